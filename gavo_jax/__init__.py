@@ -1,0 +1,34 @@
+"""Dense RGB-D visual odometry by genetic algorithm, in JAX."""
+
+from gavo_jax.alignment import Alignment as Alignment
+from gavo_jax.alignment import AlignmentOptions as AlignmentOptions
+from gavo_jax.alignment import AlignmentStatus as AlignmentStatus
+from gavo_jax.alignment import align as align
+from gavo_jax.alignment import align_batch as align_batch
+from gavo_jax.camera import Camera as Camera
+from gavo_jax.camera import load_camera as load_camera
+from gavo_jax.datasets.base import Frame as Frame
+from gavo_jax.datasets.base import FrameError as FrameError
+from gavo_jax.datasets.base import Sequence as Sequence
+from gavo_jax.datasets.synthetic import SensorNoise as SensorNoise
+from gavo_jax.datasets.synthetic import SyntheticSequence as SyntheticSequence
+from gavo_jax.datasets.synthetic import write_tum as write_tum
+from gavo_jax.datasets.tum import TumSequence as TumSequence
+from gavo_jax.errors import GavoError as GavoError
+from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error
+from gavo_jax.evaluation import distance_error as distance_error
+from gavo_jax.evaluation import relative_pose_error as relative_pose_error
+from gavo_jax.objective import LOSSES as LOSSES
+from gavo_jax.odometry import Odometry as Odometry
+from gavo_jax.odometry import OdometryRun as OdometryRun
+from gavo_jax.odometry import Step as Step
+from gavo_jax.odometry import run_odometry as run_odometry
+from gavo_jax.odometry import track as track
+from gavo_jax.presets import OdometryOptions as OdometryOptions
+from gavo_jax.presets import Preset as Preset
+from gavo_jax.presets import get_preset as get_preset
+from gavo_jax.solvers.gauss_newton import GaussNewton as GaussNewton
+from gavo_jax.solvers.genetic import GeneticAlgorithm as GeneticAlgorithm
+from gavo_jax.solvers.gradient import GradientDescent as GradientDescent
+from gavo_jax.solvers.particle_swarm import ParticleSwarm as ParticleSwarm
+from gavo_jax.trajectory import Trajectory as Trajectory

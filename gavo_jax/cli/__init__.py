@@ -1,0 +1,105 @@
+"""The command `gavo`: parses, hands over to a subcommand, and turns bad input into one line and exit status 2."""
+
+import contextlib
+import io
+import itertools
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import tyro
+
+from gavo_jax.cli.options import Align, Command, Compare, Evaluate, Run
+from gavo_jax.errors import GavoError
+
+BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
+"""Exit statuses; 0 is done, 3 is `cli.run.LOST` (`--strict`)."""
+
+DESCRIPTION = (
+    "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
+    "or Adam, on one compiled photometric objective."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with the arguments (of the process unless given) and return its exit status.
+
+    Nothing is raised for bad input: one line on standard error names the file and the fault, and the status is 2.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments == ["--version"]:
+        print(f"gavo-jax {version('gavo-jax')}")
+        return 0
+    try:
+        command = _parse(arguments)
+        return 0 if command is None else _execute(command)
+    except GavoError as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        print("gavo: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the reader of standard output has gone; point it elsewhere so that closing it at exit stays quiet
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+
+
+def _execute(command: Command) -> int:
+    """Import the subcommand only now, so that help and usage errors do not wait for JAX."""
+    match command:
+        case Run():
+            from gavo_jax.cli.run import run
+
+            return run(command)
+        case Compare():
+            from gavo_jax.cli.compare import compare
+
+            return compare(command)
+        case Align():
+            from gavo_jax.cli.align import align
+
+            return align(command)
+        case Evaluate():
+            from gavo_jax.cli.evaluate import evaluate
+
+            return evaluate(command)
+
+
+def _parse(arguments: list[str]) -> Command | None:
+    """Return the subcommand with its options, or None where help was printed.
+
+    Raises:
+        GavoError: unknown or missing arguments.
+    """
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            return tyro.cli(
+                Command,
+                prog="gavo",
+                description=DESCRIPTION,
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            return None
+    raise GavoError(_first_paragraph(messages.getvalue()) + f" (see gavo {_help_of(arguments)}--help)")
+
+
+def _first_paragraph(box: str) -> str:
+    """Return what the first paragraph of tyro's message box says, as one line."""
+    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
+    paragraph = list(itertools.takewhile(lambda line: line and not line.startswith("─"), lines))
+    return " ".join((" ".join(paragraph) or box).split())
+
+
+def _help_of(arguments: list[str]) -> str:
+    known = ("run", "compare", "align", "evaluate")
+    return f"{arguments[0]} " if arguments and arguments[0] in known else ""
+
+
+def _refuse(message: str) -> int:
+    print(f"gavo: {' '.join(message.split())}", file=sys.stderr)
+    return BAD_INPUT

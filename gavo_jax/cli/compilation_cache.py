@@ -1,0 +1,25 @@
+"""Where compiled programs are kept between runs, so that only the first command on a machine waits for them."""
+
+import os
+from pathlib import Path
+
+import jax
+
+
+def cache_folder() -> Path | None:
+    """Return `GAVO_CACHE_DIR`, else the user's cache folder for this package; None where there is no home."""
+    if named := os.environ.get("GAVO_CACHE_DIR"):
+        return Path(named)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gavo-jax"
+    except RuntimeError:
+        return None
+
+
+def enable_compilation_cache() -> None:
+    """Have JAX keep compiled programs in `cache_folder()`, unless `JAX_COMPILATION_CACHE_DIR` says where."""
+    folder = cache_folder()
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or folder is None:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

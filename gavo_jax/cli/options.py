@@ -1,0 +1,114 @@
+"""What the command takes: a dataclass a subcommand, from which tyro makes parser and help."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+Method = Literal["ga", "pso", "gauss-newton", "adam"]
+PresetName = Literal["default", "paper", "fast", "wide"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Which frames."""
+
+    sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
+    """A folder in the layout of the TUM RGB-D benchmark, or the word synthetic: a room rendered by the package."""
+    camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
+    """The camera: by the sequence's name, a camera of the TUM benchmark, or a .toml or .yaml file."""
+    start: Annotated[int, arg(metavar="K")] = 0
+    """First frame."""
+    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    """Number of frames, at least 2."""
+    stride: Annotated[int, arg(metavar="S")] = 1
+    """Take every S-th frame."""
+
+
+@dataclass(frozen=True)
+class Run(Source):
+    """Estimate the trajectory of a sequence."""
+
+    method: Method = "ga"
+    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method) or Adam."""
+    preset: PresetName = "default"
+    """Settings: the project's own, the paper's, for speed, for large motions."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Of the method's randomness: the same seed gives the same trajectory, bit for bit."""
+    reference: Annotated[
+        Literal["previous", "keyframe"] | None,
+        arg(metavar="{previous,keyframe}", help_behavior_hint="(default: the preset's)"),
+    ] = None
+    """What a frame is aligned to: the previous frame, or the last keyframe."""
+    on_lost: Annotated[
+        Literal["hold", "predict", "stop"] | None,
+        arg(metavar="{hold,predict,stop}", help_behavior_hint="(default: the preset's)"),
+    ] = None
+    """After a pair without a usable motion: stand still, keep the last motion, or end the run."""
+    output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-METHOD-PRESET)")] = (
+        None
+    )
+    """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    strict: bool = False
+    """Exit with status 3 if any pair was lost."""
+
+
+@dataclass(frozen=True)
+class Compare(Source):
+    """Run several methods, other libraries' too, over the same frames: one table, comparison.json, figures."""
+
+    methods: Annotated[str, arg(metavar="NAME,NAME,…")] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
+    """Methods of `gavo run` and odometries of other libraries (opencv-…, open3d-…), with commas between."""
+    preset: PresetName = "default"
+    """Settings of the project's own methods."""
+    seeds: Annotated[int, arg(metavar="N")] = 1
+    """Run each random method with seeds 0 to N - 1; table and figures show the run of median drift."""
+    output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-compare-PRESET)")] = (
+        None
+    )
+    """Folder for comparison.json, the trajectories and the figures."""
+
+
+@dataclass(frozen=True)
+class Align:
+    """Align one pair of RGB-D images and print the motion as JSON."""
+
+    rgb0: Annotated[Positional[Path], arg(metavar="RGB0")]
+    """Colour (or grey) image of the reference frame, 8 bit."""
+    depth0: Annotated[Positional[Path], arg(metavar="DEPTH0")]
+    """Depth image of the reference frame, 16 bit, registered to it."""
+    rgb1: Annotated[Positional[Path], arg(metavar="RGB1")]
+    """Colour image of the target frame."""
+    depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
+    """Depth image of the target frame."""
+    camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
+    """As in `gavo run`; auto goes by the name of the folder above RGB0's."""
+    method: Method = "ga"
+    """As in `gavo run`."""
+    preset: PresetName = "default"
+    """As in `gavo run`."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """As in `gavo run`."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Errors of a trajectory against the truth, both TUM files (timestamp tx ty tz qx qy qz qw)."""
+
+    estimate: Annotated[Positional[Path], arg(metavar="ESTIMATE")]
+    """The estimated trajectory, camera to world."""
+    groundtruth: Annotated[Positional[Path], arg(metavar="GROUNDTRUTH")]
+    """The true trajectory."""
+    delta: Annotated[float, arg(metavar="D")] = 1.0
+    """Span of the relative pose error."""
+    unit: Literal["s", "frames"] = "s"
+    """Unit of the span."""
+
+
+Command = (
+    Annotated[Run, subcommand("run")]
+    | Annotated[Compare, subcommand("compare")]
+    | Annotated[Align, subcommand("align")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+)

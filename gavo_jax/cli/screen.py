@@ -1,0 +1,66 @@
+"""What people see: tables on standard output, progress on standard error."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+
+class PairProgress:
+    """A bar that counts pairs; it says `compiling …` until the first one is done."""
+
+    def __init__(self, progress: Progress, task: TaskID, label: str) -> None:
+        self._progress, self._task, self._label = progress, task, label
+
+    def advance(self) -> None:
+        """Count one pair."""
+        self._progress.update(self._task, advance=1, description=self._label)
+
+
+@contextmanager
+def pair_progress(label: str, pairs: int) -> Iterator[PairProgress]:
+    """Show a bar on standard error while the block runs; nothing where that is no terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("pairs"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        yield PairProgress(progress, progress.add_task(f"{label}: compiling …", total=pairs), label)
+
+
+@contextmanager
+def waiting(words: str) -> Iterator[None]:
+    """Show a few words on standard error while the block runs; nothing where that is no terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(words):
+        yield
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table whose first column is text and whose others are numbers; it is never cut to the screen's width."""
+    table = Table()
+    for i, name in enumerate(columns):
+        table.add_column(Text(name), justify="right" if i else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    unlimited = Console(width=10_000)
+    needed = Measurement.get(unlimited, unlimited.options, table).maximum
+    print(title)
+    Console(width=max(Console().width, needed)).print(table)
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number of fixed decimals, or a dash for what is not known."""
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,1 @@
+"""Where frames come from: the sequence protocol and its implementations."""

@@ -1,0 +1,85 @@
+"""What every source of frames offers: `Frame` and the `Sequence` protocol."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol, overload
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from gavo_jax.camera import Camera
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import Trajectory
+
+
+class FrameError(GavoError):
+    """A single frame that cannot be read: a fault of that frame, not of the whole sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB-D image.
+
+    Attributes:
+        grey: intensities, 0 to 255.
+        depth: raw depth along z, 0 = no reading; metres = depth / camera.depth_scale. Registered to `grey`.
+        timestamp: of the colour image, seconds.
+        color: RGB, where the sequence was asked for it.
+        depth_timestamp: of the depth image, seconds, where it is known: the two are not exposed together.
+    """
+
+    grey: UInt8[np.ndarray, "height width"]
+    depth: UInt16[np.ndarray, "height width"]
+    timestamp: float
+    color: UInt8[np.ndarray, "height width 3"] | None = None
+    depth_timestamp: float | None = None
+
+
+class Sequence(Protocol):
+    """Frames in the order of their stamps, read one at a time.
+
+    `sequence[i]` decodes frame i (negative i counts from the end) and raises IndexError outside and `FrameError`
+    where that frame cannot be read; `sequence[start:stop:stride]` is a sequence again, with the same name, camera and
+    ground truth. Iteration goes through `[i]`.
+    """
+
+    @property
+    def name(self) -> str:
+        """Short name for tables and folders."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the frames as they come: without distortion where the sequence undistorts them."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The true trajectory with its own stamps (not one pose a frame), or None."""
+        ...
+
+    @property
+    def timestamps(self) -> Float[np.ndarray, " frames"]:
+        """Stamp of each frame, seconds."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        ...
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Sequence": ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode frame after frame."""
+        ...
+
+    def check(self) -> None:
+        """Refuse, before a run, what is wrong with the sequence as a whole.
+
+        Raises:
+            GavoError: names the file and the fault.
+        """
+        ...

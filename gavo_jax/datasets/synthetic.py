@@ -1,0 +1,407 @@
+"""A synthetic RGB-D sequence: a camera moves through the rendered room; exact poses, optional sensor noise."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.room import (
+    HIGHEST_VIEW,
+    LOWEST_VIEW,
+    MARGIN_X,
+    MARGIN_Y,
+    build_room,
+    free_space,
+    render,
+)
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import Trajectory
+
+DEFAULT_CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
+"""The factory calibration commonly used for Kinect-like cameras, 640 x 480, no distortion."""
+DEFAULT_FRAMES, DEFAULT_RATE = 30, 30.0
+
+LARGEST_EXTENT = 50.0
+"""Trajectories that reach further than this (m) along an axis are refused: a room has to hold them."""
+
+_HALF_EXTENT, _HEIGHT = (3.0, 2.5), 3.0
+_FORWARD, _EYE_LEVEL = 0.45, 1.35
+_PATH_STREAM, _EXPOSURE_STREAM, _FRAME_STREAM = range(3)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """What a structured-light RGB-D camera adds to the exact image and depth. All zeros (the default): nothing.
+
+    Depth noise and quantisation live in disparity, hence in inverse depth: both grow with z^2 (Khoshelham & Oude
+    Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 2012).
+
+    Attributes:
+        depth_sigma: deviation of inverse depth, 1/m: sigma_z = depth_sigma z^2.
+        depth_step: quantisation of inverse depth, 1/m: neighbouring depths differ by depth_step z^2.
+        depth_nearest: nearest depth with a reading, metres.
+        depth_furthest: furthest depth with a reading, metres; 0 for no limit.
+        baseline: from the camera to the pattern's projector along +x, metres. Where an object keeps the projector's
+            light from the surface behind, there is no depth: a strip to the left of the object.
+        edge_dropout: probability that a pixel beside a jump in depth has no reading.
+        grey_sigma: deviation of grey, grey levels.
+        gain_drift: amplitude of the slow change in gain (0.03: three per cent either way).
+        bias_drift: amplitude of the slow change in bias, grey levels.
+        drift_period: of the change in exposure, seconds.
+    """
+
+    depth_sigma: float = 0.0
+    depth_step: float = 0.0
+    depth_nearest: float = 0.0
+    depth_furthest: float = 0.0
+    baseline: float = 0.0
+    edge_dropout: float = 0.0
+    grey_sigma: float = 0.0
+    gain_drift: float = 0.0
+    bias_drift: float = 0.0
+    drift_period: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that are negative or not finite."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise GavoError(f"sensor noise: {field.name}: must be a number from 0, not {value!r}")
+        if self.drift_period == 0:
+            raise GavoError("sensor noise: drift_period: must be above 0")
+
+    def disturb_grey(
+        self,
+        grey: Float[np.ndarray, "height width"],
+        seconds: float,
+        phases: Float[np.ndarray, " 2"],
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "height width"]:
+        """Drift of exposure at a time (phases of gain and bias, radians), then pixel noise; grey levels in and out."""
+        turn = 2 * math.pi * seconds / self.drift_period
+        gain = 1 + self.gain_drift * math.sin(turn + phases[0])
+        bias = self.bias_drift * math.sin(0.7 * turn + phases[1])
+        noise = rng.standard_normal(grey.shape, dtype=np.float32) if self.grey_sigma else np.float32(0)
+        return np.float32(gain) * grey + np.float32(bias) + np.float32(self.grey_sigma) * noise
+
+    def disturb_depth(
+        self, depth: Float[np.ndarray, "height width"], focal: float, rng: np.random.Generator
+    ) -> Float[np.ndarray, "height width"]:
+        """Noise, quantisation and missing readings (0); depth in metres in and out, focal length along x in pixels."""
+        seen = (depth > self.depth_nearest) & (depth < (self.depth_furthest or np.inf))
+        if self.baseline:
+            seen &= ~_projector_shadow(depth, focal * self.baseline)
+        if self.edge_dropout:
+            lost = rng.random(depth.shape, dtype=np.float32) < self.edge_dropout
+            seen &= ~(lost & _depth_jumps(depth))
+        if self.depth_sigma or self.depth_step:
+            inverse = 1 / np.maximum(depth, np.float32(1e-3))
+            inverse += np.float32(self.depth_sigma) * rng.standard_normal(depth.shape, dtype=np.float32)
+            if self.depth_step:
+                inverse = np.rint(inverse / np.float32(self.depth_step)) * np.float32(self.depth_step)
+            seen &= inverse > 0
+            depth = 1 / np.where(seen, inverse, np.float32(1))
+        return np.where(seen, depth, np.float32(0))
+
+
+NONE = SensorNoise()
+"""No noise at all; grey and depth are still rounded to 8 and 16 bit."""
+KINECT = SensorNoise(
+    depth_sigma=1.4e-3,
+    depth_step=2.85e-3,
+    depth_nearest=0.4,
+    depth_furthest=8.0,
+    baseline=0.075,
+    edge_dropout=0.3,
+    grey_sigma=2.0,
+    gain_drift=0.03,
+    bias_drift=3.0,
+)
+"""About the first Kinect: disparity in eighths of a pixel (7.5 cm baseline, 580 pixels), readings from 0.4 to 8 m."""
+
+
+def _projector_shadow(depth: np.ndarray, focal_baseline: float) -> np.ndarray:
+    """Pixels that a projector to the right, at the same height, cannot light: bool [H, W].
+
+    A pixel's column in the projector is x - f b / z; something further right in the image that lies further left in the
+    projector stands in the light.
+    """
+    x = np.arange(depth.shape[1], dtype=np.float32)
+    projected = x - np.float32(focal_baseline) / np.maximum(depth, np.float32(1e-3))
+    leftmost = np.minimum.accumulate(projected[:, ::-1], axis=1)[:, ::-1]
+    shadow = np.zeros(depth.shape, bool)
+    shadow[:, :-1] = projected[:, :-1] > leftmost[:, 1:]
+    return shadow
+
+
+def _depth_jumps(depth: np.ndarray, share: float = 0.05) -> np.ndarray:
+    """Pixels whose 3 x 3 neighbourhood spans more than a share of its nearest depth: bool [H, W]."""
+    kernel = np.ones((3, 3), np.uint8)
+    nearest = cv2.erode(depth, kernel)
+    return cv2.dilate(depth, kernel) - nearest > share * nearest
+
+
+class SyntheticSequence:
+    """A camera moving through a textured, furnished room; exact poses, depth along z, optional sensor noise.
+
+    Frame i depends on the arguments and i alone: not on the order of access, nor on slicing. Frames are rendered when
+    they are asked for (the last two are kept). World frame: metres, z up, origin on the floor below the room's middle.
+
+    Args:
+        frames: how many; by default 30 on the built-in path, all of a given trajectory (never more than it has).
+        seed: of the textures, the noise and the phases of the built-in path; from 0.
+        noise: what the sensor adds; `NONE` for exact frames.
+        camera: any pinhole camera; frames come undistorted. By default 640 x 480, f = 525, the centre in the middle.
+        trajectory: what to follow instead of the built-in path: a Trajectory or a TUM file (camera to world, z up). It
+            is shifted into the room's free middle (the room is built larger where it must); scale and rotation stay.
+        rate: frames a second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
+        speed: the motion is played this many times faster.
+        color: also give RGB images; grey is then computed from them as OpenCV does.
+
+    Raises:
+        GavoError: an argument out of range, or a trajectory that cannot be read, is empty, not finite or too large.
+    """
+
+    def __init__(
+        self,
+        frames: int | None = None,
+        seed: int = 0,
+        noise: SensorNoise = KINECT,
+        camera: Camera | None = None,
+        trajectory: Trajectory | str | Path | None = None,
+        rate: float | None = None,
+        speed: float = 1.0,
+        color: bool = False,
+    ) -> None:
+        if frames is not None and frames < 1:
+            raise GavoError(f"synthetic: frames: must be at least 1, not {frames}")
+        if seed < 0:
+            raise GavoError(f"synthetic: seed: must be at least 0, not {seed}")
+        for key, value in (("rate", rate), ("speed", speed)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise GavoError(f"synthetic: {key}: must be a number above 0, not {value!r}")
+        self._noise, self._color, self._seed = noise, color, seed
+        self._camera = (camera or DEFAULT_CAMERA).rectified()
+        if trajectory is None:
+            self._truth = builtin_path(frames or DEFAULT_FRAMES, rate or DEFAULT_RATE, speed, seed)
+            self._half_extent, self._height = _HALF_EXTENT, _HEIGHT
+        else:
+            source = trajectory if isinstance(trajectory, Trajectory) else Trajectory.read_tum(trajectory)
+            self._truth, self._half_extent, self._height = _fit_room(_play(source, frames, rate, speed))
+        self._selection = np.arange(len(self._truth))
+        self._phases = np.random.default_rng([seed, _EXPOSURE_STREAM]).uniform(0, 2 * np.pi, 2)
+        self._render: Callable[[int], Frame] = lru_cache(maxsize=2)(self._render_frame)
+
+    @property
+    def name(self) -> str:
+        """Always "synthetic"."""
+        return "synthetic"
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that all frames are rendered with; no distortion."""
+        return self._camera
+
+    @property
+    def ground_truth(self) -> Trajectory:
+        """Exact `world_T_camera` of every frame of the whole sequence (slices keep it whole)."""
+        return self._truth
+
+    @property
+    def timestamps(self) -> Float[np.ndarray, " frames"]:
+        """Stamp of each frame, seconds."""
+        return self._truth.timestamps[self._selection]
+
+    def check(self) -> None:
+        """Nothing is wrong with what was not read from files: never raises."""
+
+    def __len__(self) -> int:
+        return len(self._selection)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> SyntheticSequence: ...
+    def __getitem__(self, index: int | slice) -> Frame | SyntheticSequence:
+        """Frame i (arrays are read-only), or a slice of the sequence; IndexError outside."""
+        if isinstance(index, slice):
+            part = copy.copy(self)
+            part._selection = self._selection[index]
+            return part
+        return self._render(int(self._selection[index]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[i] for i in range(len(self)))
+
+    def _render_frame(self, i: int) -> Frame:
+        """Render frame i of the whole sequence and let the sensor disturb it."""
+        room = build_room(self._seed, self._half_extent, self._height)
+        exact_grey, exact_depth, face = render(room, self._camera, self._truth.world_T_camera[i])
+        rng = np.random.default_rng([self._seed, _FRAME_STREAM, i])
+        seconds = float(self._truth.timestamps[i] - self._truth.timestamps[0])
+        grey = self._noise.disturb_grey(exact_grey, seconds, self._phases, rng)
+        depth = self._noise.disturb_depth(exact_depth, float(self._camera.fx), rng)
+        color = None
+        if self._color:
+            color = _to_bytes(grey[..., None] * room.faces.tint.astype(np.float32)[face])
+            grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+        frame = Frame(
+            grey=_to_bytes(grey),
+            depth=_to_raw(depth, float(self._camera.depth_scale)),
+            timestamp=float(self._truth.timestamps[i]),
+            color=color,
+        )
+        for image in (frame.grey, frame.depth, frame.color):
+            if image is not None:
+                image.setflags(write=False)
+        return frame
+
+
+def _to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _to_raw(depth: np.ndarray, depth_scale: float) -> UInt16[np.ndarray, "height width"]:
+    """Metres to raw units; what 16 bit cannot hold has no reading."""
+    raw = np.rint(depth * np.float32(depth_scale))
+    return np.where(raw <= np.iinfo(np.uint16).max, raw, 0).astype(np.uint16)
+
+
+def builtin_path(frames: int, rate: float = DEFAULT_RATE, speed: float = 1.0, seed: int = 0) -> Trajectory:
+    """A handheld-like look around, a sum of sinusoids: 0.25 m/s and 18 deg/s on average at speed 1.
+
+    Args:
+        frames: how many poses.
+        rate: poses a second.
+        speed: the motion is played this many times faster.
+        seed: of the sinusoids' phases.
+
+    Returns:
+        `world_T_camera`, stamps from 0 in whole microseconds.
+    """
+    timestamps = np.round(np.arange(frames) / rate, 6)
+    phases = np.random.default_rng([seed, _PATH_STREAM]).uniform(0, 2 * np.pi, (6, 3))
+
+    def wave(row: int, *terms: tuple[float, float]) -> np.ndarray:
+        """The sum of (amplitude, period in seconds)."""
+        turns = [2 * np.pi * speed * timestamps / period for _, period in terms]
+        return sum(
+            (terms[k][0] * np.sin(turns[k] + phases[row, k]) for k in range(len(terms))), np.zeros_like(timestamps)
+        )
+
+    yaw = np.radians(wave(0, (32, 10.0), (4, 2.3)))
+    pitch = np.radians(10 + wave(1, (7, 4.7), (2, 1.7)))
+    roll = np.radians(wave(2, (4, 3.9), (1, 1.5)))
+    world_T_camera = np.tile(np.eye(4), (frames, 1, 1))
+    # camera axes (right, down, forward) in a body frame (forward, left, up)
+    body_R_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    world_T_camera[:, :3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0) @ body_R_camera
+    world_T_camera[:, 0, 3] = _FORWARD + wave(3, (0.18, 5.5), (0.015, 1.1))
+    world_T_camera[:, 1, 3] = wave(4, (0.22, 6.3), (0.015, 1.3))
+    world_T_camera[:, 2, 3] = _EYE_LEVEL + wave(5, (0.09, 3.9), (0.015, 1.2))
+    return Trajectory(timestamps, world_T_camera)
+
+
+def _turn(angle: np.ndarray, axis: int) -> np.ndarray:
+    """Rotations [n, 3, 3] about a coordinate axis by angles [n] in radians."""
+    matrix = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[:, i, i] = matrix[:, j, j] = np.cos(angle)
+    matrix[:, j, i] = np.sin(angle)
+    matrix[:, i, j] = -matrix[:, j, i]
+    return matrix
+
+
+def _play(source: Trajectory, frames: int | None, rate: float | None, speed: float) -> Trajectory:
+    """The trajectory at the frames' stamps: its time runs `speed` times faster, resampled where a rate is given."""
+    if len(source) == 0:
+        raise GavoError("synthetic: the trajectory is empty")
+    if not (np.isfinite(source.timestamps).all() and np.isfinite(source.world_T_camera).all()):
+        raise GavoError("synthetic: the trajectory holds values that are not finite")
+    stamps, first = np.unique(source.timestamps, return_index=True)
+    start = stamps[0]
+    played = Trajectory(start + (stamps - start) / speed, source.world_T_camera[first])
+    if rate is not None:
+        span = played.timestamps[-1] - start
+        stamps = np.round(start + np.arange(math.floor(span * rate + 1e-6) + 1) / rate, 6)
+        stamps = np.clip(stamps, start, played.timestamps[-1])
+        world_T_camera, _ = played.interpolate(stamps, max_gap=math.inf)
+        played = Trajectory(stamps, world_T_camera)
+    return Trajectory(played.timestamps[:frames], played.world_T_camera[:frames])
+
+
+def _fit_room(path: Trajectory) -> tuple[Trajectory, tuple[float, float], float]:
+    """Shift a path into the free middle of a room; also the half extent and height (m) that the room needs for it."""
+    positions = path.world_T_camera[:, :3, 3]
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    extent = high - low
+    if extent.max() > LARGEST_EXTENT:
+        raise GavoError(
+            f"synthetic: the trajectory spans {extent.max():.1f} m: more than {LARGEST_EXTENT:g} m fit no room"
+        )
+    need = np.ceil(10 * extent + 1) / 10
+    half_extent = (max(_HALF_EXTENT[0], need[0] / 2 + MARGIN_X), max(_HALF_EXTENT[1], need[1] / 2 + MARGIN_Y))
+    height = max(_HEIGHT, LOWEST_VIEW + need[2] + HIGHEST_VIEW)
+    lowest, highest = free_space(half_extent, height)
+    middle = np.array([0.0, 0.0, _EYE_LEVEL])
+    middle = np.clip(middle, lowest + extent / 2, highest - extent / 2)
+    world_T_camera = path.world_T_camera.copy()
+    world_T_camera[:, :3, 3] += middle - (low + high) / 2
+    return Trajectory(path.timestamps, world_T_camera), (float(half_extent[0]), float(half_extent[1])), float(height)
+
+
+def write_tum(sequence: Sequence, folder: str | Path) -> None:
+    """Write a sequence as a folder in TUM layout that reads back identically, with its camera as `camera.toml`.
+
+    Colour images are 8-bit RGB (three equal channels where the frames have no colour), depth 16 bit in the camera's raw
+    units. The lists are written last, so that a folder left half written is not taken for a sequence.
+
+    Raises:
+        GavoError: the folder holds a sequence already, or something cannot be written.
+        FrameError: a frame of the sequence cannot be read.
+    """
+    folder = Path(folder)
+    if (folder / "rgb.txt").exists():
+        raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")
+    try:
+        for part in ("rgb", "depth"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        stamps = []
+        for frame in sequence:
+            stamps.append(np.format_float_positional(frame.timestamp, unique=True, min_digits=6))
+            image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
+            if frame.color is not None:
+                image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+            _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
+            _write_png(folder / "depth" / f"{stamps[-1]}.png", frame.depth)
+        (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
+        if sequence.ground_truth is not None:
+            sequence.ground_truth.write_tum(folder / "groundtruth.txt")
+        for part in ("depth", "rgb"):
+            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in stamps)]
+            (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image (BGR or one channel); raises OSError."""
+    path.write_bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
+
+
+def _camera_toml(camera: Camera) -> str:
+    lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
+    lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
+    lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
+    return "\n".join(lines) + "\n"

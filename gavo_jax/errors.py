@@ -1,0 +1,51 @@
+"""Bad input as one kind of exception, and the text files that users hand in."""
+
+from pathlib import Path
+
+MAX_TEXT_BYTES = 256 * 2**20
+
+
+class GavoError(ValueError):
+    """Input that cannot be used. The message is one line that names the file and says what is wrong with it."""
+
+
+def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Return the text of a UTF-8 file.
+
+    Raises:
+        GavoError: the file is missing, no regular file, unreadable, larger than `max_bytes` or not UTF-8.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise GavoError(f"{path}: not a file")
+        if path.stat().st_size > max_bytes:
+            raise GavoError(f"{path}: larger than {max_bytes} bytes")
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise GavoError(f"{path}: no such file") from None
+    except OSError as error:
+        raise GavoError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise GavoError(f"{path}: not a text file (UTF-8)") from None
+    except ValueError as error:
+        if isinstance(error, GavoError):
+            raise
+        raise GavoError(f"{str(path)!r}: not a usable path: {error}") from None
+
+
+def data_rows(path: str | Path) -> list[tuple[str, list[str]]]:
+    """Split a TUM text file into rows of fields; blank lines and `#` comments are skipped, commas count as blanks.
+
+    Returns:
+        A list of (`file:line`, fields), so that whoever refuses a row can say where it stands.
+
+    Raises:
+        GavoError: as `read_text`.
+    """
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        fields = line.replace(",", " ").split()
+        if fields and not fields[0].startswith("#"):
+            rows.append((f"{path}:{number}", fields))
+    return rows

@@ -1,0 +1,251 @@
+"""Errors of a trajectory against the truth: relative pose error (15)(16), absolute error, distance error (17)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import MAX_GAP, Trajectory, associate, inverse
+
+MAX_DIFFERENCE = 0.02
+"""Stamps of estimate and truth at least this far apart, in seconds, are not associated."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSeries:
+    """One kind of error, value by value.
+
+    Attributes:
+        values: one error a pair of poses, or a pose.
+        timestamps: seconds; stamp of the estimate's pose, the first one of a pair.
+        unit: of the values: "m" or "deg".
+        definition: what each value is, in a sentence.
+    """
+
+    values: Float[np.ndarray, " n"]
+    timestamps: Float[np.ndarray, " n"]
+    unit: str
+    definition: str
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean square (16)."""
+        return float(np.sqrt(np.mean(np.square(self.values))))
+
+    @property
+    def mean(self) -> float:
+        """Arithmetic mean."""
+        return float(np.mean(self.values))
+
+    @property
+    def median(self) -> float:
+        """Median."""
+        return float(np.median(self.values))
+
+    @property
+    def max(self) -> float:
+        """Largest value."""
+        return float(np.max(self.values))
+
+    @property
+    def final(self) -> float:
+        """Value at the last stamp."""
+        return float(self.values[-1])
+
+    def summary(self) -> dict[str, float | int | str]:
+        """Return the statistics with their number of values, unit and definition, ready for JSON."""
+        return {
+            "rmse": self.rmse,
+            "mean": self.mean,
+            "median": self.median,
+            "max": self.max,
+            "count": len(self.values),
+            "unit": self.unit,
+            "definition": self.definition,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePoseError:
+    """Translational (m) and rotational (deg) part of the relative pose error, over the same pairs."""
+
+    translation: ErrorSeries
+    rotation: ErrorSeries
+    delta: float
+    unit: Literal["s", "frames"]
+
+
+def relative_pose_error(
+    estimate: Trajectory, truth: Trajectory, delta: float = 1.0, unit: Literal["s", "frames"] = "s"
+) -> RelativePoseError:
+    """Return how far the estimated motion over `delta` is from the true one (15).
+
+    Unit "s" is what TUM's `evaluate_rpe.py --fixed_delta --delta DELTA --delta_unit s` computes: each pose i is paired
+    with the pose j nearest to `delta` seconds later, save pairs that end at the last pose; the truth is taken at its
+    stamps nearest to those of i and j, where both lie within twice its median interval; the error is
+    `inv(est_j_T_i) @ true_j_T_i`. At delta = 1 the RMSE of its translation is the drift in m/s (16). TUM's tool draws
+    10,000 pairs at random where there are more; here all of them count.
+
+    Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is (15)
+    as printed: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations differ by
+    about the rotation error times the distance travelled.
+
+    Raises:
+        GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
+            (for frames: not a whole number).
+    """
+    if not np.isfinite(delta) or delta <= 0:
+        raise GavoError(f"relative pose error: delta must be positive, not {delta}")
+    if unit == "s":
+        return _relative_pose_error_seconds(estimate, truth, delta)
+    if unit == "frames":
+        if delta != int(delta):
+            raise GavoError(f"relative pose error: delta must be a whole number of frames, not {delta}")
+        return _relative_pose_error_frames(estimate, truth, int(delta))
+    raise GavoError(f"relative pose error: unit must be s or frames, not {unit!r}")
+
+
+def absolute_trajectory_error(
+    estimate: Trajectory, truth: Trajectory, max_difference: float = MAX_DIFFERENCE
+) -> ErrorSeries:
+    """Return the distances between associated positions after the best rigid alignment of the estimate (no scale).
+
+    Association is `associate` by time; the alignment minimises the sum of squared distances (Horn 1987, Umeyama 1991).
+
+    Raises:
+        GavoError: fewer than two poses associate.
+    """
+    stamps, estimated, true = _associated(estimate, truth, max_difference, "absolute trajectory error")
+    positions, true_positions = estimated[:, :3, 3], true[:, :3, 3]
+    rotation, translation = align_rigidly(positions, true_positions)
+    distances = np.linalg.norm(positions @ rotation.T + translation - true_positions, axis=1)
+    definition = (
+        "distance between estimated and true position after rigid (SE(3), no scale) least-squares alignment; "
+        f"nearest stamps within {max_difference:g} s"
+    )
+    return ErrorSeries(distances, stamps, "m", definition)
+
+
+def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX_GAP) -> ErrorSeries:
+    """Return ‖p_est − p_true‖ of each pose, both seen from their own first pose: accumulated drift, as the paper plots.
+
+    The truth is interpolated (slerp) at the estimate's stamps; poses it does not cover (outside it, or in a gap longer
+    than `max_gap` seconds) are left out, and the first covered one is the common origin.
+
+    Raises:
+        GavoError: the truth covers no pose of the estimate.
+    """
+    true, valid = truth.interpolate(estimate.timestamps, max_gap)
+    if not valid.any():
+        raise GavoError("distance error: the ground truth covers no pose of the estimate")
+    estimated, true = estimate.world_T_camera[valid], true[valid]
+    from_first = inverse(estimated[0]) @ estimated
+    true_from_first = inverse(true[0]) @ true
+    distances = np.linalg.norm((from_first - true_from_first)[:, :3, 3], axis=1)
+    definition = "distance between estimated and true position, both relative to the first pose; truth interpolated"
+    return ErrorSeries(distances, estimate.timestamps[valid], "m", definition)
+
+
+def align_rigidly(
+    points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    """Return the rotation R and translation t of least Σ ‖R points_i + t − targets_i‖² (Umeyama 1991, scale 1)."""
+    center, target_center = points.mean(axis=0), targets.mean(axis=0)
+    u, _, vt = np.linalg.svd((targets - target_center).T @ (points - center))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ mirror @ vt
+    return rotation, target_center - rotation @ center
+
+
+def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta: float) -> RelativePoseError:
+    estimate, truth = _sorted(estimate), _sorted(truth)
+    if len(estimate) < 2 or len(truth) < 2:
+        raise GavoError("relative pose error: estimate and ground truth need at least two poses each")
+    end = _closest_index(estimate.timestamps, estimate.timestamps + delta)
+    start = np.flatnonzero(end != len(estimate) - 1)
+    end = end[start]
+    nearest = _closest_index(truth.timestamps, estimate.timestamps)
+    far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
+    covered = ~far[start] & ~far[end]
+    start, end = start[covered], end[covered]
+    if len(start) == 0:
+        raise GavoError(f"relative pose error: no poses {delta:g} s apart that the ground truth covers")
+    estimated, true = estimate.world_T_camera, truth.world_T_camera[nearest]
+    end_T_start = inverse(estimated[end]) @ estimated[start]
+    true_end_T_start = inverse(true[end]) @ true[start]
+    definition = f"inv(est_j_T_i) @ true_j_T_i over {delta:g} s (TUM evaluate_rpe.py, fixed delta), nearest true stamps"
+    error = inverse(end_T_start) @ true_end_T_start
+    return _relative_pose_error(error, estimate.timestamps[start], definition, delta, "s")
+
+
+def _relative_pose_error_frames(estimate: Trajectory, truth: Trajectory, delta: int) -> RelativePoseError:
+    stamps, estimated, true = _associated(estimate, truth, MAX_DIFFERENCE, "relative pose error")
+    if len(stamps) <= delta:
+        raise GavoError(f"relative pose error: no associated poses {delta} frames apart ({len(stamps)} associate)")
+    start_T_end = inverse(estimated[:-delta]) @ estimated[delta:]
+    true_start_T_end = inverse(true[:-delta]) @ true[delta:]
+    definition = (
+        f"inv(true_i_T_j) @ est_i_T_j over {delta} frames, all pairs, nearest stamps within {MAX_DIFFERENCE:g} s"
+    )
+    error = inverse(true_start_T_end) @ start_T_end
+    return _relative_pose_error(error, stamps[:-delta], definition, delta, "frames")
+
+
+def _relative_pose_error(
+    error: Float[np.ndarray, "n 4 4"],
+    stamps: Float[np.ndarray, " n"],
+    definition: str,
+    delta: float,
+    unit: Literal["s", "frames"],
+) -> RelativePoseError:
+    distances = np.linalg.norm(error[:, :3, 3], axis=1)
+    return RelativePoseError(
+        translation=ErrorSeries(distances, stamps, "m", f"length of the translation of {definition}"),
+        rotation=ErrorSeries(
+            np.degrees(rotation_angle(error[:, :3, :3])), stamps, "deg", f"angle of the rotation of {definition}"
+        ),
+        delta=delta,
+        unit=unit,
+    )
+
+
+def rotation_angle(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """Return the angle of rotation matrices in radians, 0 to π, exact for small ones too (where arccos is not)."""
+    skew = rotation - np.swapaxes(rotation, -1, -2)
+    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
+    cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1
+    return np.arctan2(sine, cosine)
+
+
+def _associated(
+    estimate: Trajectory, truth: Trajectory, max_difference: float, what: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
+    """Return stamps, estimated and true `world_T_camera` of the poses that associate, in the order of their stamps."""
+    i, j = associate(estimate.timestamps, truth.timestamps, max_difference)
+    if len(i) < 2:
+        raise GavoError(f"{what}: only {len(i)} poses of estimate and ground truth within {max_difference:g} s")
+    return estimate.timestamps[i], estimate.world_T_camera[i], truth.world_T_camera[j]
+
+
+def _sorted(trajectory: Trajectory) -> Trajectory:
+    order = np.argsort(trajectory.timestamps, kind="stable")
+    return Trajectory(trajectory.timestamps[order], trajectory.world_T_camera[order])
+
+
+def _closest_index(sorted_stamps: Float[np.ndarray, " n"], queries: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+    """Return the index of the stamp nearest to each query.
+
+    Between two equally near ones it is the one that a bisection of [0, n) meets first, as in TUM's tool.
+    """
+    low, high = np.zeros(len(queries), np.int64), np.full(len(queries), len(sorted_stamps))
+    best = np.zeros(len(queries), np.int64)
+    while np.any(low < high):
+        middle = np.minimum((low + high) // 2, len(sorted_stamps) - 1)
+        stamp = sorted_stamps[middle]
+        nearer = (low < high) & (np.abs(stamp - queries) < np.abs(sorted_stamps[best] - queries))
+        best = np.where(nearer, middle, best)
+        above = stamp > queries
+        low, high = np.where((low < high) & ~above, middle + 1, low), np.where((low < high) & above, middle, high)
+    return best

@@ -1,0 +1,146 @@
+"""Named settings: what `--method` and `--preset` stand for."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gavo_jax.alignment import AlignmentOptions
+from gavo_jax.errors import GavoError
+from gavo_jax.objective import l2
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.solvers.genetic import GeneticAlgorithm
+from gavo_jax.solvers.gradient import GradientDescent
+from gavo_jax.solvers.particle_swarm import ParticleSwarm
+
+METHODS = ("ga", "pso", "gauss-newton", "adam")
+PRESETS = ("default", "paper", "fast", "wide")
+
+
+@dataclass(frozen=True)
+class OdometryOptions:
+    """How the driver uses the alignment.
+
+    Attributes:
+        reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
+            at once, their points scored together.
+        keyframe_overlap: A new keyframe is taken when less than this share of the old one's points is in view.
+        prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
+        synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
+            sequence tells both stamps.
+        recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
+        on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
+    """
+
+    reference: Literal["previous", "keyframe"] = "keyframe"
+    keyframe_overlap: float = 0.85
+    prior: bool = True
+    synchronise: bool = True
+    recover: bool = True
+    on_lost: Literal["hold", "predict", "stop"] = "hold"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A solver, what it minimises, and how the driver uses it."""
+
+    solver: Any
+    alignment: AlignmentOptions
+    odometry: OdometryOptions
+
+
+PAPER_OBJECTIVE = AlignmentOptions(
+    loss=l2,
+    depth=False,
+    brightness=False,
+    robust_scale=False,
+    precondition=False,
+    cells=(1, 1, 1, 1, 1),
+    min_overlap=0.5,
+    bounds=(0.06, 0.06),
+    bounds_factor=0.5,
+)
+"""The paper's (2) on every pixel, ξ searched as it is. Left open there and fixed here: the bounds, ±6 cm and ±0.06 rad
+(3.4°) a gene about the guess at level 4, halved from level to level about the last level's best; a candidate must keep
+half of the points in view."""
+
+FAST_CELLS = (4, 4, 2, 1, 1)
+
+
+def _paper_solver(method: str) -> Any:
+    """The paper's methods, pyramid levels 4 to 0.
+
+    Left open there and fixed here: 40 chromosomes, 40 generations at level 4 falling to 8 at level 0, a level ends
+    after 8 generations without progress, half-width 0.25 of the crossover's extra range. The swarm gets as many
+    evaluations.
+    """
+    population, iterations, patience = (40,) * 5, (8, 12, 20, 30, 40), 8
+    if method == "ga":
+        return GeneticAlgorithm(
+            population=population,
+            iterations=iterations,
+            patience=patience,
+            surrogate=False,
+            spread=None,
+            mutation_step=None,
+            mutation_decay=1.0,
+        )
+    if method == "pso":
+        return ParticleSwarm(population=population, iterations=iterations, patience=patience, spread=None)
+    if method == "gauss-newton":
+        return GaussNewton(iterations=(10, 10, 15, 20, 20))
+    return GradientDescent(
+        iterations=(20, 30, 40, 50, 60), learning_rate=(0.0005, 0.001, 0.002, 0.004, 0.008), decay=0.95
+    )
+
+
+_DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": GaussNewton(), "adam": GradientDescent()}
+
+_FAST = {
+    "ga": GeneticAlgorithm(population=(0, 10, 12, 16, 32), iterations=(0, 5, 5, 6, 8)),
+    "pso": ParticleSwarm(population=(0, 12, 16, 20, 32), iterations=(0, 8, 10, 12, 16)),
+    "gauss-newton": GaussNewton(iterations=(0, 6, 8, 10, 12), patience=2),
+    "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),
+}
+
+_WIDE = {
+    "ga": GeneticAlgorithm(
+        population=(0, 16, 20, 48, 128),
+        iterations=(0, 6, 8, 12, 20),
+        mutation_step=(1.0, 1.0, 2.0, 4.0, 15.0),
+        mutation_decay=0.85,
+    ),
+    "pso": ParticleSwarm(population=(0, 20, 24, 48, 128), iterations=(0, 12, 14, 20, 30)),
+    "gauss-newton": GaussNewton(iterations=(0, 12, 12, 20, 40)),
+    "adam": GradientDescent(iterations=(0, 30, 40, 60, 100)),
+}
+WIDE_OBJECTIVE = AlignmentOptions(
+    islands=(1, 1, 2, 6, 16), start_spread=(0.15, 0.3), min_overlap=0.25, bounds=(1.0, 1.5)
+)
+
+
+def get_preset(method: str = "ga", name: str = "default") -> Preset:
+    """The settings that a method and a preset name stand for.
+
+    Args:
+        method: One of `METHODS`.
+        name: One of `PRESETS`. `default`: preconditioned coordinates, robust grey and depth error, levels 4 to 1.
+            `paper`: as printed, levels 4 to 0, frame to frame. `fast`: fewer pixels and candidates. `wide`: many
+            independent populations at the coarsest level, for motions of tens of degrees.
+
+    Raises:
+        GavoError: An unknown method or preset.
+    """
+    if method not in METHODS:
+        raise GavoError(f"unknown method {method!r}: not one of {', '.join(METHODS)}")
+    if name == "paper":
+        return Preset(
+            _paper_solver(method),
+            PAPER_OBJECTIVE,
+            OdometryOptions(reference="previous", prior=False, synchronise=False, recover=False),
+        )
+    if name == "default":
+        return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
+    if name == "fast":
+        return Preset(_FAST[method], AlignmentOptions(cells=FAST_CELLS), OdometryOptions())
+    if name == "wide":
+        return Preset(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
+    raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")

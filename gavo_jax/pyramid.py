@@ -1,0 +1,85 @@
+"""Image pyramids of the grey and depth images, on the device (paper, section 3.4).
+
+Level 0 is the full image; each level halves the last. Pixel centres are integers, so a pixel of level k + 1 sits in
+the middle of a 2x2 block of level k (`Camera.level` holds the same convention).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Integer
+
+LEVELS = 5
+
+# Two surfaces whose inverse depths differ by more than this share are not averaged: a 2x2 block across an edge keeps
+# the nearer one.
+EDGE_TOLERANCE = 0.03
+
+
+class PyramidLevel(NamedTuple):
+    """One level of one frame."""
+
+    grey: Float[Array, "h w"]
+    """Intensity in grey levels, 0 to 255."""
+    inverse_depth: Float[Array, "h w"]
+    """1/z in 1/m; 0 where there is no reading."""
+
+
+Pyramid = tuple[PyramidLevel, ...]
+
+
+def halve_grey(grey: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
+    """Halve an image with the binomial kernel [1 3 3 1]/8, which is centred on the 2x2 block; borders replicate."""
+
+    def along_rows(image: jax.Array) -> jax.Array:
+        image = image[: image.shape[0] // 2 * 2]
+        even, odd = image[0::2], image[1::2]
+        before = jnp.concatenate([even[:1], odd[:-1]])
+        after = jnp.concatenate([even[1:], odd[-1:]])
+        return 0.375 * (even + odd) + 0.125 * (before + after)
+
+    return along_rows(along_rows(grey).T).T
+
+
+def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
+    """Mean inverse depth of each 2x2 block over the readings on the block's nearest surface; 0 where there are none.
+
+    Inverse depth is what is averaged because it is affine in the pixel coordinates on a plane, and because the
+    sensor's noise is uniform in it.
+    """
+    height, width = inverse_depth.shape
+    rows = inverse_depth[: height // 2 * 2, : width // 2 * 2]
+    taps = [rows[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    nearest = jnp.maximum(jnp.maximum(taps[0], taps[1]), jnp.maximum(taps[2], taps[3]))
+    floor = nearest * (1.0 - EDGE_TOLERANCE)
+    keep = [(tap >= floor) & (tap > 0) for tap in taps]
+    count = sum(k.astype(jnp.float32) for k in keep)
+    total = sum(jnp.where(k, tap, 0.0) for k, tap in zip(keep, taps, strict=True))
+    return total / jnp.maximum(count, 1.0)
+
+
+def build_pyramid(
+    grey: Integer[Array, "h w"] | Float[Array, "h w"],
+    depth: Integer[Array, "h w"] | Float[Array, "h w"],
+    depth_scale: Float[Array, ""] | float,
+    levels: int = LEVELS,
+) -> Pyramid:
+    """Pyramid of a frame from its raw images.
+
+    Args:
+        grey: [H, W] intensity, 0 to 255, of any number type.
+        depth: [H, W]; z = depth / depth_scale in metres. 0, negative or non-finite means no reading.
+        depth_scale: Units of `depth` per metre (5000 for TUM's PNG files, 1 for metres).
+        levels: Number of levels, the full image included.
+
+    Returns:
+        A tuple of `PyramidLevel`, level 0 (the full image) first.
+    """
+    z = depth.astype(jnp.float32)
+    inverse = jnp.where((z > 0) & jnp.isfinite(z), depth_scale / jnp.where(z > 0, z, 1.0), 0.0)
+    grey = jnp.nan_to_num(grey.astype(jnp.float32))
+    pyramid = [PyramidLevel(grey, inverse)]
+    for _ in range(levels - 1):
+        pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
+    return tuple(pyramid)

@@ -1,0 +1,218 @@
+"""The files of one run: trajectory.txt and frames.csv grow with it, config.json opens and metrics.json closes it."""
+
+import csv
+import dataclasses
+import enum
+import json
+import math
+import os
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import jax
+import numpy as np
+
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry import Step
+from gavo_jax.plots import FORMATS as FIGURE_FORMATS
+from gavo_jax.trajectory import format_tum_row
+
+TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
+
+TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
+DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
+FRAME_COLUMNS = (
+    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "lost") + DEVIATIONS + ("milliseconds",)
+)
+"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, deviations of the
+motion's translation (m) and rotation (rad) along the axes of the reference camera."""
+
+
+class RunFolder:
+    """A folder that receives the files of one run; use it in a `with` block.
+
+    Every frame's row is on disk as soon as it is added, so that a run that is cut short leaves what it had; only a run
+    that came to its end has a metrics.json.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Make the folder where it is missing.
+
+        Raises:
+            GavoError: it is no folder or cannot be written to.
+        """
+        self.folder = prepare_folder(folder)
+        self._files = ExitStack()
+
+    def start(self, config: Mapping[str, Any], timestamp: float) -> None:
+        """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
+
+        Args:
+            config: the effective configuration.
+            timestamp: of the first frame, seconds.
+
+        Raises:
+            GavoError: a file cannot be written.
+        """
+        remove_files(self.folder, METRICS, CONFIG, TRAJECTORY, FRAMES)
+        remove_figures(self.folder)
+        write_json(self.folder / CONFIG, config)
+        try:
+            self._trajectory = self._files.enter_context((self.folder / TRAJECTORY).open("w", encoding="utf-8"))
+            self._frames = self._files.enter_context((self.folder / FRAMES).open("w", encoding="utf-8", newline=""))
+        except OSError as error:
+            raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
+        self._rows = csv.writer(self._frames, lineterminator="\n")
+        self._rows.writerow(FRAME_COLUMNS)
+        self._trajectory.write(f"{TRAJECTORY_HEADER}\n{format_tum_row(timestamp, np.eye(4))}\n")
+        self._flush()
+
+    def add(self, step: Step) -> None:
+        """Append one frame: its pose and its pair's row.
+
+        Raises:
+            GavoError: the disk is full, or the like.
+        """
+        self._rows.writerow(frame_row(step))
+        self._trajectory.write(format_tum_row(step.timestamp, step.world_T_camera) + "\n")
+        self._flush()
+
+    def finish(self, metrics: Mapping[str, Any]) -> None:
+        """Write metrics.json, whole or not at all.
+
+        Raises:
+            GavoError: it cannot be written.
+        """
+        write_json(self.folder / METRICS, metrics)
+
+    def _flush(self) -> None:
+        try:
+            self._trajectory.flush()
+            self._frames.flush()
+        except OSError as error:
+            raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._files.close()
+
+
+def frame_row(step: Step) -> list[Any]:
+    """Return the values of `FRAME_COLUMNS` of one step; numbers in the shortest digits that read back exactly."""
+    alignment = step.alignment
+    deviations = np.sqrt(np.maximum(np.diag(np.asarray(alignment.covariance, np.float64)), 0.0))
+    return [
+        step.index,
+        f"{step.reference_timestamp:.6f}",
+        f"{step.timestamp:.6f}",
+        _digits(alignment.error),
+        _digits(alignment.overlap),
+        alignment.status.name.lower(),
+        int(step.lost),
+        *map(_digits, deviations),
+        f"{step.milliseconds:.3f}",
+    ]
+
+
+def environment() -> dict[str, str]:
+    """Return the versions that decide a result."""
+    try:
+        own = version("gavo-jax")
+    except PackageNotFoundError:
+        own = "not installed"
+    return {
+        "gavo-jax": own,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def describe(value: Any) -> Any:
+    """Return a value as JSON knows it: settings with the name of their type, arrays as lists, not-a-number as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        entries = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {"type": type(value).__name__, **entries}
+    if isinstance(value, enum.Enum):
+        return value.name.lower()
+    if isinstance(value, Mapping):
+        return {str(key): describe(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return describe(np.asarray(value).tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [describe(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    return getattr(value, "__name__", str(value))
+
+
+def prepare_folder(folder: str | Path) -> Path:
+    """Make a folder where it is missing, see that files can be made in it, and return it.
+
+    Raises:
+        GavoError: it is no folder or cannot be written to.
+    """
+    folder = Path(folder)
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise GavoError(f"{folder}: output folder is not a folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise GavoError(f"{folder}: output folder cannot be written to: {error.strerror or error}") from None
+    return folder
+
+
+def remove_files(folder: Path, *names: str) -> None:
+    """Remove files of an earlier run, where there are any.
+
+    Raises:
+        GavoError: one cannot be removed.
+    """
+    for name in names:
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise GavoError(f"{folder / name}: cannot be replaced: {error.strerror or error}") from None
+
+
+def remove_figures(folder: Path) -> None:
+    """Remove an earlier run's figures, where there are any.
+
+    Raises:
+        GavoError: one cannot be removed.
+    """
+    stems = (TRAJECTORY_FIGURE, DISTANCE_FIGURE)
+    remove_files(folder, *(f"{stem}.{suffix}" for stem in stems for suffix in FIGURE_FORMATS))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value (see `describe`) as JSON, whole or not at all.
+
+    Raises:
+        GavoError: the file cannot be written.
+    """
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text(json.dumps(describe(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def _digits(value: Any) -> str:
+    return np.format_float_positional(value, unique=True) if np.isfinite(value) else str(float(value))

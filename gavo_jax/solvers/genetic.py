@@ -1,0 +1,172 @@
+"""The genetic algorithm of the paper, equations (8) to (14), and the offspring that makes it precise.
+
+With `spread` and `mutation_step` left out every operator is the paper's: a population uniform within the bounds,
+fitness f = exp(−8 E/E_min), a roulette wheel by cumulative sum, 30 % mutants ξ' = ξ + p_m (ξ^U − ξ^L) randn,
+intermediate crossover with a random α a gene, parents and offspring merged, sorted, and the best kept.
+
+In preconditioned coordinates (`Problem`) E is close to a round bowl, so two things change: the population starts as a
+normal cloud and the mutation's step is a number of grey levels that falls within each level. A third is added: one
+offspring a generation is bred from the whole population, at the minimum of a quadratic fitted to its errors. It uses
+evaluations only, no derivative, and replaces the slow last third of a search (`benchmarks/ablation.py`).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Integer, PRNGKeyArray
+
+from gavo_jax.objective import Problem
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static
+
+
+class GeneticState(NamedTuple):
+    """A population in the order of its errors, its offspring yet to be evaluated, and the mutation's present step."""
+
+    population: Float[Array, "p 6"]
+    error: Float[Array, " p"]
+    offspring: Float[Array, "p 6"]
+    mutation_step: Float[Array, " 6"]
+    bounds: Bounds
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GeneticAlgorithm(PerLevel):
+    """The paper's genetic algorithm.
+
+    Attributes:
+        population: Chromosomes (static, an entry a level).
+        iterations: Largest number of generations (static, an entry a level; 0 skips the level).
+        patience: Generations without progress that end a level (static).
+        mutants: Share of the offspring that are mutants, 0.3 in the paper (static); the rest are crossed.
+        surrogate: Whether one offspring is bred from a quadratic fit to the population (static).
+        spread: Standard deviation of the first population about the guess, search units, an entry a level; None
+            draws it uniformly within the bounds (9).
+        mutation_step: First standard deviation of a mutation, search units, an entry a level; None takes
+            δ = mutation_rate (ξ^U − ξ^L) (12).
+        mutation_decay: Factor on the step from generation to generation; 1 in the paper.
+        mutation_rate: p_m, 0.1 in the paper.
+        crossover_range: d of the intermediate crossover: α is uniform in [−d, 1 + d] (13).
+        pressure: Factor in the fitness, 8 in the paper (10).
+    """
+
+    population: tuple[int, ...] = static((0, 12, 16, 24, 64))
+    iterations: tuple[int, ...] = static((0, 5, 6, 8, 12))
+    patience: int = static(1000)
+    mutants: float = static(0.3)
+    surrogate: bool = static(True)
+    spread: tuple[float, ...] | None = (0.5, 0.5, 1.0, 1.5, 6.0)
+    mutation_step: tuple[float, ...] | None = (1.0, 1.0, 2.0, 3.0, 6.0)
+    mutation_decay: float = 0.8
+    mutation_rate: float = 0.1
+    crossover_range: float = 0.25
+    pressure: float = 8.0
+
+    def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GeneticState:
+        """First population (9)."""
+        del problem
+        x = first_candidates(key, self.population, self.spread, guess, bounds)
+        step = self.mutation_rate * (bounds.upper - bounds.lower)
+        if self.mutation_step is not None:
+            step = jnp.full(6, self.mutation_step)
+        return GeneticState(x, jnp.full(self.population, jnp.inf), x, step, bounds)
+
+    def step(self, key: PRNGKeyArray, state: GeneticState, problem: Problem) -> GeneticState:
+        """One generation: evaluate the newcomers, keep the best (14), then select, cross and mutate."""
+        new_error, _ = problem.score(state.offspring)
+        x = jnp.concatenate([state.population, state.offspring])
+        error = jnp.concatenate([state.error, new_error])
+        keep = jnp.argsort(error)[: self.population]
+        state = state._replace(population=x[keep], error=error[keep])
+        cross_key, mutate_key = jax.random.split(key)
+        mutants = round(self.mutants * self.population)
+        crossed = self.population - mutants - self.surrogate
+        offspring = [self._cross(cross_key, state, crossed), self._mutate(mutate_key, state, mutants)]
+        if self.surrogate:
+            offspring.append(surrogate_minimum(state.population, state.error)[None])
+        new = jnp.clip(jnp.concatenate(offspring), state.bounds.lower, state.bounds.upper)
+        return state._replace(offspring=new, mutation_step=state.mutation_step * self.mutation_decay)
+
+    def best(self, state: GeneticState) -> Best:
+        """The first of the sorted population."""
+        return Best(state.population[0], state.error[0])
+
+    def candidates(self, state: GeneticState) -> Candidates:
+        """The population, best first."""
+        return Candidates(state.population, state.error)
+
+    def _select(self, key: PRNGKeyArray, error: Float[Array, " p"], count: int) -> Integer[Array, " n"]:
+        """Roulette wheel (11): indices drawn in proportion to the fitness f = exp(−8 E/E_min) (10)."""
+        fitness = jnp.exp(-self.pressure * (error / jnp.maximum(error[0], 1e-12) - 1.0))
+        wheel = jnp.cumsum(jnp.where(jnp.isfinite(error), fitness, 0.0))
+        draws = jax.random.uniform(key, (count,)) * wheel[-1]
+        return jnp.minimum(jnp.searchsorted(wheel, draws), error.shape[0] - 1)
+
+    def _cross(self, key: PRNGKeyArray, state: GeneticState, count: int) -> Float[Array, "n 6"]:
+        """Intermediate crossover with an extra range (13): a + α (b − a), α drawn for every gene."""
+        select_key, alpha_key = jax.random.split(key)
+        parents = state.population[self._select(select_key, state.error, 2 * count)]
+        first, second = parents[:count], parents[count:]
+        width = self.crossover_range
+        alpha = -width + (1.0 + 2.0 * width) * jax.random.uniform(alpha_key, first.shape)
+        return first + alpha * (second - first)
+
+    def _mutate(self, key: PRNGKeyArray, state: GeneticState, count: int) -> Float[Array, "n 6"]:
+        """Mutation (12): ξ' = ξ + δ randn, of chromosomes drawn by the wheel."""
+        select_key, noise_key = jax.random.split(key)
+        chosen = state.population[self._select(select_key, state.error, count)]
+        return chosen + state.mutation_step * jax.random.normal(noise_key, chosen.shape)
+
+
+def first_candidates(
+    key: PRNGKeyArray,
+    count: int,
+    spread: float | tuple[float, ...] | None,
+    guess: Float[Array, "g 6"],
+    bounds: Bounds,
+) -> Float[Array, "p 6"]:
+    """First population: the guesses themselves, then a cloud about them, or uniform draws where `spread` is None."""
+    about = guess[jnp.arange(count) % guess.shape[0]]
+    if spread is None:
+        x = bounds.lower + (bounds.upper - bounds.lower) * jax.random.uniform(key, (count, 6))
+    else:
+        x = about + jnp.asarray(spread) * jax.random.normal(key, (count, 6))
+    kept = jnp.arange(count)[:, None] < guess.shape[0]
+    return jnp.clip(jnp.where(kept, about, x), bounds.lower, bounds.upper)
+
+
+_PAIRS = jnp.triu_indices(6, 1)
+RIDGE = 0.1
+"""How strongly the fit leans to a round bowl; the problem's coordinates make it nearly one."""
+
+
+def surrogate_minimum(x: Float[Array, "p 6"], error: Float[Array, " p"]) -> Float[Array, " 6"]:
+    """Minimum of a quadratic fitted to evaluated candidates, best first, by weighted ridge regression.
+
+    The bowl's mean curvature is fitted freely and its departures from roundness are shrunk, so that a population
+    smaller than the 28 coefficients still gives a sound step. Candidates far above the best weigh little, and the
+    step is held within four times the population's spread.
+    """
+    finite = jnp.isfinite(error)
+    offset = jnp.where(finite[:, None], x - x[0], 0.0)
+    count = jnp.maximum(jnp.sum(finite), 1)
+    radius = jnp.sqrt(jnp.sum(offset**2) / (6.0 * count)) + 1e-6
+    z = offset / radius
+    height = jnp.where(finite, error - error[0], 0.0)
+    height = height / (jnp.sum(height) / count + 1e-12)
+    weight = finite / (1.0 + height) ** 2
+    square = jnp.sum(z**2, axis=1, keepdims=True)
+    features = jnp.concatenate(
+        [jnp.ones_like(square), z, square, z**2 - square / 6.0, z[:, _PAIRS[0]] * z[:, _PAIRS[1]]], axis=1
+    )
+    penalty = jnp.concatenate([jnp.full(8, 1e-6), jnp.full(21, RIDGE)]) * jnp.sum(weight)
+    weighted = features * weight[:, None]
+    fit = jax.scipy.linalg.solve(weighted.T @ features + jnp.diag(penalty), weighted.T @ height, assume_a="pos")
+    slope, bowl, uneven = fit[1:7], fit[7], fit[8:14] - jnp.mean(fit[8:14])
+    cross = jnp.zeros((6, 6)).at[_PAIRS].set(fit[14:])
+    values, vectors = jnp.linalg.eigh(jnp.diag(2.0 * (bowl + uneven)) + cross + cross.T)
+    step = -vectors @ ((vectors.T @ slope) / jnp.maximum(values, 0.2 * jnp.maximum(bowl, 1e-3)))
+    step = step * jnp.minimum(1.0, 4.0 / jnp.maximum(jnp.linalg.norm(step), 1e-9))
+    return x[0] + radius * jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0)

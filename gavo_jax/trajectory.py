@@ -1,0 +1,272 @@
+"""Trajectories of a camera: TUM and KITTI files, interpolation and association by time."""
+
+import heapq
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gavo_jax.errors import GavoError, data_rows
+
+MAX_GAP = 0.1
+"""Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
+
+MAX_MAGNITUDE = 1e9
+"""Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Where a camera was, when.
+
+    Attributes:
+        timestamps: seconds.
+        world_T_camera: rigid transforms from the camera's frame (x right, y down, z forward) into the world, metres.
+    """
+
+    timestamps: Float[np.ndarray, " n"]
+    world_T_camera: Float[np.ndarray, "n 4 4"]
+
+    def __post_init__(self) -> None:
+        """Hold both as float64 arrays; raise ValueError where their shapes do not belong together."""
+        timestamps = np.asarray(self.timestamps, np.float64)
+        world_T_camera = np.asarray(self.world_T_camera, np.float64)
+        if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
+            raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
+        object.__setattr__(self, "timestamps", timestamps)
+        object.__setattr__(self, "world_T_camera", world_T_camera)
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.timestamps)
+
+    @staticmethod
+    def read_tum(path: str | Path) -> "Trajectory":
+        """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
+
+        Rows come back in the order of their stamps; of rows with equal stamps the first is kept. Quaternions are
+        normalised.
+
+        Raises:
+            GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, not finite, absurdly
+                large or without a rotation (zero quaternion).
+        """
+        rows = [_parse_tum_row(place, fields) for place, fields in data_rows(path)]
+        if not rows:
+            raise GavoError(f"{path}: holds no trajectory (no rows)")
+        table = np.array(rows)
+        _, first = np.unique(table[:, 0], return_index=True)
+        table = table[first]
+        world_T_camera = np.zeros((len(table), 4, 4))
+        world_T_camera[:, :3, :3] = rotation_from_quaternion(table[:, 4:])
+        world_T_camera[:, :3, 3] = table[:, 1:4]
+        world_T_camera[:, 3, 3] = 1.0
+        return Trajectory(table[:, 0], world_T_camera)
+
+    def write_tum(self, path: str | Path) -> None:
+        """Write rows of `timestamp tx ty tz qx qy qz qw` that read back to the last digit.
+
+        Raises:
+            GavoError: the file cannot be written; nothing is left under its name then.
+        """
+        rows = map(format_tum_row, self.timestamps, self.world_T_camera)
+        _write_lines(path, ["# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)", *rows])
+
+    def write_kitti(self, path: str | Path) -> None:
+        """Write the upper 3×4 of each matrix, row by row, twelve numbers a line (KITTI odometry format, no stamps).
+
+        Raises:
+            GavoError: the file cannot be written; nothing is left under its name then.
+        """
+        rows = self.world_T_camera[:, :3].reshape(len(self), 12)
+        _write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
+
+    def interpolate(
+        self, timestamps: Float[np.ndarray, " m"], max_gap: float = MAX_GAP
+    ) -> tuple[Float[np.ndarray, "m 4 4"], Bool[np.ndarray, " m"]]:
+        """Return `world_T_camera` at other stamps, between the samples around: translation linear, rotation by slerp.
+
+        Args:
+            timestamps: seconds, in any order.
+            max_gap: seconds; a stamp between two samples further apart than this is not valid.
+
+        Returns:
+            Transforms, NaN where not valid, and the mask of the valid ones: those on a sample or between two near ones.
+        """
+        timestamps = np.asarray(timestamps, np.float64)
+        order = np.argsort(self.timestamps, kind="stable")
+        times, samples = self.timestamps[order], self.world_T_camera[order]
+        result = np.full((len(timestamps), 4, 4), np.nan)
+        valid = np.zeros(len(timestamps), bool)
+        if len(times) == 0:
+            return result, valid
+        right = np.clip(np.searchsorted(times, timestamps), 0, len(times) - 1)
+        left = np.where(times[right] == timestamps, right, np.maximum(right - 1, 0))
+        gap = times[right] - times[left]
+        valid = (times[left] <= timestamps) & (timestamps <= times[right]) & (gap <= max_gap)
+        fraction = np.divide(timestamps - times[left], gap, out=np.zeros_like(gap), where=gap > 0)[valid]
+        start, end = samples[left[valid]], samples[right[valid]]
+        between = np.zeros((len(fraction), 4, 4))
+        between[:, :3, :3] = rotation_from_quaternion(
+            _slerp(
+                quaternion_from_rotation(start[:, :3, :3]), quaternion_from_rotation(end[:, :3, :3]), fraction[:, None]
+            )
+        )
+        between[:, :3, 3] = start[:, :3, 3] + fraction[:, None] * (end[:, :3, 3] - start[:, :3, 3])
+        between[:, 3, 3] = 1.0
+        result[valid] = between
+        return result, valid
+
+
+def format_tum_row(timestamp: float, world_T_camera: Float[np.ndarray, "4 4"]) -> str:
+    """Return `timestamp tx ty tz qx qy qz qw` without a line end: shortest digits that read back exactly, qw ≥ 0.
+
+    Stamps have at least 6 decimals, the rest at least 9; never an exponent.
+    """
+    world_T_camera = np.asarray(world_T_camera, np.float64)
+    values = [*world_T_camera[:3, 3], *quaternion_from_rotation(world_T_camera[:3, :3])]
+    return " ".join([_digits(timestamp, 6), *(_digits(value, 9) for value in values)])
+
+
+def associate(
+    a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"], max_difference: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Pair stamps of two lists, one to one: the closest pair first, then the closest of what is left, and so on.
+
+    The rule of TUM's `associate.py`: all pairs with |a_i − b_j| < max_difference, sorted by that difference, are taken
+    in turn where both are still free. The closest free pair is always adjacent in the merged order of what is left, so
+    a heap of neighbours does it in O(n log n) whatever max_difference is.
+
+    Returns:
+        Indices into `a` and into `b`, in the order of a's stamps.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    order = np.argsort(np.concatenate([a, b]), kind="stable")
+    stamps, source = np.concatenate([a, b])[order].tolist(), order.tolist()
+    count = len(order)
+    before, after = list(range(-1, count - 1)), list(range(1, count + 1))
+    heap: list[tuple[float, float, int, int]] = []
+
+    def offer(i: int, j: int) -> None:
+        if 0 <= i and j < count and (source[i] < len(a)) != (source[j] < len(a)):
+            difference = stamps[j] - stamps[i]
+            if difference < max_difference:
+                heapq.heappush(heap, (difference, stamps[i], i, j))
+
+    for i in range(count - 1):
+        offer(i, i + 1)
+    free = [True] * count
+    pairs = []
+    while heap:
+        _, _, i, j = heapq.heappop(heap)
+        if free[i] and free[j]:
+            free[i] = free[j] = False
+            pairs.append(sorted((source[i], source[j])))
+            left, right = before[i], after[j]
+            if left >= 0:
+                after[left] = right
+            if right < count:
+                before[right] = left
+            offer(left, right)
+    table = np.array(pairs, np.int64).reshape(-1, 2)
+    table = table[np.argsort(a[table[:, 0]], kind="stable")]
+    return table[:, 0], table[:, 1] - len(a)
+
+
+def rotation_from_quaternion(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Return the rotation matrix of a quaternion (x, y, z, w) of any length but zero."""
+    quaternion = np.asarray(quaternion, np.float64)
+    x, y, z, w = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Return the unit quaternion (x, y, z, w), w ≥ 0, of a rotation matrix.
+
+    4 q qᵀ is linear in the matrix; its column under the largest diagonal entry is q up to a well-conditioned factor.
+    """
+    m = np.asarray(rotation, np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    xw, yw, zw = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    columns = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, xy, xz, xw], axis=-1),
+            np.stack([xy, 1 - xx + yy - zz, yz, yw], axis=-1),
+            np.stack([xz, yz, 1 - xx - yy + zz, zw], axis=-1),
+            np.stack([xw, yw, zw, 1 + xx + yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.diagonal(columns, axis1=-2, axis2=-1), axis=-1)
+    quaternion = np.take_along_axis(columns, largest[..., None, None], axis=-2)[..., 0, :]
+    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
+
+def inverse(a_T_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Return `b_T_a` of rigid transforms, by transposing the rotation."""
+    a_T_b = np.asarray(a_T_b, np.float64)
+    b_T_a = np.zeros_like(a_T_b)
+    b_T_a[..., :3, :3] = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    b_T_a[..., :3, 3] = -np.einsum("...ij,...j->...i", b_T_a[..., :3, :3], a_T_b[..., :3, 3])
+    b_T_a[..., 3, 3] = 1.0
+    return b_T_a
+
+
+def _slerp(
+    start: Float[np.ndarray, "m 4"], end: Float[np.ndarray, "m 4"], fraction: Float[np.ndarray, "m 1"]
+) -> Float[np.ndarray, "m 4"]:
+    """Interpolate unit quaternions along the shorter arc at constant speed (Shoemake 1985)."""
+    cosine = np.sum(start * end, axis=-1, keepdims=True)
+    end = np.where(cosine < 0, -end, end)
+    angle = 2 * np.arctan2(
+        np.linalg.norm(end - start, axis=-1, keepdims=True), np.linalg.norm(end + start, axis=-1, keepdims=True)
+    )
+    sine = np.sin(angle)
+    small = sine < 1e-9
+    safe = np.where(small, 1.0, sine)
+    weight_start = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / safe)
+    weight_end = np.where(small, fraction, np.sin(fraction * angle) / safe)
+    return weight_start * start + weight_end * end
+
+
+def _parse_tum_row(place: str, fields: list[str]) -> list[float]:
+    if len(fields) != 8:
+        raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
+    try:
+        values = [float(field) for field in fields]
+    except ValueError:
+        raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found text") from None
+    if not all(map(math.isfinite, values)):
+        raise GavoError(f"{place}: holds a value that is not finite")
+    if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_MAGNITUDE**2:
+        raise GavoError(f"{place}: holds an absurdly large value")
+    if math.hypot(*values[4:]) < 1e-6:
+        raise GavoError(f"{place}: its quaternion is zero, which is no rotation")
+    return values
+
+
+def _digits(value: float, decimals: int) -> str:
+    return np.format_float_positional(float(value) + 0.0, unique=True, min_digits=decimals)
+
+
+def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    """Write a text file whole or not at all: beside it first, then renamed into place."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None

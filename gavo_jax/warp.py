@@ -1,0 +1,221 @@
+"""The warp ω(ξ, p) = P(g(ξ) P⁻¹(p)) and the sampling of the target image, equations (3) to (8).
+
+The reference's points are kept as separate flat arrays of ray coordinates and inverse depth, and the target's 2x2
+neighbourhoods are packed into one 32-bit word a pixel, so that a residual costs one gather: on a CPU this is what
+decides the speed of the whole program (`benchmarks/kernel.py` prints by how much).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from gavo_jax.camera import Camera
+
+INVERSE_DEPTH_STEP = 1.0 / 8192.0
+"""1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a hundredth of the sensor's noise."""
+SLOPE_STEP = 1.0 / 4096.0
+"""1/m a pixel and unit of the packed inverse-depth slopes (signed 8 bits)."""
+
+
+def exp(xi: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
+    """g(ξ) = exp(ξ̂) of a twist ξ = (v, w), translation (m) first, rotation in radians. Equation (3)."""
+    return jaxlie.SE3.exp(xi).as_matrix()
+
+
+def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
+    """ξ of a rigid motion, the inverse of `exp`."""
+    return jaxlie.SE3.from_matrix(transform).log()
+
+
+def _generators() -> np.ndarray:
+    basis = np.zeros((4, 4, 6), np.float32)
+    for i in range(3):
+        basis[i, 3, i] = 1.0
+        j, k = (i + 1) % 3, (i + 2) % 3
+        basis[k, j, 3 + i], basis[j, k, 3 + i] = 1.0, -1.0
+    return basis
+
+
+GENERATORS = _generators()
+"""[4, 4, 6]: ξ̂ = GENERATORS · ξ, and the derivative of `exp` at 0."""
+
+
+def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
+    """J with exp(ξ + δ) ≈ exp(ξ) exp(J δ), to second order in ξ: I − ad/2 + ad²/6."""
+
+    def cross(a: jax.Array) -> jax.Array:
+        return jnp.asarray(GENERATORS[:3, :3, 3:]) @ a
+
+    v, w = cross(xi[:3]), cross(xi[3:])
+    adjoint = jnp.block([[w, v], [jnp.zeros((3, 3)), w]])
+    return jnp.eye(6) - 0.5 * adjoint + adjoint @ adjoint / 6.0
+
+
+class Points(NamedTuple):
+    """Points of the reference frame as inverse-depth rays: P⁻¹(p) = (x, y, 1)/q. Flat arrays of N."""
+
+    x: Float[Array, " n"]
+    y: Float[Array, " n"]
+    q: Float[Array, " n"]
+    """Inverse depth, 1/m; 0 marks a point without a reading."""
+
+
+class Warped(NamedTuple):
+    """Reference points seen by the target camera."""
+
+    u: Float[Array, " n"]
+    v: Float[Array, " n"]
+    inverse_depth: Float[Array, " n"]
+    """1/z in the target camera, 1/m."""
+    inside: Float[Array, " n"]
+    """1 where the point has a reading, lies before the camera and inside the image, else 0."""
+
+
+def synchronise_depth(
+    inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
+) -> Float[Array, "h w"]:
+    """Inverse depth as the camera would have read it at the colour image's moment.
+
+    A structured-light camera's depth and colour images are not exposed together: TUM's pairs lie up to 20 ms apart,
+    at handheld speed several pixels. Each pixel looks up, in the depth image, where its point was when that was taken.
+
+    Args:
+        inverse_depth: [h, w] 1/m, 0 = no reading, seen by the camera where it stood when depth was read.
+        camera: Camera of the image.
+        depth_T_colour: Maps points of the camera at the colour image's moment into the camera at the depth image's.
+    """
+    height, width = inverse_depth.shape
+    x = jnp.broadcast_to((jnp.arange(width) - camera.cx) / camera.fx, (height, width)).reshape(-1)
+    y = jnp.broadcast_to(((jnp.arange(height) - camera.cy) / camera.fy)[:, None], (height, width)).reshape(-1)
+    flat = inverse_depth.reshape(-1)
+    r, t = depth_T_colour[:3, :3], depth_T_colour[:3, 3]
+    depth = r[2, 0] * x + r[2, 1] * y + (r[2, 2] + t[2] * flat)
+    u = camera.fx * (r[0, 0] * x + r[0, 1] * y + (r[0, 2] + t[0] * flat)) / depth + camera.cx
+    v = camera.fy * (r[1, 0] * x + r[1, 1] * y + (r[1, 2] + t[1] * flat)) / depth + camera.cy
+    inside = (depth > 1e-3) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+    column = jnp.clip((u + 0.5).astype(jnp.int32), 0, width - 1)
+    row = jnp.clip((v + 0.5).astype(jnp.int32), 0, height - 1)
+    read = jnp.where(inside, flat[jnp.where(inside, row * width + column, 0)], 0.0)
+    x_read = (column.astype(jnp.float32) - camera.cx) / camera.fx
+    y_read = (row.astype(jnp.float32) - camera.cy) / camera.fy
+    back = jnp.linalg.inv(depth_T_colour)
+    depth_back = back[2, 0] * x_read + back[2, 1] * y_read + (back[2, 2] + back[2, 3] * read)
+    return jnp.where(depth_back > 1e-3, read / depth_back, 0.0).reshape(height, width)
+
+
+class Target(NamedTuple):
+    """A level of the target frame, packed for sampling with one gather a channel."""
+
+    grey: UInt32[Array, "h w"]
+    """Four 8-bit grey levels of the 2x2 block that starts at the pixel: (v, u), (v, u+1), (v+1, u), (v+1, u+1)."""
+    depth: UInt32[Array, "h w"]
+    """16 bits of inverse depth (0 = no reading) and its slopes along u and v, 8 bits each."""
+
+
+def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera) -> Warped:
+    """ω(ξ, p) for every reference point, equations (4) to (8), for one motion."""
+    r, t = target_T_reference[:3, :3], target_T_reference[:3, 3]
+    x, y, q = points
+    depth = r[2, 0] * x + r[2, 1] * y + (r[2, 2] + t[2] * q)
+    before = depth > 1e-3
+    per_depth = 1.0 / jnp.where(before, depth, 1.0)
+    u = camera.fx * (r[0, 0] * x + r[0, 1] * y + (r[0, 2] + t[0] * q)) * per_depth + camera.cx
+    v = camera.fy * (r[1, 0] * x + r[1, 1] * y + (r[1, 2] + t[1] * q)) * per_depth + camera.cy
+    inside = before & (q > 0) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    return Warped(u, v, q * per_depth, inside.astype(jnp.float32))
+
+
+def pack_grey(grey: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
+    """The 2x2 neighbourhood of every pixel in one word; rounding to 8 bits is far below the image's noise."""
+    rounded = jnp.clip(jnp.round(grey), 0, 255).astype(jnp.uint32)
+    right = jnp.concatenate([rounded[:, 1:], rounded[:, -1:]], axis=1)
+    pair = rounded | (right << 8)
+    below = jnp.concatenate([pair[1:], pair[-1:]], axis=0)
+    return pair | (below << 16)
+
+
+def inverse_depth_slopes(inverse_depth: Float[Array, "h w"], limit: float = 0.1) -> tuple[jax.Array, jax.Array]:
+    """∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from whichever neighbours lie on the same surface; 0 where none does.
+
+    `limit` is the largest relative step between neighbours that is still one surface.
+    """
+
+    def along(q: jax.Array, axis: int) -> jax.Array:
+        ahead = jnp.roll(q, -1, axis) - q
+        behind = q - jnp.roll(q, 1, axis)
+        count_ahead = (jnp.roll(q, -1, axis) > 0) & (jnp.abs(ahead) < limit * q)
+        count_behind = (jnp.roll(q, 1, axis) > 0) & (jnp.abs(behind) < limit * q)
+        total = jnp.where(count_ahead, ahead, 0.0) + jnp.where(count_behind, behind, 0.0)
+        return total / jnp.maximum(count_ahead.astype(jnp.float32) + count_behind, 1.0)
+
+    return along(inverse_depth, 1), along(inverse_depth, 0)
+
+
+def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
+    """Inverse depth and its slopes in one word: a local plane, so that sampling between pixels needs no neighbours."""
+    along_u, along_v = inverse_depth_slopes(inverse_depth)
+    value = jnp.clip(jnp.round(inverse_depth / INVERSE_DEPTH_STEP), 0, 65535).astype(jnp.uint32)
+
+    def slope(s: jax.Array) -> jax.Array:
+        return (jnp.clip(jnp.round(s / SLOPE_STEP), -127, 127) + 128).astype(jnp.uint32)
+
+    return value | (slope(along_u) << 16) | (slope(along_v) << 24)
+
+
+def pack_target(grey: Float[Array, "h w"], inverse_depth: Float[Array, "h w"]) -> Target:
+    """Pack a pyramid level for sampling."""
+    return Target(pack_grey(grey), pack_depth(inverse_depth))
+
+
+def _byte(word: jax.Array, shift: int) -> jax.Array:
+    return ((word >> shift) & 255).astype(jnp.int32).astype(jnp.float32)
+
+
+def _take(packed: UInt32[Array, "h w"], row: jax.Array, column: jax.Array, inside: jax.Array) -> jax.Array:
+    index = jnp.where(inside > 0, row * packed.shape[1] + column, 0)
+    return packed.reshape(-1).at[index].get(mode="promise_in_bounds")
+
+
+class GreySample(NamedTuple):
+    """Bilinear intensity at the warped points and its exact derivative along u and v (grey levels a pixel)."""
+
+    value: Float[Array, " n"]
+    along_u: Float[Array, " n"]
+    along_v: Float[Array, " n"]
+
+
+def sample_grey(packed: UInt32[Array, "h w"], warped: Warped) -> GreySample:
+    """I_{t+1}(ω(ξ, p)), bilinear; anything outside the image samples pixel 0 and must be masked by `inside`."""
+    u, v = warped.u, warped.v
+    column, row = u.astype(jnp.int32), v.astype(jnp.int32)
+    a, b = u - column.astype(jnp.float32), v - row.astype(jnp.float32)
+    word = _take(packed, row, column, warped.inside)
+    top_left, top_right, low_left, low_right = _byte(word, 0), _byte(word, 8), _byte(word, 16), _byte(word, 24)
+    top = top_left + a * (top_right - top_left)
+    low = low_left + a * (low_right - low_left)
+    along_u = (top_right - top_left) + b * ((low_right - low_left) - (top_right - top_left))
+    return GreySample(top + b * (low - top), along_u, low - top)
+
+
+class DepthSample(NamedTuple):
+    """Inverse depth at the warped points (1/m), its slopes (1/m a pixel), and whether there is a reading (0 or 1)."""
+
+    value: Float[Array, " n"]
+    along_u: Float[Array, " n"]
+    along_v: Float[Array, " n"]
+    valid: Float[Array, " n"]
+
+
+def sample_depth(packed: UInt32[Array, "h w"], warped: Warped) -> DepthSample:
+    """Inverse depth of the target's surface at the warped points, from the nearest pixel's plane."""
+    column, row = (warped.u + 0.5).astype(jnp.int32), (warped.v + 0.5).astype(jnp.int32)
+    word = _take(packed, row, column, warped.inside)
+    value = (word & 65535).astype(jnp.int32).astype(jnp.float32) * INVERSE_DEPTH_STEP
+    along_u = (_byte(word, 16) - 128.0) * SLOPE_STEP
+    along_v = (_byte(word, 24) - 128.0) * SLOPE_STEP
+    plane = value + along_u * (warped.u - column.astype(jnp.float32)) + along_v * (warped.v - row.astype(jnp.float32))
+    return DepthSample(plane, along_u, along_v, (value > 0).astype(jnp.float32))

@@ -1,0 +1,29 @@
+"""Fixtures and settings shared by all tests."""
+
+import os
+from pathlib import Path
+
+# programs compiled by the tests are kept between runs; JAX reads this when it is imported, so it comes first
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "gavo-jax" / "test-jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+settings.register_profile("gavo", deadline=None, derandomize=True)
+settings.load_profile("gavo")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Return the folder of real TUM clips (fr1_xyz, fr1_desk, fr1_rpy).
+
+    Skips where GAVO_DATA does not name one; fails instead with GAVO_REQUIRE_DATA=1.
+    """
+    folder = os.environ.get("GAVO_DATA")
+    if folder and Path(folder).is_dir():
+        return Path(folder)
+    reason = f"GAVO_DATA is no folder: {folder}" if folder else "GAVO_DATA is not set: it names the real TUM clips"
+    if os.environ.get("GAVO_REQUIRE_DATA"):
+        pytest.fail(reason)
+    pytest.skip(reason)

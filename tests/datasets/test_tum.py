@@ -1,0 +1,330 @@
+"""TUM folders: association, decoding and what is refused when."""
+
+import shutil
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.tum import TumSequence, read_frame
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import Trajectory
+
+CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+STAMPS = [100.0 + i / 30 for i in range(6)]
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def color_image(i: int) -> np.ndarray:
+    return np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+
+
+def depth_image(i: int) -> np.ndarray:
+    return np.random.default_rng(100 + i).integers(0, 30000, (48, 64), dtype=np.uint16)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Six frames of 64×48 pixels, depth 5 ms after colour, with ground truth."""
+    folder = tmp_path / "clip"
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+    rgb, depth = ["# colour"], ["# depth"]
+    for i, stamp in enumerate(STAMPS):
+        (folder / f"rgb/{i}.png").write_bytes(png(color_image(i)))
+        (folder / f"depth/{i}.png").write_bytes(png(depth_image(i)))
+        rgb.append(f"{stamp:.6f} rgb/{i}.png")
+        depth.append(f"{stamp + 0.005:.6f} depth/{i}.png")
+    (folder / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (folder / "depth.txt").write_text("\n".join(depth) + "\n")
+    Trajectory(np.array(STAMPS), np.tile(np.eye(4), (6, 1, 1))).write_tum(folder / "groundtruth.txt")
+    return folder
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_frames_come_as_written(folder):
+    sequence: Sequence = TumSequence(folder, CAMERA, color=True)
+    sequence.check()
+    assert sequence.name == "clip" and len(sequence) == 6 and sequence.camera == CAMERA
+    np.testing.assert_allclose(sequence.timestamps, STAMPS, atol=1e-6)
+    for i, frame in enumerate(sequence):
+        assert isinstance(frame, Frame) and frame.timestamp == sequence.timestamps[i]
+        np.testing.assert_array_equal(frame.depth, depth_image(i))
+        assert frame.color is not None
+        np.testing.assert_array_equal(frame.color, color_image(i)[..., ::-1])
+        np.testing.assert_allclose(frame.grey, color_image(i) @ [0.114, 0.587, 0.299], atol=1)
+        assert frame.grey.dtype == np.uint8 and frame.depth.dtype == np.uint16
+    truth = sequence.ground_truth
+    assert truth is not None and len(truth) == 6
+
+
+def test_asking_for_colour_changes_nothing_else(folder):
+    plain, colored = TumSequence(folder, CAMERA)[2], TumSequence(folder, CAMERA, color=True)[2]
+    assert plain.color is None
+    np.testing.assert_array_equal(plain.grey, colored.grey)
+
+
+def test_slices_are_sequences(folder):
+    sequence = TumSequence(folder, CAMERA, name="mine")
+    part = sequence[1:6:2]
+    assert isinstance(part, TumSequence) and len(part) == 3
+    assert (part.name, part.camera, part.ground_truth) == ("mine", CAMERA, sequence.ground_truth)
+    np.testing.assert_array_equal(part.timestamps, sequence.timestamps[1:6:2])
+    np.testing.assert_array_equal(part[1:][0].depth, depth_image(3))
+    np.testing.assert_array_equal(part[-1].depth, depth_image(5))
+    assert len(sequence) == 6
+    for index in (3, -4):
+        with pytest.raises(IndexError):
+            part[index]
+    with pytest.raises(GavoError, match="no frames"):
+        sequence[6:].check()
+
+
+def test_association_is_one_to_one_and_in_the_order_of_colour_stamps(folder):
+    """A depth image is used once, by its nearest colour image, whatever the order of the lists."""
+    (folder / "rgb.txt").write_text(
+        "3.000 rgb/3.png\n1.000 rgb/0.png\n1.012 rgb/1.png\n2.000 rgb/2.png\n1.012 rgb/5.png\n"
+    )
+    (folder / "depth.txt").write_text("1.010 depth/1.png\n3.019 depth/3.png\n2.020 depth/2.png\n")
+    sequence = TumSequence(folder, CAMERA, color=True)
+    np.testing.assert_array_equal(sequence.timestamps, [1.012, 3.0])
+    assert sequence[0].color is not None
+    np.testing.assert_array_equal(sequence[0].color[..., ::-1], color_image(1))
+    np.testing.assert_array_equal(sequence[0].depth, depth_image(1))
+    np.testing.assert_array_equal(sequence[1].depth, depth_image(3))
+
+
+def test_a_missing_ground_truth_is_none(folder):
+    (folder / "groundtruth.txt").unlink()
+    assert TumSequence(folder, CAMERA).ground_truth is None
+
+
+def test_auto_camera_follows_the_folder_name(folder):
+    with pytest.raises(GavoError, match="--camera"):
+        TumSequence(folder)
+    renamed = folder.rename(folder.with_name("rgbd_dataset_freiburg3_clip"))
+    assert TumSequence(renamed).camera == Camera.preset("fr3")
+    (folder.parent / "link").symlink_to(renamed)
+    assert TumSequence(folder.parent / "link").camera == Camera.preset("fr3")
+    assert TumSequence(renamed, "fr1").camera == Camera.preset("fr1").rectified()
+
+
+def test_undistortion_belongs_to_the_sequence(folder):
+    lens = Camera(50.0, 50.0, 31.5, 23.5, 64, 48, (0.3, 0.0, 0.0, 0.0, 0.0))
+    sequence = TumSequence(folder, lens)
+    assert sequence.camera == CAMERA
+    grey, depth = lens.undistort(TumSequence(folder, CAMERA)[0].grey, depth_image(0))
+    np.testing.assert_array_equal(sequence[0].grey, grey)
+    np.testing.assert_array_equal(sequence[0].depth, depth)
+    assert (depth == 0).mean() > 0.1
+    raw = TumSequence(folder, lens, undistort=False)
+    assert raw.camera == lens
+    np.testing.assert_array_equal(raw[0].depth, depth_image(0))
+
+
+@pytest.mark.parametrize(
+    ("damage", "fault"),
+    [
+        (lambda f: shutil.rmtree(f), "no such folder"),
+        (lambda f: (f / "rgb.txt").unlink(), "rgb.txt: no such file"),
+        (lambda f: (f / "depth.txt").unlink(), "depth.txt: no such file"),
+        (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "rgb.txt: lists no images"),
+        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "rgb.txt: not a text"),
+        (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2.png\nnot a line at all"), "depth.txt:5: "),
+        (lambda f: edit(f / "depth.txt", "depth/2.png", ""), "depth.txt:4: "),
+        (lambda f: edit(f / "rgb.txt", "100.000000", "nan"), "rgb.txt:2: not a time stamp"),
+        (lambda f: edit(f / "rgb.txt", "rgb/3.png", "../clip2/3.png"), "rgb.txt:5: path leaves"),
+        (lambda f: edit(f / "rgb.txt", "rgb/3.png", "/etc/passwd"), "rgb.txt:5: path leaves"),
+        (lambda f: edit(f / "rgb.txt", "rgb/3.png", "rgb/\0.png"), "rgb.txt:5: not a usable path"),
+        (lambda f: edit(f / "depth.txt", "100.", "900."), "no stamps"),
+        (lambda f: (f / "groundtruth.txt").write_text(""), "groundtruth.txt: "),
+        (lambda f: (f / "groundtruth.txt").write_text("nan nan nan nan nan nan nan nan\n"), "groundtruth.txt:1: "),
+        (lambda f: edit(f / "groundtruth.txt", "100.000000", "inf"), "groundtruth.txt:2: "),
+    ],
+)
+def test_faults_of_the_lists_are_refused_at_once(folder, damage, fault):
+    damage(folder)
+    with pytest.raises(GavoError) as caught:
+        TumSequence(folder, CAMERA)
+    message = str(caught.value)
+    assert str(folder) in message and fault in message and len(message.splitlines()) == 1
+
+
+def test_links_out_of_the_folder_are_refused(folder):
+    (folder.parent / "outside.png").write_bytes(png(color_image(0)))
+    (folder / "rgb/1.png").unlink()
+    (folder / "rgb/1.png").symlink_to(folder.parent / "outside.png")
+    with pytest.raises(GavoError, match=r"rgb\.txt:3: path leaves"):
+        TumSequence(folder, CAMERA)
+
+
+def test_a_folder_reached_through_a_link_is_fine(folder):
+    (folder.parent / "link").symlink_to(folder)
+    TumSequence(folder.parent / "link", CAMERA).check()
+
+
+@pytest.mark.parametrize("camera", ["nonsense", "missing.toml"])
+def test_an_unknown_camera_is_refused(folder, camera):
+    with pytest.raises(GavoError, match=camera):
+        TumSequence(folder, camera)
+
+
+def test_a_missing_image_of_the_chosen_range_is_refused_before_the_run(folder):
+    (folder / "depth/4.png").unlink()
+    sequence = TumSequence(folder, CAMERA)
+    sequence[:4].check()
+    with pytest.raises(GavoError, match=r"depth/4\.png"):
+        sequence.check()
+    with pytest.raises(FrameError, match=r"depth/4\.png"):
+        sequence[4]
+
+
+def with_chunk(data: bytes, kind: bytes, content: bytes) -> bytes:
+    chunk = len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
+    return data[:33] + chunk + data[33:]
+
+
+def with_size(data: bytes, width: int, height: int) -> bytes:
+    header = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:29]
+    return data[:12] + header + zlib.crc32(header).to_bytes(4, "big") + data[33:]
+
+
+WHOLE_COLOR, WHOLE_DEPTH = png(color_image(0)), png(depth_image(0))
+BAD_COLOR = {
+    "empty": b"",
+    "text": b"hello",
+    "torn": WHOLE_COLOR[:3000],
+    "only the end missing": WHOLE_COLOR[:-12],
+    "last byte missing": WHOLE_COLOR[:-1],
+    "zeros at the end": WHOLE_COLOR[:3000] + bytes(len(WHOLE_COLOR) - 3000),
+    "flipped byte": WHOLE_COLOR[:2000] + bytes([WHOLE_COLOR[2000] ^ 1]) + WHOLE_COLOR[2001:],
+    "another size": png(np.zeros((24, 64, 3), np.uint8)),
+    "absurd size": with_size(WHOLE_COLOR, 2**31 - 1, 2**31 - 1),
+    "wrong size, right header": with_size(png(np.zeros((24, 64, 3), np.uint8)), 64, 48),
+    "16 bits": png(np.zeros((48, 64, 3), np.uint16)),
+    "depth": WHOLE_DEPTH,
+    "JPEG": cv2.imencode(".jpg", color_image(0))[1].tobytes(),
+    "no end of chunk": WHOLE_COLOR[:33] + b"\xff\xff\xff\xffIDAT",
+    "signature only": WHOLE_COLOR[:8],
+    "huge": WHOLE_COLOR + bytes(2**21),
+}
+BAD_DEPTH = {
+    "torn": WHOLE_DEPTH[:3000],
+    "8 bits": png(np.zeros((48, 64), np.uint8)),
+    "colour": WHOLE_COLOR,
+    "16-bit colour": png(np.zeros((48, 64, 3), np.uint16)),
+    "another size": png(np.zeros((48, 32), np.uint16)),
+}
+BAD = [("rgb", name) for name in BAD_COLOR] + [("depth", name) for name in BAD_DEPTH]
+
+
+@pytest.mark.parametrize(("kind", "name"), BAD)
+def test_a_bad_image_is_refused_as_first_and_flagged_in_the_middle(folder, kind, name):
+    content = BAD_COLOR[name] if kind == "rgb" else BAD_DEPTH[name]
+    (folder / f"{kind}/2.png").write_bytes(content)
+    sequence = TumSequence(folder, CAMERA)
+    sequence.check()
+    with pytest.raises(FrameError) as caught:
+        sequence[2]
+    assert f"{kind}/2.png" in str(caught.value) and len(str(caught.value).splitlines()) == 1
+    assert sequence[3].timestamp == sequence.timestamps[3]
+    with pytest.raises(GavoError, match=rf"{kind}/2\.png"):
+        sequence[2:].check()
+
+
+def test_grey_and_transparent_images_serve_as_colour(tmp_path):
+    grey = color_image(0)[..., 0]
+    (tmp_path / "depth.png").write_bytes(WHOLE_DEPTH)
+    for name, image in (("grey", grey), ("alpha", np.dstack([grey] * 3 + [np.full_like(grey, 255)]))):
+        (tmp_path / f"{name}.png").write_bytes(png(image))
+        np.testing.assert_array_equal(read_frame(tmp_path / f"{name}.png", tmp_path / "depth.png", CAMERA).grey, grey)
+
+
+def test_an_orientation_tag_does_not_turn_the_image(tmp_path):
+    exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    (tmp_path / "plain.png").write_bytes(WHOLE_COLOR)
+    (tmp_path / "turned.png").write_bytes(with_chunk(WHOLE_COLOR, b"eXIf", exif))
+    (tmp_path / "depth.png").write_bytes(WHOLE_DEPTH)
+    plain, turned = (
+        read_frame(tmp_path / f"{name}.png", tmp_path / "depth.png", CAMERA) for name in ("plain", "turned")
+    )
+    np.testing.assert_array_equal(plain.grey, turned.grey)
+
+
+@pytest.mark.parametrize("path", ["none.png", ".", "a\0b.png", "x" * 300])
+def test_no_path_raises_anything_else(tmp_path, path):
+    (tmp_path / "depth.png").write_bytes(WHOLE_DEPTH)
+    with pytest.raises(FrameError):
+        read_frame(tmp_path / path, tmp_path / "depth.png", CAMERA)
+
+
+@given(cut=st.integers(0, len(WHOLE_DEPTH) - 1), flip=st.integers(1, 255), at=st.integers(0, len(WHOLE_DEPTH) - 1))
+def test_damage_anywhere_in_an_image_is_noticed(tmp_path_factory, cut, flip, at):
+    folder = tmp_path_factory.mktemp("png")
+    (folder / "color.png").write_bytes(WHOLE_COLOR)
+    flipped = bytearray(WHOLE_DEPTH)
+    flipped[at] ^= flip
+    for content in (WHOLE_DEPTH[:cut], bytes(flipped)):
+        (folder / "depth.png").write_bytes(content)
+        with pytest.raises(FrameError):
+            read_frame(folder / "color.png", folder / "depth.png", CAMERA)
+
+
+stamp = st.one_of(st.floats(), st.text(max_size=4))
+rows = st.lists(st.tuples(stamp, st.text(max_size=8)).map(lambda row: f"{row[0]} {row[1]}"), max_size=4)
+
+
+@given(content=st.one_of(st.binary(max_size=200), rows.map(lambda r: "\n".join(r).encode("utf-8", "replace"))))
+def test_lists_raise_nothing_else(tmp_path_factory, content):
+    folder = tmp_path_factory.mktemp("clip")
+    (folder / "rgb.txt").write_bytes(content)
+    (folder / "depth.txt").write_bytes(content)
+    try:
+        TumSequence(folder, CAMERA).check()
+    except GavoError as error:
+        assert len(str(error).splitlines()) == 1
+    else:
+        pytest.fail("there is no image in the folder")
+
+
+def test_memory_does_not_grow_with_the_frames_read(folder):
+    sequence = TumSequence(folder, CAMERA)
+    for frame in sequence:
+        assert frame.grey.size
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    for _ in range(50):
+        for index in range(len(sequence)):
+            assert sequence[index].grey.size
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert after - before < 5 * depth_image(0).nbytes
+
+
+@pytest.mark.parametrize(("clip", "frames"), [("fr1_xyz", 95), ("fr1_desk", 69), ("fr1_rpy", 80)])
+def test_real_clips(data_dir, clip, frames):
+    sequence = TumSequence(data_dir / clip)
+    sequence.check()
+    assert len(sequence) == frames and sequence.camera == Camera.preset("fr1").rectified()
+    frame = sequence[0]
+    assert frame.grey.shape == frame.depth.shape == (480, 640)
+    assert 0.3 < np.median(frame.depth[frame.depth > 0]) / sequence.camera.depth_scale < 3
+    assert frame.grey[:, [0, -1]].min() > 0 and frame.grey[[0, -1]].mean() > 10
+    assert sequence.ground_truth is not None
+    _, valid = sequence.ground_truth.interpolate(sequence.timestamps)
+    assert valid.all()

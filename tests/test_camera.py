@@ -1,0 +1,240 @@
+"""Intrinsics, levels, projection, undistortion and camera files."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gavo_jax.camera import RIM, Camera, camera_for_sequence, load_camera
+from gavo_jax.errors import GavoError
+
+SMALL = Camera(50.0, 52.0, 31.2, 23.9, 64, 48)
+TOML = "fx = 50.0\nfy = 52\ncx = 31.2\ncy = 23.9\nwidth = 64\nheight = 48\n"
+YAML = "---\n# a comment\nfx: 50.0\nfy: 52  # pixels\ncx: 31.2\ncy: 23.9\nwidth: 64\nheight: 48\n"
+
+coordinate = st.floats(-5, 5)
+cameras = st.builds(
+    Camera,
+    fx=st.floats(20, 2000),
+    fy=st.floats(20, 2000),
+    cx=st.floats(0, 640),
+    cy=st.floats(0, 480),
+    width=st.just(640),
+    height=st.just(480),
+)
+
+
+def distorted_source(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where an undistorted pixel comes from in the recorded image: Brown-Conrady, from its formula in float64."""
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return camera.fx * xd + camera.cx, camera.fy * yd + camera.cy
+
+
+@given(camera=cameras, x=coordinate, y=coordinate, z=st.floats(0.1, 10))
+def test_projection_then_back_projection_is_identity(camera, x, y, z):
+    points = np.array([[x, y, z]])
+    pixels = camera.project(points)
+    assert pixels.dtype == np.float64
+    np.testing.assert_allclose(camera.back_project(pixels, points[:, 2]), points, rtol=1e-9, atol=1e-9)
+
+
+def test_projection_follows_the_pinhole_formula_in_numpy_and_jax():
+    points = np.array([[[0.2, -0.1, 2.0], [0.0, 0.0, 1.0]]])
+    expected = np.array([[[50 * 0.1 + 31.2, 52 * -0.05 + 23.9], [31.2, 23.9]]])
+    np.testing.assert_allclose(SMALL.project(points), expected)
+    traced = jax.jit(lambda camera, p: camera.project(p))(SMALL, jnp.asarray(points, jnp.float32))
+    np.testing.assert_allclose(traced, expected, rtol=1e-6)
+    lifted = jax.jit(lambda camera, uv, z: camera.back_project(uv, z))(SMALL, expected, points[..., 2])
+    np.testing.assert_allclose(lifted, points, atol=1e-6)
+
+
+def test_camera_is_a_pytree_with_static_sizes():
+    leaves, structure = jax.tree.flatten(Camera.preset("fr1"))
+    assert leaves == [517.3, 516.5, 318.6, 255.3, 5000.0]
+    assert jax.tree.unflatten(structure, leaves) == Camera.preset("fr1")
+
+
+@pytest.mark.parametrize("k", [0, 1, 2, 4])
+def test_a_level_sees_its_pixels_where_their_averages_lie(k):
+    """Catches a half-pixel shift: the mean of 2^k × 2^k pixels' rays is the ray of the level's pixel."""
+    camera = Camera.preset("fr3")
+    level = camera.level(k)
+    assert (level.width, level.height) == (640 >> k, 480 >> k)
+    side = 2**k
+    fine = np.stack(np.meshgrid(np.arange(3 * side, 4 * side), np.arange(5 * side, 6 * side)), -1).astype(float)
+    rays = camera.back_project(fine, np.ones(fine.shape[:2]))
+    coarse = level.back_project(np.array([3.0, 5.0]), np.array(1.0))
+    np.testing.assert_allclose(coarse, rays.mean(axis=(0, 1)), atol=1e-12)
+
+
+def test_levels_compose():
+    camera = Camera.preset("fr1")
+    np.testing.assert_allclose(jax.tree.leaves(camera.level(1).level(2)), jax.tree.leaves(camera.level(3)))
+
+
+@pytest.mark.parametrize("name", ["fr1", "fr2"])
+def test_undistortion_samples_where_the_lens_put_the_light(name):
+    """A smooth image, sampled at the analytic source position; catches the inverse mapping and swapped axes."""
+    camera = Camera.preset(name)
+    v, u = np.mgrid[:480, :640].astype(float)
+
+    def image(u, v):
+        return 127 + 60 * np.sin(u / 40) + 60 * np.cos(v / 50)
+
+    source_u, source_v = distorted_source(camera, u, v)
+    inside = (source_u >= 0) & (source_u <= 639) & (source_v >= 0) & (source_v <= 479)
+    undistorted = camera.undistort_image(np.round(image(u, v)).astype(np.uint8))
+    assert np.abs(undistorted[inside] - image(source_u, source_v)[inside]).max() < 1.5
+    color = camera.undistort_image(np.repeat(np.round(image(u, v)).astype(np.uint8)[..., None], 3, axis=-1))
+    np.testing.assert_array_equal(color, np.repeat(undistorted[..., None], 3, axis=-1))
+
+
+def test_undistortion_leaves_no_black_rim():
+    camera = Camera.preset("fr1")
+    grey = np.full((480, 640), 200, np.uint8)
+    assert np.all(camera.undistort_image(grey) == 200)
+
+
+@pytest.mark.parametrize("name", ["fr1", "fr2"])
+def test_undistorted_depth_is_nearest_and_empty_near_the_rim(name):
+    camera = Camera.preset(name)
+    v, u = np.mgrid[:480, :640].astype(float)
+    source_u, source_v = distorted_source(camera, u, v)
+    rows = np.broadcast_to(np.arange(1, 481, dtype=np.uint16)[:, None], (480, 640)).copy()
+    columns = np.broadcast_to(np.arange(1, 641, dtype=np.uint16), (480, 640)).copy()
+    row, column = (camera.undistort_depth(depth).astype(int) for depth in (rows, columns))
+    margin = np.minimum.reduce([source_u, 639 - source_u, source_v, 479 - source_v])
+    assert np.all(row[margin < RIM - 0.01] == 0)
+    kept = margin > RIM + 0.01
+    assert np.all(row[kept] > 0)
+    assert np.abs(row - 1 - source_v)[kept].max() < 0.55
+    assert np.abs(column - 1 - source_u)[kept].max() < 0.55
+    assert 0.5 < kept.mean() < 0.99
+
+
+def test_without_distortion_the_same_objects_come_back():
+    grey, depth = np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.uint16)
+    same_grey, same_depth = SMALL.undistort(grey, depth)
+    assert same_grey is grey and same_depth is depth
+    assert not Camera.preset("fr1").rectified().is_distorted
+    assert Camera.preset("fr1").rectified().fx == 517.3
+
+
+def test_undistortion_refuses_another_size():
+    with pytest.raises(ValueError, match="480 rows"):
+        Camera.preset("fr1").undistort_image(np.zeros((240, 320), np.uint8))
+
+
+def test_undistortion_agrees_with_opencv():
+    camera = Camera.preset("fr1")
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    grey = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
+    theirs = cv2.undistort(grey, matrix, np.array(camera.distortion))
+    ours = camera.undistort_image(grey)
+    middle = np.s_[60:-60, 60:-60]
+    assert np.abs(ours[middle].astype(int) - theirs[middle]).mean() < 1
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", "fr1"),
+        ("fr1_desk", "fr1"),
+        ("FR2_desk", "fr2"),
+        ("rgbd_dataset_freiburg3_long_office_household", "fr3"),
+        ("clip-fr3", "fr3"),
+    ],
+)
+def test_sequence_names_pick_the_preset(name, preset):
+    assert camera_for_sequence(name) == Camera.preset(preset)
+
+
+@pytest.mark.parametrize("name", ["office", "fr4_x", "fr12", "afr1_x", ""])
+def test_other_sequence_names_ask_for_a_camera(name):
+    with pytest.raises(GavoError, match="--camera"):
+        camera_for_sequence(name)
+
+
+def test_camera_files(tmp_path):
+    (tmp_path / "a.toml").write_text(TOML)
+    (tmp_path / "b.yaml").write_text(YAML + "distortion: [0.1, -0.2, 0, 0.001]\ndepth_scale: 1000\n")
+    (tmp_path / "c.toml").write_text(TOML + "distortion = [0.1, -0.2, 0, 0.001, 0.3]\n")
+    assert load_camera(tmp_path / "a.toml") == SMALL
+    expected = replace(SMALL, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), depth_scale=1000.0)
+    assert load_camera(str(tmp_path / "b.yaml")) == expected
+    assert load_camera(tmp_path / "c.toml").distortion == (0.1, -0.2, 0.0, 0.001, 0.3)
+    assert load_camera("fr2") == Camera.preset("fr2")
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (TOML.replace("fx = 50.0", "fx = nan"), "fx"),
+        (TOML.replace("fx = 50.0", "fx = -50.0"), "fx"),
+        (TOML.replace("fx = 50.0", "fx = '50'"), "fx"),
+        (TOML.replace("fx = 50.0", "fx = true"), "fx"),
+        (TOML.replace("fx = 50.0", "fx = 1e9"), "fx"),
+        (TOML.replace("fx = 50.0", "fx = 1" + "0" * 400), "fx"),
+        (TOML.replace("fx = 50.0", "fx = 0x" + "f" * 5000), "fx"),
+        (TOML.replace("fx = 50.0", "fx = 1" + "0" * 5000), "TOML"),
+        (TOML.replace("fx = 50.0\n", ""), "fx"),
+        (TOML.replace("width = 64", "width = 64.5"), "width"),
+        (TOML.replace("width = 64", "width = 100000"), "width"),
+        (TOML.replace("width = 64", "width = 0"), "width"),
+        (TOML + "fz = 1\n", "fz"),
+        (TOML + "depth_scale = 0\n", "depth_scale"),
+        (TOML + "depth_scale = inf\n", "depth_scale"),
+        (TOML + "distortion = 3\n", "distortion"),
+        (TOML + "distortion = [1, 2]\n", "distortion"),
+        (TOML + "distortion = [1, 2, 3, nan]\n", "distortion"),
+        (TOML + "distortion = [1, 2, 3, 4, [5]]\n", "distortion"),
+        (TOML + '"a\\nb" = 1\n', "unknown key"),
+        (TOML + "not toml at all", "TOML"),
+        ("[" * 3000, "TOML"),
+        ("", "missing"),
+    ],
+)
+def test_bad_camera_files_are_refused_in_one_line(tmp_path, text, fault):
+    path = tmp_path / "camera.toml"
+    path.write_text(text)
+    with pytest.raises(GavoError) as caught:
+        load_camera(path)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and fault in message and len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", [YAML + "fx: 3\n", YAML + "distortion:\n  - 1\n", YAML.replace("50.0", ".nan"), "x"])
+def test_bad_yaml_is_refused(tmp_path, text):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(GavoError, match=r"camera\.yaml"):
+        load_camera(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize("name", ["nonsense", "fr4", "", "missing.toml", "missing.yaml", "a\0b.toml"])
+def test_unknown_cameras_are_refused(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(GavoError):
+        load_camera(name)
+    with pytest.raises(GavoError, match="unknown camera"):
+        Camera.preset(name)
+
+
+@given(
+    content=st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)),
+    suffix=st.sampled_from([".toml", ".yaml"]),
+)
+def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
+    path = tmp_path_factory.mktemp("camera") / f"camera{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(GavoError):
+        load_camera(path)

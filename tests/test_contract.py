@@ -1,0 +1,18 @@
+"""The installed command against the contract that its users hold it to, by their own script."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def test_contract(data_dir):
+    script = data_dir.parent / "tools" / "check-contract"
+    if not script.is_file():
+        pytest.skip("no tools/check-contract beside the folder of real clips")
+    gavo = shutil.which("gavo", path=str(Path(sys.executable).parent))
+    assert gavo is not None, "the package is not installed: no command `gavo` beside this Python"
+    done = subprocess.run([sys.executable, script, "--gavo", gavo], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.rstrip().endswith("all hold"), done.stdout + done.stderr

@@ -1,0 +1,252 @@
+"""Errors against TUM's definitions, written out literally, and against evo."""
+
+import copy
+
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.tools import file_interface
+from scipy.spatial.transform import Rotation
+
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error, rotation_angle
+from gavo_jax.trajectory import Trajectory, inverse
+
+CLIPS = ["fr1_xyz", "fr1_desk", "fr1_rpy"]
+
+
+def transform(rotation_vector, translation) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def smooth_truth(seconds: float = 4.0, rate: float = 100.0, seed: int = 0) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    stamps = 1000 + np.arange(0, seconds, 1 / rate) + rng.uniform(-0.001, 0.001, int(round(seconds * rate)))
+    phase = rng.uniform(0, 6, 6)
+    waves = 0.5 * np.sin(stamps[:, None] * [1.0, 1.3, 0.7, 0.9, 1.1, 0.6] + phase)
+    return Trajectory(stamps, np.array([transform(row[:3], row[3:]) for row in waves]))
+
+
+def perturbed(truth: Trajectory, stamps: np.ndarray, seed: int) -> Trajectory:
+    """An odometry of `truth`: first pose the identity, every step off by a few millimetres and tenths of a degree."""
+    rng = np.random.default_rng(seed)
+    true, valid = truth.interpolate(stamps)
+    assert valid.all()
+    world_T_camera = [np.eye(4)]
+    for before, after in zip(true[:-1], true[1:], strict=True):
+        noise = transform(rng.normal(0, 0.005, 3), rng.normal(0, 0.004, 3))
+        world_T_camera.append(world_T_camera[-1] @ inverse(before) @ after @ noise)
+    return Trajectory(stamps, np.array(world_T_camera))
+
+
+def real_pair(folder, seed=0) -> tuple[Trajectory, Trajectory]:
+    truth = Trajectory.read_tum(folder / "groundtruth.txt")
+    stamps = np.loadtxt(folder / "rgb.txt", usecols=0)
+    return perturbed(truth, stamps, seed), truth
+
+
+def bisect_nearest(stamps: list, wanted: float) -> int:
+    low, high, best = 0, len(stamps), 0
+    while low < high:
+        middle = (low + high) // 2
+        if abs(stamps[middle] - wanted) < abs(stamps[best] - wanted):
+            best = middle
+        if stamps[middle] == wanted:
+            return middle
+        if stamps[middle] > wanted:
+            high = middle
+        else:
+            low = middle + 1
+    return best
+
+
+def tum_tool(estimate: Trajectory, truth: Trajectory, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """`evaluate_rpe.py --fixed_delta --delta_unit s`, pair by pair: translations (m) and angles (deg)."""
+    est, true = list(estimate.timestamps), list(truth.timestamps)
+    limit = 2 * np.median([b - a for a, b in zip(true[:-1], true[1:], strict=True)])
+    translations, angles = [], []
+    for i in range(len(est)):
+        j = bisect_nearest(est, est[i] + delta)
+        if j == len(est) - 1:
+            continue
+        m, n = bisect_nearest(true, est[i]), bisect_nearest(true, est[j])
+        if abs(true[m] - est[i]) > limit or abs(true[n] - est[j]) > limit:
+            continue
+        moved = np.linalg.inv(estimate.world_T_camera[j]) @ estimate.world_T_camera[i]
+        truly = np.linalg.inv(truth.world_T_camera[n]) @ truth.world_T_camera[m]
+        error = np.linalg.inv(moved) @ truly
+        translations.append(np.linalg.norm(error[:3, 3]))
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))))
+    return np.array(translations), np.array(angles)
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+@pytest.mark.parametrize("delta", [1.0, 0.5])
+def test_drift_equals_tums_tool_on_real_truth(data_dir, clip, delta):
+    estimate, truth = real_pair(data_dir / clip)
+    translations, angles = tum_tool(estimate, truth, delta)
+    error = relative_pose_error(estimate, truth, delta, "s")
+    np.testing.assert_allclose(error.translation.values, translations, atol=1e-12)
+    np.testing.assert_allclose(error.rotation.values, angles, atol=1e-5)
+    assert error.translation.rmse == pytest.approx(rms(translations), abs=1e-12)
+    assert error.translation.rmse > 0.005
+
+
+@pytest.mark.parametrize("rate", [100.0, 30.0])
+def test_drift_equals_tums_tool_with_gaps_and_ties(rate):
+    truth = smooth_truth(rate=rate)
+    keep = (truth.timestamps < 1001.5) | (truth.timestamps > 1001.9)
+    truth = Trajectory(np.round(truth.timestamps[keep], 2), truth.world_T_camera[keep])
+    just_after = truth.timestamps[truth.timestamps < 1001.6][-1] + 1.5 / rate
+    estimate = perturbed(truth, np.arange(1000.125, 1001.4, 0.0625), 3)
+    late = perturbed(truth, np.arange(1002.0, 1003.8, 0.0625), 4)
+    estimate = Trajectory(
+        np.concatenate([estimate.timestamps, [just_after, 1001.7], late.timestamps]),
+        np.concatenate([estimate.world_T_camera, np.tile(np.eye(4), (2, 1, 1)), late.world_T_camera]),
+    )
+    translations, angles = tum_tool(estimate, truth, 1.0)
+    error = relative_pose_error(estimate, truth)
+    np.testing.assert_allclose(error.translation.values, translations, atol=1e-12)
+    np.testing.assert_allclose(error.rotation.values, angles, atol=1e-5)
+
+
+def evo_pair(tmp_path, estimate, truth):
+    estimate.write_tum(tmp_path / "estimate.txt")
+    truth.write_tum(tmp_path / "truth.txt")
+    reference = file_interface.read_tum_trajectory_file(str(tmp_path / "truth.txt"))
+    theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "estimate.txt"))
+    return sync.associate_trajectories(reference, theirs, max_diff=0.02)
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+@pytest.mark.parametrize("delta", [1, 7])
+def test_relative_error_per_frame_equals_evo(data_dir, tmp_path, clip, delta):
+    estimate, truth = real_pair(data_dir / clip, seed=1)
+    error = relative_pose_error(estimate, truth, delta, "frames")
+    for series, relation in (
+        (error.translation, metrics.PoseRelation.translation_part),
+        (error.rotation, metrics.PoseRelation.rotation_angle_deg),
+    ):
+        rpe = metrics.RPE(relation, delta=delta, delta_unit=metrics.Unit.frames, all_pairs=True)
+        rpe.process_data(evo_pair(tmp_path, estimate, truth))
+        np.testing.assert_allclose(series.values, rpe.error, atol=1e-6)
+        assert series.rmse == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), abs=1e-6)
+        assert series.median == pytest.approx(rpe.get_statistic(metrics.StatisticsType.median), abs=1e-6)
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+def test_absolute_error_equals_evo(data_dir, tmp_path, clip):
+    estimate, truth = real_pair(data_dir / clip, seed=2)
+    reference, theirs = evo_pair(tmp_path, estimate, truth)
+    aligned = copy.deepcopy(theirs)
+    aligned.align(reference, correct_scale=False)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, aligned))
+    error = absolute_trajectory_error(estimate, truth)
+    np.testing.assert_allclose(error.values, ape.error, atol=1e-6)
+    assert error.rmse == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-6)
+
+
+def test_a_perfect_estimate_in_another_world_has_no_error():
+    """Catches poses the wrong way round: the inverse trajectory is not without error."""
+    truth = smooth_truth()
+    other_T_world = transform([0.3, -1.0, 2.0], [4, 5, 6])
+    moved = Trajectory(truth.timestamps, other_T_world @ truth.world_T_camera)
+    for unit in ("s", "frames"):
+        error = relative_pose_error(moved, truth, 1, unit)
+        assert error.translation.max < 1e-12 and error.rotation.max < 1e-6
+    assert absolute_trajectory_error(moved, truth).max < 1e-12
+    assert distance_error(moved, truth).max < 1e-12
+    backwards = Trajectory(truth.timestamps, inverse(truth.world_T_camera))
+    assert relative_pose_error(backwards, truth).translation.rmse > 0.05
+    assert absolute_trajectory_error(backwards, truth).rmse > 0.05
+    assert distance_error(backwards, truth).rmse > 0.05
+
+
+def test_absolute_error_never_mirrors():
+    truth = smooth_truth()
+    mirrored = truth.world_T_camera.copy()
+    mirrored[:, 0, 3] *= -1
+    assert absolute_trajectory_error(Trajectory(truth.timestamps, mirrored), truth).rmse > 0.01
+
+
+def test_absolute_error_does_not_scale():
+    truth = smooth_truth()
+    larger = truth.world_T_camera.copy()
+    larger[:, :3, 3] *= 2
+    assert absolute_trajectory_error(Trajectory(truth.timestamps, larger), truth).rmse > 0.1
+
+
+def test_absolute_error_of_a_camera_that_never_moved_is_finite():
+    truth = smooth_truth()
+    still = Trajectory(truth.timestamps, np.tile(np.eye(4), (len(truth), 1, 1)))
+    spread = truth.world_T_camera[:, :3, 3] - truth.world_T_camera[:, :3, 3].mean(axis=0)
+    assert absolute_trajectory_error(still, truth).rmse == pytest.approx(rms(np.linalg.norm(spread, axis=1)))
+
+
+def test_distance_error_starts_at_zero_and_follows_the_offset():
+    truth = smooth_truth()
+    from_first = inverse(truth.world_T_camera[0]) @ truth.world_T_camera
+    from_first[:, 0, 3] += np.linspace(0, 0.3, len(truth))
+    error = distance_error(Trajectory(truth.timestamps, from_first), truth)
+    np.testing.assert_allclose(error.values, np.linspace(0, 0.3, len(truth)), atol=1e-9)
+    assert error.final == pytest.approx(0.3)
+    assert error.unit == "m" and "first pose" in error.definition
+
+
+def test_distance_error_leaves_out_what_the_truth_does_not_cover():
+    truth = smooth_truth()
+    estimate = perturbed(truth, truth.timestamps[::3], 0)
+    error = distance_error(estimate, Trajectory(truth.timestamps[60:], truth.world_T_camera[60:]))
+    assert len(error.values) == len(estimate) - 20 and error.values[0] == 0
+
+
+def test_results_say_what_they_are():
+    truth = smooth_truth()
+    error = relative_pose_error(perturbed(truth, truth.timestamps[::3], 0), truth)
+    assert (error.translation.unit, error.rotation.unit) == ("m", "deg")
+    summary = error.translation.summary()
+    assert summary["count"] == len(error.translation.values) == len(error.translation.timestamps)
+    assert "translation" in error.translation.definition and "rotation" in error.rotation.definition
+    assert summary["max"] == error.translation.max >= error.translation.rmse >= error.translation.mean > 0
+
+
+def test_too_little_to_compare_is_refused():
+    truth = smooth_truth()
+    short = perturbed(truth, truth.timestamps[:20:3], 0)
+    elsewhere = Trajectory(truth.timestamps + 1e6, truth.world_T_camera)
+    single = Trajectory(truth.timestamps[:1], truth.world_T_camera[:1])
+    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    for estimate in (short, elsewhere, single, empty):
+        with pytest.raises(GavoError):
+            relative_pose_error(estimate, truth)
+    for estimate in (elsewhere, single, empty):
+        with pytest.raises(GavoError):
+            relative_pose_error(estimate, truth, 1, "frames")
+        with pytest.raises(GavoError):
+            absolute_trajectory_error(estimate, truth)
+    for estimate in (elsewhere, empty):
+        with pytest.raises(GavoError):
+            distance_error(estimate, truth)
+
+
+@pytest.mark.parametrize(
+    "arguments", [(0, "s"), (-1, "s"), (np.nan, "s"), (0.5, "frames"), (np.inf, "frames"), (1, "m")]
+)
+def test_bad_deltas_and_units_are_refused(arguments):
+    truth = smooth_truth()
+    with pytest.raises(GavoError):
+        relative_pose_error(truth, truth, *arguments)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, 3.0, np.pi])
+def test_rotation_angles_are_exact_at_both_ends(angle):
+    rotation = Rotation.from_rotvec(np.array([0.6, 0.0, 0.8]) * angle).as_matrix()
+    assert rotation_angle(rotation[None])[0] == pytest.approx(angle, abs=1e-12)
