@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Integer, PRNGKeyArray
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
@@ -38,7 +38,7 @@ from gavo_jax.objective import (
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
 from gavo_jax.solvers.base import Bounds, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import log, pack_target
+from gavo_jax.warp import exp, log, pack_target
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -86,10 +86,12 @@ class AlignmentOptions:
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Weight of the depth cost against the grey one, both in units of their noise.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
+        outside_cost: Cost of a point that leaves the view; see `Objective`. None: (2) as printed.
         bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
         bounds_factor: Factor on the half-widths from a level to the next finer one.
-        start_spread: Standard deviations in metres and radians of the coarsest level's first candidates, or None to
-            leave them to the solver.
+        scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands
+            start from the best distinct ones. 0 starts all islands from the guess.
+        scout_spread: Standard deviations of the scouts, metres and radians.
     """
 
     loss: Loss = static(student_t)
@@ -101,9 +103,11 @@ class AlignmentOptions:
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: float = 0.3
     min_overlap: float = 0.35
+    outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
     bounds_factor: float = 1.0
-    start_spread: tuple[float, float] | None = None
+    scouts: int = static(0)
+    scout_spread: tuple[float, float] = (0.15, 0.4)
 
 
 class Alignment(NamedTuple):
@@ -150,14 +154,26 @@ def level_objective(
     level: int,
     guess: Float[Array, "4 4"],
     options: AlignmentOptions,
+    brightness: bool,
 ) -> Objective:
-    """E of one level, with its brightness model and scales estimated at the guess."""
+    """E of one level, with its scales, and from the second level on its brightness model, estimated at the guess.
+
+    Before anything is aligned a regression of one image on the other would only tell that they differ: its gain would
+    fall towards 0 and reward motions that hide contrast.
+    """
     camera = camera.level(level)
     packed = pack_target(target[level].grey, target[level].inverse_depth)
 
     def objective(reference: Reference) -> Objective:
         return Objective(
-            reference, packed, camera, Scales.unit(), jnp.float32(options.min_overlap), options.loss, options.depth
+            reference,
+            packed,
+            camera,
+            Scales.unit(),
+            jnp.float32(options.min_overlap),
+            options.loss,
+            options.depth,
+            None if options.outside_cost is None else jnp.float32(options.outside_cost),
         )
 
     references = []
@@ -165,7 +181,7 @@ def level_objective(
         reference = make_reference(view.pyramid[level], camera, options.cells[level])
         if i > 0:
             reference = move_reference(reference, view.anchor_T_view)
-        if options.brightness:
+        if brightness:
             gain, bias = estimate_brightness(objective(reference), guess)
             reference = reference._replace(grey=gain * reference.grey + bias)
         references.append(reference)
@@ -217,28 +233,32 @@ def align_pyramids(
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
     """
     box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
-    islands = guesses
+    islands, centre = guesses, guesses[0]
     histories: list[jax.Array] = []
     for level in solver.levels:
         first, count = not histories, options.islands[level]
-        make_objective = partial(level_objective, views, target, camera, level, options=options)
+        make_objective = partial(
+            level_objective, views, target, camera, level, options=options, brightness=options.brightness and not first
+        )
         leader, objective = _best_guess(make_objective, guesses if first else islands[:1])
         basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
         key, level_key, start_key = jax.random.split(key, 3)
-        origins = jnp.repeat(leader[None], count, axis=0) if first else islands[:count]
-        clouds = jnp.zeros((count, 1, 6))
-        if first and options.start_spread is not None:
-            spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.start_spread]), 3)
-            clouds = clouds + spread * jax.random.normal(start_key, (count, solver.population[level], 6))
-            clouds = clouds.at[:, 0].set(0.0)
-        search = partial(_search_island, Problem(objective, leader, basis), solver.at_level(level), options, box)
-        if count == 1:
-            islands, errors, history = jax.tree.map(lambda a: a[None], search(level_key, origins[0], clouds[0]))
+        if not first:
+            origins = islands[:count]
+        elif options.scouts:
+            origins = _scout(objective, leader, options, count, start_key)
         else:
-            islands, errors, history = jax.vmap(search)(jax.random.split(level_key, count), origins, clouds)
-        order = jnp.argsort(errors)
-        islands = islands[order]
-        histories.append(history[order[0]])
+            origins = jnp.repeat(leader[None], count, axis=0)
+        centre = leader if first else centre
+        search = partial(
+            _search_island, Problem(objective, leader, basis, centre), solver.at_level(level), options, box
+        )
+        if count == 1:
+            islands, errors, history = jax.tree.map(lambda a: a[None], search(level_key, origins[0]))
+        else:
+            islands, errors, history = jax.vmap(search)(jax.random.split(level_key, count), origins)
+        histories.append(history[jnp.argmin(errors)])
+        islands = islands[_best_distinct(islands, errors, count)]
         box = box * options.bounds_factor
     return _conclude(objective, islands[0], options, jnp.concatenate(histories))
 
@@ -250,20 +270,57 @@ def _search_island(
     box: Float[Array, " 6"],
     key: PRNGKeyArray,
     origin: Float[Array, "4 4"],
-    cloud: Float[Array, "g 6"],
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"]]:
-    """Search one level from one origin; the cloud holds the twists of the first candidates about it."""
+    """Search one level from one origin."""
     if options.precondition:
-        problem = replace(problem, origin=origin)
+        problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]))
         reach = jnp.abs(jnp.linalg.inv(problem.basis)) @ box
         bounds = Bounds(-reach, reach)
-        guess = jnp.linalg.solve(problem.basis, cloud.T).T
+        guess = jnp.zeros((1, 6))
     else:
         problem = replace(problem, origin=jnp.eye(4))
         bounds = Bounds(log(origin) - box, log(origin) + box)
-        guess = log(origin) + cloud
+        guess = log(origin)[None]
     solution = solve(key, solver, problem, guess, bounds)
     return problem.transform(solution.x), solution.error, solution.history
+
+
+NICHE = (0.08, 0.08)
+"""Metres and radians within which two motions count as one mode."""
+
+
+def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
+    """Indices of the `count` best motions with no two of one mode, best first (clearing, Petrowski 1996).
+
+    Where there are fewer modes than that, the last places go to the best motions that are left over.
+    """
+    if count == 1:
+        return jnp.argmin(errors)[None]
+    scale = jnp.repeat(jnp.stack([jnp.float32(radius) for radius in NICHE]), 3)
+
+    def pick(cleared: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        best = jnp.argmin(cleared)
+        offset = log(jnp.linalg.inv(motions[best]) @ motions) / scale
+        near = jnp.sum(offset**2, axis=1) < 1.0
+        cleared = jnp.where(near, cleared + CLEARED, cleared).at[best].set(jnp.inf)
+        return cleared, best
+
+    return jax.lax.scan(pick, jnp.minimum(jnp.nan_to_num(errors, nan=jnp.inf), CLEARED / 2), length=count)[1]
+
+
+CLEARED = 1e9
+"""Added to the error of a motion whose mode is taken; above any error."""
+
+
+def _scout(
+    objective: Objective, leader: Float[Array, "4 4"], options: AlignmentOptions, count: int, key: PRNGKeyArray
+) -> Float[Array, "k 4 4"]:
+    """Origins of the coarsest level's islands: the best distinct ones of many motions drawn about the leader."""
+    spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
+    twists = spread * jax.random.normal(key, (options.scouts, 6))
+    scouts = leader @ exp(twists.at[0].set(0.0))
+    errors, _ = objective.score(scouts)
+    return scouts[_best_distinct(scouts, errors, count)]
 
 
 def _conclude(

@@ -202,6 +202,9 @@ class Objective:
     min_overlap: Float[Array, ""]
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
+    outside_cost: Float[Array, ""] | None = None
+    """Cost of a reference point that leaves the view, in units of that of a residual of one scale; None averages over
+    the points in view alone, as (2) does. With a cost, a motion cannot win by pushing pixels out of view."""
 
     def residuals(self, target_T_reference: Float[Array, "4 4"]) -> Residuals:
         """r_i(ξ) of one motion, equation (1)."""
@@ -227,11 +230,16 @@ class Objective:
         r, scales = self.residuals(target_T_reference), self.scales
         count = jnp.sum(r.inside)
         variance = scales.grey**2
-        error = variance * jnp.sum(r.inside * self.loss(r.grey**2 / variance)) / jnp.maximum(count, 1.0)
+        total = jnp.sum(r.inside * self.loss(r.grey**2 / variance))
+        valid = jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
+        if self.outside_cost is None:
+            error = variance * total / jnp.maximum(count, 1.0)
+        else:
+            error = variance * (total + (valid - count) * self.outside_cost * self.loss(jnp.float32(1.0))) / valid
         if self.use_depth:
             cost = jnp.sum(r.depth_valid * self.loss((r.depth / scales.depth) ** 2))
             error += variance * scales.depth_weight * cost / jnp.maximum(jnp.sum(r.depth_valid), 1.0)
-        overlap = count / jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
+        overlap = count / valid
         return jnp.where(overlap < self.min_overlap, jnp.inf, error), overlap
 
     def score(self, target_T_reference: Float[Array, "p 4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
@@ -288,6 +296,10 @@ class Problem:
     objective: Objective
     origin: Float[Array, "4 4"]
     basis: Float[Array, "6 6"]
+    centre: Float[Array, "4 4"] | None = None
+    """Motion that the search is held about, and `reach`, the largest translation (m) and rotation (rad) from it; a
+    candidate further off is worthless. None: the solver's bounds alone hold it."""
+    reach: Float[Array, " 2"] | None = None
 
     def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
         """target_T_reference of search coordinates."""
@@ -299,7 +311,13 @@ class Problem:
 
     def score(self, x: Float[Array, "p 6"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every solver."""
-        error, overlap = self.objective.score(self.transform(x))
+        motions = self.transform(x)
+        error, overlap = self.objective.score(motions)
+        if self.centre is not None and self.reach is not None:
+            offset = jnp.linalg.inv(self.centre) @ motions
+            cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
+            far = (jnp.linalg.norm(offset[:, :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
+            error = jnp.where(far, jnp.inf, error)
         return jnp.where(jnp.isnan(error), jnp.inf, error), overlap
 
     def _weighted_terms(self, x: Float[Array, " 6"]) -> tuple[Residuals, list[tuple[jax.Array, jax.Array]]]:
@@ -386,13 +404,13 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
     return curvature
 
 
-LARGEST_UNIT_STEP = jnp.array([0.05] * 3 + [0.05] * 3)
-"""Metres and radians: a direction that the image hardly constrains is not searched further than this a unit."""
+LARGEST_UNIT_STEP = 0.05
+"""Metres or radians: a direction that the image hardly constrains is not searched further than this a unit."""
 
 
 def preconditioner(curvature: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     """B with BᵀAB = identity, B = V Λ^(−1/2) of A = V Λ Vᵀ, limited where A is nearly singular."""
-    ridge = jnp.diag(1.0 / LARGEST_UNIT_STEP**2)
+    ridge = jnp.eye(6) / LARGEST_UNIT_STEP**2
     values, vectors = jnp.linalg.eigh(curvature + ridge)
     return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-9))
 

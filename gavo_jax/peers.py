@@ -65,8 +65,8 @@ class OpenCVPeer:
     - camera matrix: the camera's (default: a generic one for 640×480);
     - largest translation and rotation of a result: open (defaults 0.15 m and 15 degrees). They only turn a finished
       result into a failure;
-    - largest depth (default 4 m): open for the two photometric kinds, which lose the far half of a room otherwise;
-      point to plane alone keeps the default, where the sensor's noise grows with z²;
+    - largest depth (default 4 m): open for the two photometric kinds, whose rotation far readings hold best; point to
+      plane alone keeps the default, because the sensor's noise grows with z²;
     - readings of `DEPTH_LIMIT` and beyond are dropped: OpenCV takes a depth image with any value above 10 for one in
       1/5000 m and divides all of it, so that one far reading would spoil the frame without a word.
 
@@ -170,8 +170,8 @@ class Open3DTensorPeer:
 
     Settings that differ from the defaults:
     - depth scale: the camera's (default 1000);
-    - four levels of at most 20 iterations (default three levels of 10, 5 and 3, coarse to fine), which stop well short
-      of convergence: the drift of the two photometric methods is several times larger with them.
+    - four levels of at most 20 iterations; the default three levels of 10, 5 and 3, coarse to fine, stop well short of
+      convergence with the intensity and hybrid methods.
 
     The library has no flag: `success` is false where it raises its error of a singular system.
     """

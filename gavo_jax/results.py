@@ -10,7 +10,6 @@ import platform
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,6 +21,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Step
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
 from gavo_jax.trajectory import format_tum_row
+from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
 TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
@@ -48,7 +48,7 @@ class RunFolder:
         Raises:
             GavoError: it is no folder or cannot be written to.
         """
-        self.folder = prepare_folder(folder)
+        self.path = prepare_folder(folder)
         self._files = ExitStack()
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
@@ -61,14 +61,14 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.folder, METRICS, CONFIG, TRAJECTORY, FRAMES)
-        remove_figures(self.folder)
-        write_json(self.folder / CONFIG, config)
+        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES)
+        remove_figures(self.path)
+        write_json(self.path / CONFIG, config)
         try:
-            self._trajectory = self._files.enter_context((self.folder / TRAJECTORY).open("w", encoding="utf-8"))
-            self._frames = self._files.enter_context((self.folder / FRAMES).open("w", encoding="utf-8", newline=""))
+            self._trajectory = self._files.enter_context((self.path / TRAJECTORY).open("w", encoding="utf-8"))
+            self._frames = self._files.enter_context((self.path / FRAMES).open("w", encoding="utf-8", newline=""))
         except OSError as error:
-            raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
+            raise GavoError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
         self._rows = csv.writer(self._frames, lineterminator="\n")
         self._rows.writerow(FRAME_COLUMNS)
         self._trajectory.write(f"{TRAJECTORY_HEADER}\n{format_tum_row(timestamp, np.eye(4))}\n")
@@ -90,14 +90,14 @@ class RunFolder:
         Raises:
             GavoError: it cannot be written.
         """
-        write_json(self.folder / METRICS, metrics)
+        write_json(self.path / METRICS, metrics)
 
     def _flush(self) -> None:
         try:
             self._trajectory.flush()
             self._frames.flush()
         except OSError as error:
-            raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
+            raise GavoError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -125,12 +125,8 @@ def frame_row(step: Step) -> list[Any]:
 
 def environment() -> dict[str, str]:
     """Return the versions that decide a result."""
-    try:
-        own = version("gavo-jax")
-    except PackageNotFoundError:
-        own = "not installed"
     return {
-        "gavo-jax": own,
+        "gavo-jax": __version__,
         "jax": jax.__version__,
         "numpy": np.__version__,
         "opencv": cv2.__version__,

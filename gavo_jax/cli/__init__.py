@@ -6,12 +6,12 @@ import itertools
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 
 import tyro
 
 from gavo_jax.cli.options import Align, Command, Compare, Evaluate, Run
 from gavo_jax.errors import GavoError
+from gavo_jax.version import __version__
 
 BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 """Exit statuses; 0 is done, 3 is `cli.run.LOST` (`--strict`)."""
@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments == ["--version"]:
-        print(f"gavo-jax {version('gavo-jax')}")
+        print(f"gavo-jax {__version__}")
         return 0
     try:
         command = _parse(arguments)

@@ -3,11 +3,13 @@
 from gavo_jax.camera import load_camera
 from gavo_jax.cli.options import Source
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.synthetic import DEFAULT_FRAMES, SyntheticSequence
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 
 SYNTHETIC = "synthetic"
+SYNTHETIC_FRAMES = 40
+"""Unless `--frames` says how many: the drift over one second needs a little more than a second of them."""
 MAX_SYNTHETIC_FRAMES = 1_000_000
 MAX_SEED = 2**32 - 1
 
@@ -41,7 +43,7 @@ def check_seed(seed: int) -> None:
 
 
 def _synthetic(source: Source, stop: int | None) -> SyntheticSequence:
-    frames = DEFAULT_FRAMES if stop is None else stop
+    frames = SYNTHETIC_FRAMES if stop is None else stop
     if frames > MAX_SYNTHETIC_FRAMES:
         raise GavoError(f"{SYNTHETIC}: has no more than {MAX_SYNTHETIC_FRAMES} frames, not {frames}")
     return SyntheticSequence(frames, camera=None if source.camera == "auto" else load_camera(source.camera))

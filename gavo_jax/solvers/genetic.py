@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Integer, PRNGKeyArray
 
 from gavo_jax.objective import Problem
@@ -137,7 +138,7 @@ def first_candidates(
     return jnp.clip(jnp.where(kept, about, x), bounds.lower, bounds.upper)
 
 
-_PAIRS = jnp.triu_indices(6, 1)
+_PAIRS = np.triu_indices(6, 1)
 RIDGE = 0.1
 """How strongly the fit leans to a round bowl; the problem's coordinates make it nearly one."""
 

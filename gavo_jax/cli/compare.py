@@ -1,0 +1,139 @@
+"""`gavo compare`: the same frames through several methods, other libraries' too."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gavo_jax.cli.compilation_cache import enable_compilation_cache
+from gavo_jax.cli.options import Compare
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.cli.selection import MAX_SEED, open_sequence
+from gavo_jax.cli.tracking import INTERRUPTED, draw, track_visibly
+from gavo_jax.comparison import PeerOdometry
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry import Odometry
+from gavo_jax.peers import PEERS
+from gavo_jax.presets import METHODS, get_preset
+from gavo_jax.results import environment, prepare_folder, remove_figures, remove_files, write_json
+from gavo_jax.trajectory import Trajectory
+
+COMPARISON = "comparison.json"
+DRIFT = "rpe_translation_rmse_m_per_s"
+
+COLUMNS = (
+    ("drift m/s", DRIFT, 4),
+    ("deg/s", "rpe_rotation_rmse_deg_per_s", 3),
+    ("ATE m", "ate_translation_rmse_m", 4),
+    ("distance m", "distance_error_final_m", 4),
+    ("lost", "lost_pairs", 0),
+    ("ms/pair", "milliseconds_per_pair_median", 1),
+    ("frames/s", "frames_per_second", 1),
+)
+"""Columns of the table: heading, key in comparison.json, decimals."""
+
+
+class Entry(NamedTuple):
+    """One run of one method."""
+
+    method: str
+    metrics: dict[str, Any]
+    trajectory: Trajectory
+
+
+def compare(options: Compare) -> int:
+    """Run the methods one after the other; write comparison.json, trajectories and figures; print a table."""
+    methods = _parse_methods(options.methods)
+    if not 1 <= options.seeds <= MAX_SEED:
+        raise GavoError(f"--seeds: must be from 1 to {MAX_SEED}, not {options.seeds}")
+    sequence = open_sequence(options)
+    enable_compilation_cache()
+    peers = {name: PeerOdometry(name, sequence.camera) for name in methods if name in PEERS}
+    folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
+    remove_files(folder, COMPARISON)
+    remove_figures(folder)
+    entries: list[Entry] = []
+    status = 0
+    try:
+        for method in methods:
+            for seed in range(options.seeds) if method in METHODS else (None,):
+                entry = _run_method(sequence, method, options.preset, seed, peers.get(method))
+                suffix = "" if seed is None or options.seeds == 1 else f"-seed{seed}"
+                entry.trajectory.write_tum(folder / f"{method}{suffix}.txt")
+                entries.append(entry)
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+        if not entries:
+            raise
+    typical = _typical_runs(entries)
+    draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    write_json(folder / COMPARISON, [entry.metrics for entry in entries])
+    _report(f"{sequence.name}, {len(sequence)} frames, preset {options.preset}", entries, typical)
+    print(f"files in {folder}")
+    return status
+
+
+def _parse_methods(text: str) -> list[str]:
+    """Return the names between the commas; raise GavoError for an unknown or repeated one."""
+    names = [name.strip() for name in text.split(",")]
+    known = (*METHODS, *PEERS)
+    for name in names:
+        if name not in known:
+            raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}")
+        if names.count(name) > 1:
+            raise GavoError(f"--methods: {name} is given twice")
+    return names
+
+
+def _run_method(
+    sequence: Sequence, method: str, preset_name: str, seed: int | None, peer: PeerOdometry | None
+) -> Entry:
+    """Run one method once; a peer has neither preset nor seed.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it; an unfinished run is not compared.
+    """
+    if peer is None:
+        preset = get_preset(method, preset_name)
+        odometry = Odometry(sequence.camera, preset.solver, preset.alignment, preset.odometry, seed or 0)
+    else:
+        odometry = peer
+    label = method if seed is None else f"{method}, seed {seed}"
+    tracked = track_visibly(label, sequence, odometry)
+    if tracked.interrupted:
+        raise KeyboardInterrupt
+    metrics = {
+        "sequence": sequence.name,
+        "method": method,
+        "preset": None if peer else preset_name,
+        "seed": seed,
+        **tracked.metrics,
+        "versions": peer.peer.versions if peer else environment(),
+    }
+    return Entry(method, metrics, tracked.trajectory)
+
+
+def _typical_runs(entries: list[Entry]) -> list[Entry]:
+    """Return for each method its run of median drift (the better of the two middle ones), in the methods' order."""
+    by_method: dict[str, list[Entry]] = {}
+    for entry in entries:
+        by_method.setdefault(entry.method, []).append(entry)
+    return [_median(runs) for runs in by_method.values()]
+
+
+def _median(runs: list[Entry]) -> Entry:
+    drifts = [run.metrics[DRIFT] for run in runs]
+    if None in drifts:
+        return runs[0]
+    return sorted(runs, key=lambda run: run.metrics[DRIFT])[(len(runs) - 1) // 2]
+
+
+def _report(title: str, entries: list[Entry], typical: list[Entry]) -> None:
+    headings = ["method", *(heading for heading, _, _ in COLUMNS), "seeds", "drift from", "to"]
+    rows = []
+    for run in typical:
+        drifts = [entry.metrics[DRIFT] for entry in entries if entry.method == run.method]
+        known = [drift for drift in drifts if drift is not None]
+        cells = [number(run.metrics[key], digits) for _, key, digits in COLUMNS]
+        span = [number(extreme(known, default=None)) for extreme in (min, max)]
+        rows.append([run.method, *cells, len(drifts), *span])
+    print_table(title, headings, rows)
