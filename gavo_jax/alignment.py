@@ -86,7 +86,8 @@ class AlignmentOptions:
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Weight of the depth cost against the grey one, both in units of their noise.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
-        outside_cost: Cost of a point that leaves the view; see `Objective`. None: (2) as printed.
+        outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
+            None, and on the levels that refine one motion: (2) as printed.
         bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
         bounds_factor: Factor on the half-widths from a level to the next finer one.
         scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands
@@ -161,6 +162,7 @@ def level_objective(
     Before anything is aligned a regression of one image on the other would only tell that they differ: its gain would
     fall towards 0 and reward motions that hide contrast.
     """
+    charge_outside = options.outside_cost is not None and options.islands[level] > 1
     camera = camera.level(level)
     packed = pack_target(target[level].grey, target[level].inverse_depth)
 
@@ -173,7 +175,7 @@ def level_objective(
             jnp.float32(options.min_overlap),
             options.loss,
             options.depth,
-            None if options.outside_cost is None else jnp.float32(options.outside_cost),
+            jnp.float32(options.outside_cost) if charge_outside else None,
         )
 
     references = []
@@ -233,7 +235,7 @@ def align_pyramids(
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
     """
     box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
-    islands, centre = guesses, guesses[0]
+    islands, centre, objective = guesses, guesses[0], None
     histories: list[jax.Array] = []
     for level in solver.levels:
         first, count = not histories, options.islands[level]
@@ -260,6 +262,7 @@ def align_pyramids(
         histories.append(history[jnp.argmin(errors)])
         islands = islands[_best_distinct(islands, errors, count)]
         box = box * options.bounds_factor
+    assert objective is not None, "the solver has no level with an iteration"
     return _conclude(objective, islands[0], options, jnp.concatenate(histories))
 
 

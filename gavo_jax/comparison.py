@@ -5,7 +5,7 @@ from typing import Any
 from gavo_jax.alignment import Alignment, AlignmentStatus
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry import Odometry, _no_alignment
+from gavo_jax.odometry import Odometry, no_alignment
 from gavo_jax.peers import make_peer
 from gavo_jax.presets import OdometryOptions
 
@@ -37,4 +37,4 @@ class PeerOdometry(Odometry):
         prepared = self.peer.prepare(frame)
         found = self.peer.align(state, prepared)
         status = AlignmentStatus.OK if found.success else AlignmentStatus.NOT_FINITE
-        return prepared, _no_alignment(status)._replace(target_T_reference=found.target_T_reference)
+        return prepared, no_alignment(status)._replace(target_T_reference=found.target_T_reference)

@@ -320,14 +320,15 @@ class Problem:
             error = jnp.where(far, jnp.inf, error)
         return jnp.where(jnp.isnan(error), jnp.inf, error), overlap
 
-    def _weighted_terms(self, x: Float[Array, " 6"]) -> tuple[Residuals, list[tuple[jax.Array, jax.Array]]]:
-        """For each channel, J of [6, N] and w r of [N], with E's gradient = Σ_i J_i (w r)_i, and w J beside it."""
+    def _weighted_terms(self, x: Float[Array, " 6"]) -> tuple[Residuals, list[tuple[jax.Array, jax.Array, jax.Array]]]:
+        """For each channel J of [6, N], r and w of [N]: E's gradient is Σ J w r, its Gauss-Newton Hessian Σ w J Jᵀ."""
         objective = self.objective
         twist = self.basis @ x
         tangent = jnp.einsum("ij,jkm->ikm", self.transform(x), GENERATORS @ (right_jacobian(twist) @ self.basis))
         r, scales, facing = objective.residuals(self.transform(x)), objective.scales, objective.reference.facing
         grey, depth = r.grey_sample, r.depth_sample
-        channels = [(r.grey, scales.grey, r.inside, 1.0, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
+        one = jnp.float32(1.0)
+        channels = [(r.grey, scales.grey, r.inside, one, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
         if objective.use_depth:
             factor = scales.depth_weight * (scales.grey / scales.depth) ** 2
             slopes = (facing * depth.along_u, facing * depth.along_v, -facing)
@@ -348,8 +349,8 @@ class Problem:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
         error, overlap = self.objective.error(self.transform(x))
         _, terms = self._weighted_terms(x)
-        gradient = sum(jacobian @ (weight * residual) for jacobian, residual, weight in terms)
-        hessian = sum((jacobian * weight) @ jacobian.T for jacobian, _, weight in terms)
+        gradient = jnp.asarray(sum(jacobian @ (weight * residual) for jacobian, residual, weight in terms))
+        hessian = jnp.asarray(sum((jacobian * weight) @ jacobian.T for jacobian, _, weight in terms))
         return Linearization(error, overlap, gradient, hessian)
 
     def gradient_scatter(self, x: Float[Array, " 6"]) -> Float[Array, "6 6"]:
@@ -363,7 +364,7 @@ class Problem:
         column = jnp.clip(r.warped.u * (TILES[0] / camera.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / camera.height), 0, TILES[1] - 1).astype(jnp.int32)
         tile = jax.nn.one_hot(row * TILES[0] + column, TILES[0] * TILES[1])
-        sums = sum((jacobian * (weight * residual)) @ tile for jacobian, residual, weight in terms)
+        sums = jnp.asarray(sum((jacobian * (weight * residual)) @ tile for jacobian, residual, weight in terms))
         used = jnp.sum(jnp.any(sums != 0, axis=0))
         return (sums @ sums.T) * used / jnp.maximum(used - 1, 1)
 

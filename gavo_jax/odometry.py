@@ -111,7 +111,8 @@ def _first_state(grey: Array, depth: Array, camera: Camera) -> TrackerState:
     return TrackerState(pyramid, pyramid, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
-class Step(NamedTuple):
+@dataclass(frozen=True)
+class Step:
     """What the driver says of one new frame."""
 
     index: int
@@ -128,18 +129,18 @@ class Step(NamedTuple):
     lost: bool
 
 
-def _no_alignment(status: AlignmentStatus) -> Alignment:
+def no_alignment(status: AlignmentStatus) -> Alignment:
     """The result of a pair that could not be aligned at all: no motion, nothing known."""
-    unknown = np.float32(np.nan)
-    return Alignment(
-        np.eye(4, dtype=np.float32),
-        np.zeros(6, np.float32),
-        unknown,
-        np.float32(0.0),
-        np.full((6, 6), np.nan, np.float32),
-        status,
-        np.zeros(0, np.float32),
+    nothing = Alignment(
+        target_T_reference=jnp.eye(4),
+        xi=jnp.zeros(6),
+        error=jnp.float32(jnp.nan),
+        overlap=jnp.float32(0.0),
+        covariance=jnp.full((6, 6), jnp.nan),
+        status=status,
+        history=jnp.zeros(0),
     )
+    return on_host(nothing)
 
 
 MAX_HELD = 3
@@ -206,7 +207,7 @@ class Odometry:
             self._restart(frame)
             return None
         start = time.perf_counter()
-        state, result = (None, _no_alignment(AlignmentStatus.UNREADABLE))
+        state, result = (None, no_alignment(AlignmentStatus.UNREADABLE))
         if frame is not None:
             state, result = self._align(self._state, frame)
         lost = result.status != AlignmentStatus.OK
@@ -281,7 +282,7 @@ def _traced(options: OdometryOptions) -> OdometryOptions:
     return replace(options, recover=True, on_lost="hold")
 
 
-def _rigid(transform: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+def _rigid(transform: Float[Array | np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
     """A float32 motion in double precision with its rotation made orthonormal, so that chains stay rigid."""
     result = np.eye(4)
     u, _, v = np.linalg.svd(np.asarray(transform[:3, :3], np.float64))

@@ -113,10 +113,10 @@ _WIDE = {
     "adam": GradientDescent(),
 }
 WIDE_OBJECTIVE = AlignmentOptions(
-    islands=(1, 1, 2, 8, 64), scouts=4096, min_overlap=0.2, outside_cost=0.35, bounds=(0.5, 1.05)
+    islands=(1, 1, 2, 8, 64), scouts=4096, min_overlap=0.2, outside_cost=0.5, bounds=(0.5, 1.05)
 )
 """Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 64 populations at level 4, of which the 8
-best distinct ones go on to level 3 and 2 to level 2. A point out of view costs a third of a typical residual."""
+best distinct ones go on to level 3 and 2 to level 2. A point out of view costs half a typical residual."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:

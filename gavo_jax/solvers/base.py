@@ -15,6 +15,10 @@ def static(default: Any) -> Any:
     return field(default=default, metadata={"static": True})
 
 
+Schedule = Any
+"""A tuple with an entry a pyramid level, level 0 first; a plain number once `at_level` has picked a level's entry."""
+
+
 class Bounds(NamedTuple):
     """Search box in the problem's coordinates."""
 
@@ -44,7 +48,7 @@ class Solver(Protocol):
     """
 
     @property
-    def iterations(self) -> int | tuple[int, ...]:
+    def iterations(self) -> Schedule:
         """Largest number of iterations; 0 skips a level."""
         ...
 

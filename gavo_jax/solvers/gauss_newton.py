@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective import Linearization, Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 
 
 class GaussNewtonState(NamedTuple):
@@ -38,7 +38,7 @@ class GaussNewton(PerLevel):
         damping: First damping, relative to the Hessian's diagonal.
     """
 
-    iterations: tuple[int, ...] = static((0, 12, 12, 15, 20))
+    iterations: Schedule = static((0, 12, 12, 15, 20))
     patience: int = static(3)
     damping: float = 1e-4
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer, PRNGKeyArray
 
 from gavo_jax.objective import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 
 
 class GeneticState(NamedTuple):
@@ -53,13 +53,13 @@ class GeneticAlgorithm(PerLevel):
         pressure: Factor in the fitness, 8 in the paper (10).
     """
 
-    population: tuple[int, ...] = static((0, 12, 16, 24, 64))
-    iterations: tuple[int, ...] = static((0, 5, 6, 8, 12))
+    population: Schedule = static((0, 12, 16, 24, 64))
+    iterations: Schedule = static((0, 5, 6, 8, 12))
     patience: int = static(1000)
     mutants: float = static(0.3)
     surrogate: bool = static(True)
-    spread: tuple[float, ...] | None = (0.5, 0.5, 1.0, 1.5, 6.0)
-    mutation_step: tuple[float, ...] | None = (1.0, 1.0, 2.0, 3.0, 6.0)
+    spread: Schedule | None = (0.5, 0.5, 1.0, 1.5, 6.0)
+    mutation_step: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
     mutation_decay: float = 0.8
     mutation_rate: float = 0.1
     crossover_range: float = 0.25

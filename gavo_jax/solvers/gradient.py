@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 
 
 class GradientState(NamedTuple):
@@ -39,9 +39,9 @@ class GradientDescent(PerLevel):
         optimizer: optax's constructor, called with a learning rate of 1 (static).
     """
 
-    iterations: tuple[int, ...] = static((0, 30, 40, 50, 60))
+    iterations: Schedule = static((0, 30, 40, 50, 60))
     patience: int = static(15)
-    learning_rate: tuple[float, ...] = (0.5, 0.5, 1.0, 2.0, 4.0)
+    learning_rate: Schedule = (0.5, 0.5, 1.0, 2.0, 4.0)
     decay: float = 0.93
     optimizer: Callable[[float], optax.GradientTransformation] = static(optax.adam)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 from gavo_jax.solvers.genetic import first_candidates
 
 
@@ -40,10 +40,10 @@ class ParticleSwarm(PerLevel):
         velocity_clamp: Largest velocity as a share of the bounds' width, or of 6 x spread where a spread is given.
     """
 
-    population: tuple[int, ...] = static((0, 20, 24, 32, 64))
-    iterations: tuple[int, ...] = static((0, 12, 14, 16, 24))
+    population: Schedule = static((0, 20, 24, 32, 64))
+    iterations: Schedule = static((0, 12, 14, 16, 24))
     patience: int = static(1000)
-    spread: tuple[float, ...] | None = (1.0, 1.0, 1.5, 2.0, 6.0)
+    spread: Schedule | None = (1.0, 1.0, 1.5, 2.0, 6.0)
     constriction: float = 0.7298
     cognitive: float = 2.05
     social: float = 2.05
