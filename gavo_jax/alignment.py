@@ -134,7 +134,7 @@ class Alignment(NamedTuple):
 
 
 MIN_DEPTH_SHARE = 0.05
-MIN_FINAL_OVERLAP = 0.4
+MIN_FINAL_OVERLAP = 0.3
 MIN_EXPLAINED = 0.5
 MAX_TRANSLATION_DEVIATION = 0.05
 MAX_ROTATION_DEVIATION = 0.05
@@ -289,7 +289,7 @@ def _search_island(
 
 
 NICHE = (0.08, 0.08)
-"""Metres and radians within which two motions count as one mode."""
+"""Metres and radians of ξ within which two motions count as one mode."""
 
 
 def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
@@ -300,13 +300,12 @@ def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], c
     if count == 1:
         return jnp.argmin(errors)[None]
     scale = jnp.repeat(jnp.stack([jnp.float32(radius) for radius in NICHE]), 3)
+    places = log(motions) / scale
 
     def pick(cleared: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
         best = jnp.argmin(cleared)
-        offset = log(jnp.linalg.inv(motions[best]) @ motions) / scale
-        near = jnp.sum(offset**2, axis=1) < 1.0
-        cleared = jnp.where(near, cleared + CLEARED, cleared).at[best].set(jnp.inf)
-        return cleared, best
+        near = jnp.sum((places - places[best]) ** 2, axis=1) < 1.0
+        return jnp.where(near, cleared + CLEARED, cleared).at[best].set(jnp.inf), best
 
     return jax.lax.scan(pick, jnp.minimum(jnp.nan_to_num(errors, nan=jnp.inf), CLEARED / 2), length=count)[1]
 

@@ -104,7 +104,7 @@ _FAST = {
 _WIDE = {
     "ga": GeneticAlgorithm(
         population=(0, 16, 20, 24, 16),
-        iterations=(0, 8, 8, 10, 10),
+        iterations=(0, 8, 8, 10, 12),
         spread=(0.5, 0.5, 1.0, 3.0, 15.0),
         mutation_step=(1.0, 1.0, 2.0, 5.0, 15.0),
     ),
@@ -113,10 +113,15 @@ _WIDE = {
     "adam": GradientDescent(),
 }
 WIDE_OBJECTIVE = AlignmentOptions(
-    islands=(1, 1, 2, 8, 64), scouts=4096, min_overlap=0.2, outside_cost=0.5, bounds=(0.5, 1.05)
+    islands=(1, 1, 4, 16, 96),
+    scouts=8192,
+    scout_spread=(0.1, 0.5),
+    min_overlap=0.2,
+    outside_cost=0.5,
+    bounds=(0.5, 1.05),
 )
-"""Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 64 populations at level 4, of which the 8
-best distinct ones go on to level 3 and 2 to level 2. A point out of view costs half a typical residual."""
+"""Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
+16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs half a typical residual."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:
