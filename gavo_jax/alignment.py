@@ -84,7 +84,7 @@ class AlignmentOptions:
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         cells: Side of the blocks that give one point each, an entry a level (static); 1 takes every pixel.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
-        depth_weight: Weight of the depth cost against the grey one, both in units of their noise.
+        depth_weight: Factor on the depth cost's weight, which comes from the data; see `objective.estimate_scales`.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -102,7 +102,7 @@ class AlignmentOptions:
     precondition: bool = static(True)
     cells: tuple[int, ...] = static((2, 2, 1, 1, 1))
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
-    depth_weight: float = 0.3
+    depth_weight: float = 1.0
     min_overlap: float = 0.35
     outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
@@ -175,6 +175,7 @@ def level_objective(
             jnp.float32(options.min_overlap),
             options.loss,
             options.depth,
+            camera.width // options.cells[level],
             jnp.float32(options.outside_cost) if charge_outside else None,
         )
 

@@ -202,6 +202,8 @@ class Objective:
     min_overlap: Float[Array, ""]
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
+    columns: int = field(default=1, metadata={"static": True})
+    """Reference points a row: they come from a grid, row after row."""
     outside_cost: Float[Array, ""] | None = None
     """Cost of a reference point that leaves the view, in units of that of a residual of one scale; None averages over
     the points in view alone, as (2) does. With a cost, a motion cannot win by pushing pixels out of view."""
@@ -439,14 +441,46 @@ SMALLEST_DEPTH_SCALE = 5e-4
 """1/m: a tenth of the quantisation of a structured-light sensor."""
 
 
+def _independent_share(residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: int) -> jax.Array:
+    """Share of a channel's residuals that are independent witnesses, from their correlation between neighbours.
+
+    n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ the correlation at lag one of the residuals as the
+    loss weighs them (an autoregressive model along either direction). Where depth and colour are out of step, whole
+    surfaces err together: ρ is near 1 and the share falls to a few per cent.
+    """
+    weighted = mask * residual * 6.0 / (5.0 + (residual / scale) ** 2)
+    weighted, mask = weighted.reshape(-1, columns), mask.reshape(-1, columns)
+    share = jnp.float32(1.0)
+    for first, second, both in (
+        (weighted[:, :-1], weighted[:, 1:], mask[:, :-1] * mask[:, 1:]),
+        (weighted[:-1], weighted[1:], mask[:-1] * mask[1:]),
+    ):
+        product = jnp.sum(first * second)
+        power = 0.5 * jnp.sum(both * (first**2 + second**2))
+        rho = jnp.clip(product / jnp.maximum(power, 1e-20), 0.0, 0.98)
+        share *= (1.0 - rho) / (1.0 + rho)
+    return share
+
+
 def estimate_scales(
     objective: Objective, target_T_reference: Float[Array, "4 4"], depth_weight: jax.Array | float
 ) -> Scales:
-    """Scales of the grey and the depth residuals at one motion."""
+    """Scales of the grey and the depth residuals at one motion, and the weight of depth that follows from them.
+
+    Each channel counts as its independent residuals do; `depth_weight` multiplies the ratio.
+    """
     r = objective.residuals(target_T_reference)
     grey = jnp.maximum(_t_scale(r.grey, r.inside), SMALLEST_GREY_SCALE)
     depth = jnp.maximum(_t_scale(r.depth, r.depth_valid), SMALLEST_DEPTH_SCALE)
-    return Scales(grey, depth, jnp.float32(depth_weight))
+    ratio = _independent_share(r.depth, r.depth_valid, depth, objective.columns) / _independent_share(
+        r.grey, r.inside, grey, objective.columns
+    )
+    return Scales(grey, depth, depth_weight * jnp.clip(ratio, *DEPTH_WEIGHT_RANGE))
+
+
+DEPTH_WEIGHT_RANGE = (0.1, 0.3)
+"""The estimated weight of depth is held within these: depth errs by whole surfaces (calibration, timing) in ways that
+its scatter about them does not show, so it never counts as much as grey does."""
 
 
 def estimate_brightness(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
