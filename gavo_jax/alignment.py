@@ -100,7 +100,7 @@ class AlignmentOptions:
     brightness: bool = static(True)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
-    cells: tuple[int, ...] = static((2, 2, 1, 1, 1))
+    cells: tuple[int, ...] = static((2, 2, 2, 1, 1))
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: float = 1.0
     min_overlap: float = 0.35

@@ -53,12 +53,12 @@ class GeneticAlgorithm(PerLevel):
         pressure: Factor in the fitness, 8 in the paper (10).
     """
 
-    population: Schedule = static((0, 12, 16, 24, 64))
-    iterations: Schedule = static((0, 5, 6, 8, 12))
+    population: Schedule = static((0, 16, 20, 24, 64))
+    iterations: Schedule = static((0, 8, 8, 10, 12))
     patience: int = static(1000)
     mutants: float = static(0.3)
     surrogate: bool = static(True)
-    spread: Schedule | None = (0.5, 0.5, 1.0, 1.5, 6.0)
+    spread: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
     mutation_step: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
     mutation_decay: float = 0.8
     mutation_rate: float = 0.1

@@ -1,0 +1,222 @@
+"""How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
+
+A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
+stamps. Prints a row a gap: the number of pairs, their median motion, and each method's success rate (median over the
+seeds; presets as METHOD:PRESET, peers by name); then a row a method: how often its status was right about failure, as
+precision (share of the flagged pairs that had failed) and recall (share of the failed pairs that were flagged), and
+the milliseconds a pair. A peer's status is the flag that it returns.
+
+    python benchmarks/basin.py
+    python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
+
+On 2 cores the defaults take about 5 minutes.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import common
+import jax
+import numpy as np
+
+from gavo_jax.alignment import AlignmentStatus, align
+from gavo_jax.camera import Camera
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import rotation_angle
+from gavo_jax.peers import PEERS, make_peer
+from gavo_jax.trajectory import inverse
+
+METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.installed_peers()
+MAX_TRANSLATION, MAX_ROTATION = 0.05, 3.0
+"""Metres and degrees: errors of a found motion stay below."""
+
+
+class Pair(NamedTuple):
+    """Two frames of a clip and the true motion between them."""
+
+    reference: int
+    target: int
+    target_T_reference: np.ndarray
+
+
+class Attempt(NamedTuple):
+    """What a method made of a pair."""
+
+    target_T_reference: np.ndarray
+    flagged: bool
+    """Whether the method itself says that something is wrong."""
+
+
+Aligner = Callable[[Frame, Frame, int], Attempt]
+"""From reference, target and seed."""
+
+
+def pairs_apart(sequence: Sequence, gap: int, step: int) -> list[Pair]:
+    """The pairs `gap` frames apart, every `step` frames; those without ground truth are left out.
+
+    Raises:
+        GavoError: the sequence has no ground truth.
+    """
+    if sequence.ground_truth is None:
+        raise GavoError(f"{sequence.name}: has no ground truth")
+    world_T_camera, valid = sequence.ground_truth.interpolate(sequence.timestamps)
+    return [
+        Pair(i, i + gap, inverse(world_T_camera[i + gap]) @ world_T_camera[i])
+        for i in range(0, len(sequence) - gap, step)
+        if valid[i] and valid[i + gap]
+    ]
+
+
+def make_aligner(name: str, camera: Camera) -> Aligner:
+    """The method or peer of that name.
+
+    Raises:
+        GavoError: unknown name.
+    """
+    if name in PEERS:
+        peer = make_peer(name, camera)
+
+        def by_peer(reference: Frame, target: Frame, seed: int) -> Attempt:
+            del seed
+            result = peer.align(peer.prepare(reference), peer.prepare(target))
+            return Attempt(result.target_T_reference, not result.success)
+
+        return by_peer
+    preset = common.preset_of(name)
+
+    def by_solver(reference: Frame, target: Frame, seed: int) -> Attempt:
+        key = jax.random.key(seed)
+        result = align(reference, target, camera, preset.solver, key, options=preset.alignment)
+        return Attempt(np.asarray(result.target_T_reference, np.float64), result.status != AlignmentStatus.OK)
+
+    return by_solver
+
+
+def motion_size(a_T_b: np.ndarray) -> tuple[float, float]:
+    """Length (m) and angle (degrees) of a rigid motion."""
+    return float(np.linalg.norm(a_T_b[:3, 3])), float(np.degrees(rotation_angle(a_T_b[None, :3, :3])[0]))
+
+
+def attempt_pairs(
+    sequence: Sequence, pairs: list[Pair], aligners: dict[str, Aligner], seeds: int
+) -> list[dict[str, Any]]:
+    """Let every method try every pair, pair after pair; a peer tries once."""
+    records = []
+    for pair in pairs:
+        reference, target = sequence[pair.reference], sequence[pair.target]
+        length, angle = motion_size(pair.target_T_reference)
+        for name, aligner in aligners.items():
+            for seed in range(1 if name in PEERS else seeds):
+                start = time.perf_counter()
+                attempt = aligner(reference, target, seed)
+                milliseconds = (time.perf_counter() - start) * 1e3
+                error = motion_size(inverse(pair.target_T_reference) @ attempt.target_T_reference)
+                records.append(
+                    {
+                        "gap": pair.target - pair.reference,
+                        "reference": pair.reference,
+                        "method": name,
+                        "seed": seed,
+                        "motion_m": length,
+                        "motion_deg": angle,
+                        "error_m": error[0],
+                        "error_deg": error[1],
+                        "found": error[0] < MAX_TRANSLATION and error[1] < MAX_ROTATION,
+                        "flagged": bool(attempt.flagged),
+                        "milliseconds": milliseconds,
+                    }
+                )
+    return records
+
+
+def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row a gap: pairs, median motion and each method's success rate, median over the seeds."""
+    rows = []
+    for gap in dict.fromkeys(r["gap"] for r in records):
+        of_gap = [r for r in records if r["gap"] == gap]
+        motions = {r["reference"]: (r["motion_m"], r["motion_deg"]) for r in of_gap}
+        length, angle = np.median(list(motions.values()), axis=0)
+        rates = {}
+        for name in dict.fromkeys(r["method"] for r in of_gap):
+            by_seed: dict[int, list[bool]] = {}
+            for r in of_gap:
+                if r["method"] == name:
+                    by_seed.setdefault(r["seed"], []).append(r["found"])
+            rates[name] = float(np.median([np.mean(found) for found in by_seed.values()]))
+        rows.append({"gap": gap, "pairs": len(motions), "motion_m": length, "motion_deg": angle, "success": rates})
+    return rows
+
+
+def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row a method: precision and recall of its status as a sign of failure; None where there is nothing to count."""
+    rows = []
+    for name in dict.fromkeys(r["method"] for r in records):
+        own = [r for r in records if r["method"] == name]
+        failed, flagged = sum(not r["found"] for r in own), sum(r["flagged"] for r in own)
+        both = sum(r["flagged"] and not r["found"] for r in own)
+        rows.append(
+            {
+                "method": name,
+                "attempts": len(own),
+                "failed": failed,
+                "flagged": flagged,
+                "precision": both / flagged if flagged else None,
+                "recall": both / failed if failed else None,
+                "milliseconds": float(np.median([r["milliseconds"] for r in own])),
+            }
+        )
+    return rows
+
+
+def main(
+    clip: str = "fr1_rpy",
+    gaps: str = "1,3,6,10,15",
+    methods: str = METHODS,
+    step: int = 4,
+    seeds: int = 1,
+    json: Path | None = None,
+) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clip: as for drift.py, one of them.
+        gaps: frames between the two of a pair, with commas between.
+        methods: METHOD, METHOD:PRESET or the name of a peer, with commas between.
+        step: frames from a pair to the next one.
+        seeds: tries of each of our methods.
+        json: file for every attempt and the rates.
+    """
+    sequence = common.open_clip(clip)
+    sequence.check()
+    aligners = {name: make_aligner(name, sequence.camera) for name in common.names(methods)}
+    records: list[dict[str, Any]] = []
+    for gap in map(int, common.names(gaps)):
+        records += attempt_pairs(sequence, pairs_apart(sequence, gap, step), aligners, seeds)
+    if not records:
+        raise GavoError(f"{clip}: no two frames with ground truth lie {gaps} frames apart")
+    rates, agreement = success_rates(records), status_agreement(records)
+    rows = [
+        [row["gap"], row["pairs"], number(row["motion_m"], 3), number(row["motion_deg"], 1)]
+        + [number(rate, 2) for rate in row["success"].values()]
+        for row in rates
+    ]
+    print_table(f"success rate on {clip}", ("gap", "pairs", "motion m", "deg", *aligners), rows)
+    rows = [
+        [row["method"], row["attempts"], row["failed"], row["flagged"]]
+        + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
+        for row in agreement
+    ]
+    print_table(
+        "status against failure", ("method", "tries", "failed", "flagged", "precision", "recall", "ms/pair"), rows
+    )
+    results = {"clip": clip, "success": rates, "status": agreement, "attempts": records}
+    common.record(json, "basin", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)

@@ -1,0 +1,238 @@
+"""What the benchmarks share: clips and methods by name, drift over seeds, tables and the record of a run."""
+
+import os
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+
+from gavo_jax.camera import Camera
+from gavo_jax.cli.compilation_cache import enable_compilation_cache
+from gavo_jax.cli.screen import number
+from gavo_jax.cli.tracking import track_visibly
+from gavo_jax.comparison import PeerOdometry
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry import Odometry
+from gavo_jax.peers import PEERS
+from gavo_jax.presets import Preset, get_preset
+from gavo_jax.results import environment, write_json
+
+CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
+CLIP_FRAMES = {"fr1_xyz": 90}
+"""Frames taken of a clip where its name says nothing: the paper's first experiment uses 90 of fr1_xyz."""
+TRANSLATION, ROTATION = "rpe_translation_rmse_m_per_s", "rpe_rotation_rmse_deg_per_s"
+
+
+def command(main: Callable[..., Any]) -> None:
+    """Run a benchmark's `main` as a command: its arguments are the options, the module's docstring the help text."""
+    enable_compilation_cache()
+    try:
+        tyro.cli(main, description=sys.modules[main.__module__].__doc__)
+    except GavoError as error:
+        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def names(text: str) -> list[str]:
+    """Return the names between the commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def open_clip(text: str) -> FrameSequence:
+    """Return the frames of a clip.
+
+    Args:
+        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder in TUM layout, one of GAVO_DATA's
+            folders, or the word synthetic.
+
+    Raises:
+        GavoError: no such folder, GAVO_DATA not set, or the frames are not a number.
+    """
+    name, _, count = text.partition(":")
+    if count and not (count.isdecimal() and int(count) >= 2):
+        raise GavoError(f"{text}: not NAME or NAME:FRAMES with at least 2 frames")
+    frames = int(count) if count else CLIP_FRAMES.get(name)
+    if name == "synthetic":
+        return SyntheticSequence(frames)
+    folder = Path(name)
+    if not folder.is_dir():
+        data = os.environ.get("GAVO_DATA")
+        if not data:
+            raise GavoError(f"{name}: no such folder, and GAVO_DATA does not name the folder of the clips")
+        folder = Path(data) / name
+    return TumSequence(folder)[:frames]
+
+
+class Contender(NamedTuple):
+    """What takes part in a table."""
+
+    name: str
+    make: Callable[[Camera, int], Odometry]
+    """A new driver for a camera and a seed."""
+    random: bool
+    """Whether the seed can change the result; a peer's cannot."""
+
+
+def preset_contender(name: str, preset: Preset) -> Contender:
+    """One of our own methods with its settings."""
+
+    def make(camera: Camera, seed: int) -> Odometry:
+        return Odometry(camera, preset.solver, preset.alignment, preset.odometry, seed)
+
+    return Contender(name, make, True)
+
+
+def preset_of(name: str) -> Preset:
+    """The preset of METHOD or METHOD:PRESET.
+
+    Raises:
+        GavoError: unknown method or preset.
+    """
+    method, _, preset = name.partition(":")
+    return get_preset(method, preset or "default")
+
+
+def parse_methods(text: str) -> list[Contender]:
+    """The contenders of a list like `ga,ga:fast,opencv-rgb`: METHOD, METHOD:PRESET or the name of a peer.
+
+    Raises:
+        GavoError: unknown method, preset or peer.
+    """
+    return [
+        Contender(name, lambda camera, _, name=name: PeerOdometry(name, camera), False)
+        if name in PEERS
+        else preset_contender(name, preset_of(name))
+        for name in names(text)
+    ]
+
+
+def installed_peers() -> str:
+    """Names of the peers whose libraries are installed, with commas between."""
+    return ",".join(name for name, info in PEERS.items() if info.installed)
+
+
+def measure_drift(clips: Sequence[str], contenders: Sequence[Contender], seeds: int) -> list[dict[str, Any]]:
+    """Run every contender over every clip with every seed; a peer runs once a clip.
+
+    Seed after seed, and within each one contender after the other, so that a slow spell of the machine meets all.
+
+    Returns:
+        The metrics of each run (as `metrics.json`, times included) with `clip`, `name`, `seed` and `random`.
+
+    Raises:
+        GavoError: a clip cannot be read, or its ground truth covers less than a second.
+    """
+    runs = []
+    for clip in clips:
+        sequence = open_clip(clip)
+        sequence.check()
+        for seed in range(seeds):
+            for contender in contenders:
+                if seed > 0 and not contender.random:
+                    continue
+                odometry = contender.make(sequence.camera, seed)
+                metrics = track_visibly(f"{clip}, {contender.name}, seed {seed}", sequence, odometry).metrics
+                if metrics[TRANSLATION] is None:
+                    raise GavoError(f"{clip}: no ground truth over a second of it")
+                runs.append({"clip": clip, "name": contender.name, "seed": seed, "random": contender.random, **metrics})
+    return runs
+
+
+class Summary(NamedTuple):
+    """One contender on one clip, over the seeds."""
+
+    clip: str
+    name: str
+    translation: float
+    """Median drift, m/s."""
+    translation_spread: float
+    """Largest over smallest."""
+    rotation: float
+    """Median drift, deg/s."""
+    rotation_spread: float
+    lost: int
+    """Lost pairs of the worst run."""
+    milliseconds: float
+    """Median over the runs of the median time a pair."""
+    runs: int
+
+
+def summarise(runs: Sequence[dict[str, Any]]) -> list[Summary]:
+    """Median and spread over the seeds of each clip and contender, in the order of the runs."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for run in runs:
+        groups.setdefault((run["clip"], run["name"]), []).append(run)
+    summaries = []
+    for (clip, name), group in groups.items():
+        translation, rotation = (np.array([run[key] for run in group]) for key in (TRANSLATION, ROTATION))
+        summaries.append(
+            Summary(
+                clip,
+                name,
+                float(np.median(translation)),
+                float(translation.max() / translation.min()),
+                float(np.median(rotation)),
+                float(rotation.max() / rotation.min()),
+                max(run["lost_pairs"] for run in group),
+                float(np.median([run["milliseconds_per_pair_median"] for run in group])),
+                len(group),
+            )
+        )
+    return summaries
+
+
+DRIFT_COLUMNS = ("method", "m/s", "max/min", "deg/s", "max/min", "lost", "ms/pair", "runs")
+
+
+def drift_row(summary: Summary) -> list[str]:
+    """The cells of `DRIFT_COLUMNS`."""
+    return [
+        summary.name,
+        number(summary.translation, 4),
+        number(summary.translation_spread, 3),
+        number(summary.rotation, 3),
+        number(summary.rotation_spread, 3),
+        str(summary.lost),
+        number(summary.milliseconds, 1),
+        str(summary.runs),
+    ]
+
+
+def geometric_mean(values: Sequence[float]) -> float:
+    """Geometric mean of positive numbers."""
+    return float(np.exp(np.mean(np.log(values))))
+
+
+def record(path: Path | None, benchmark: str, results: dict[str, Any]) -> None:
+    """Write the results as JSON beside what they depend on: date, machine, versions; nothing where path is None."""
+    if path is not None:
+        write_json(path, {"benchmark": benchmark, **machine(), **results})
+
+
+def machine() -> dict[str, Any]:
+    """Date, processor, cores, device and versions."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "device": jax.devices()[0].device_kind,
+        "versions": environment(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor()

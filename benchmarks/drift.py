@@ -1,0 +1,97 @@
+"""Drift of every method on every clip: ours with their presets, the peers beside them.
+
+Prints, for each clip, a row a method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s, each
+as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
+milliseconds a pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
+which need not be the same one) and of the GA to Gauss-Newton, clip by clip, with their geometric mean and the worst.
+
+    python benchmarks/drift.py
+    python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
+
+Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
+METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
+is run at the full resolution as printed; without it, ten minutes.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import common
+
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.peers import PEERS
+
+METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers()
+
+
+class Ratio(NamedTuple):
+    """A figure against its reference, clip by clip."""
+
+    name: str
+    by_clip: dict[str, float]
+
+    @property
+    def mean(self) -> float:
+        """Geometric mean over the clips."""
+        return common.geometric_mean(list(self.by_clip.values()))
+
+    @property
+    def worst(self) -> float:
+        """Largest of the clips."""
+        return max(self.by_clip.values())
+
+
+def ratios(summaries: list[common.Summary]) -> list[Ratio]:
+    """Each of our methods against the best peer, and each GA preset against Gauss-Newton's of the same name."""
+    clips = list(dict.fromkeys(summary.clip for summary in summaries))
+    by_key = {(summary.clip, summary.name): summary for summary in summaries}
+    contenders = list(dict.fromkeys(summary.name for summary in summaries))
+    ours, peers = [n for n in contenders if n not in PEERS], [n for n in contenders if n in PEERS]
+    pairs: list[tuple[str, list[str], str]] = [(name, peers, "best peer") for name in ours if peers]
+    for name in ours:
+        rival = name.replace("ga", "gauss-newton", 1)
+        if name.partition(":")[0] == "ga" and rival in ours:
+            pairs.append((name, [rival], rival))
+    found = []
+    for name, rivals, title in pairs:
+        for what in ("translation", "rotation"):
+            by_clip = {
+                clip: getattr(by_key[clip, name], what) / min(getattr(by_key[clip, r], what) for r in rivals)
+                for clip in clips
+            }
+            found.append(Ratio(f"{name} / {title}, {what}", by_clip))
+    return found
+
+
+def main(clips: str = common.CLIPS, methods: str = METHODS, seeds: int = 5, json: Path | None = None) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: names with commas between.
+        methods: names with commas between.
+        seeds: runs of each of our methods.
+        json: file for all runs and the summary.
+    """
+    runs = common.measure_drift(common.names(clips), common.parse_methods(methods), seeds)
+    summaries = common.summarise(runs)
+    for clip in common.names(clips):
+        rows = [common.drift_row(summary) for summary in summaries if summary.clip == clip]
+        print_table(f"drift on {clip}, {runs[0]['device']}", common.DRIFT_COLUMNS, rows)
+    compared = ratios(summaries)
+    if compared:
+        rows = [
+            [r.name, *(number(value, 3) for value in r.by_clip.values()), number(r.mean, 3), number(r.worst, 3)]
+            for r in compared
+        ]
+        print_table("ratios of the medians", ("", *common.names(clips), "geometric mean", "worst"), rows)
+    results = {
+        "runs": runs,
+        "summary": [summary._asdict() for summary in summaries],
+        "ratios": [{**r._asdict(), "geometric_mean": r.mean, "worst": r.worst} for r in compared],
+    }
+    common.record(json, "drift", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)

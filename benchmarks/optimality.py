@@ -1,0 +1,155 @@
+"""How close the GA's result is to the minimum of E, over all consecutive pairs of the clips.
+
+For each pair the GA and Gauss-Newton are run coarse to fine from the identity. Then one objective is made for the
+finest level, its brightness model and scales estimated at the GA's result, and everything is judged by that E: the two
+motions as they were found, and the minima that Gauss-Newton, run to convergence on this very E, reaches from either.
+The lower of the two minima is the reference. Prints a row a clip: the excess of the GA's E over it (median, 90th and
+95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own result.
+
+    python benchmarks/optimality.py
+    python benchmarks/optimality.py --clips fr1_desk:31 --preset fast --json optimality.json
+
+On 2 cores the defaults take about 3 minutes.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import common
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from gavo_jax.alignment import AlignmentOptions, Images, View, align_pyramids, level_objective
+from gavo_jax.camera import Camera
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.objective import Objective, Problem, preconditioner, reference_curvature
+from gavo_jax.presets import get_preset
+from gavo_jax.pyramid import build_pyramid
+from gavo_jax.solvers.base import Bounds, solve
+from gavo_jax.solvers.gauss_newton import GaussNewton
+
+TOLERANCE = 0.5
+"""Per cent of E within which a result counts as optimal."""
+POLISH = 40
+"""Gauss-Newton steps to the reference minima."""
+
+
+class FinalErrors(NamedTuple):
+    """E of one pair by one objective, squared grey levels."""
+
+    genetic: Float[Array, ""]
+    gauss_newton: Float[Array, ""]
+    minimum_from_genetic: Float[Array, ""]
+    minimum_from_gauss_newton: Float[Array, ""]
+
+
+def converged_error(objective: Objective, start: Float[Array, "4 4"]) -> Float[Array, ""]:
+    """E where Gauss-Newton ends that starts at a motion; never above E there."""
+    problem = Problem(objective, start, preconditioner(reference_curvature(objective)))
+    solver = GaussNewton(iterations=(POLISH,), patience=POLISH).at_level(0)
+    unbounded = Bounds(jnp.full(6, -jnp.inf), jnp.full(6, jnp.inf))
+    return solve(jax.random.key(0), solver, problem, jnp.zeros((1, 6)), unbounded).error
+
+
+@jax.jit
+def final_errors(
+    reference: Images,
+    target: Images,
+    camera: Camera,
+    genetic: Any,
+    gauss_newton: Any,
+    options: AlignmentOptions,
+    key: PRNGKeyArray,
+) -> FinalErrors:
+    """E of one pair, everything by the same objective (see the module)."""
+    pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale) for image in (reference, target)]
+    views = (View(pyramids[0], jnp.eye(4)),)
+    found, descended = (
+        align_pyramids(views, pyramids[1], camera, solver, options, key, jnp.eye(4)[None]).target_T_reference
+        for solver in (genetic, gauss_newton)
+    )
+    objective = level_objective(views, pyramids[1], camera, min(genetic.levels), found, options, options.brightness)
+    return FinalErrors(
+        objective.error(found)[0],
+        objective.error(descended)[0],
+        converged_error(objective, found),
+        converged_error(objective, descended),
+    )
+
+
+def pair_errors(sequence: Sequence, preset_name: str, seed: int) -> list[FinalErrors]:
+    """E of every consecutive pair."""
+    genetic, descent = get_preset("ga", preset_name), get_preset("gauss-newton", preset_name)
+    errors, last = [], None
+    for index, frame in enumerate(sequence):
+        images = Images(frame.grey, frame.depth)
+        if last is not None:
+            key = jax.random.fold_in(jax.random.key(seed), index)
+            result = final_errors(last, images, sequence.camera, genetic.solver, descent.solver, genetic.alignment, key)
+            errors.append(jax.device_get(result))
+        last = images
+    return errors
+
+
+def stack(errors: list[FinalErrors]) -> FinalErrors:
+    """Arrays over the pairs."""
+    return jax.tree.map(lambda *values: np.stack(values), *errors)
+
+
+def excess(error: np.ndarray, errors: FinalErrors) -> np.ndarray:
+    """Excess over the lower minimum, per cent; infinite where the error is."""
+    minimum = np.minimum(errors.minimum_from_genetic, errors.minimum_from_gauss_newton)
+    return np.where(np.isfinite(error), 100.0 * (error / minimum - 1.0), np.inf)
+
+
+def summarise(name: str, errors: FinalErrors) -> dict[str, Any]:
+    """Figures of one clip, or of all; the fields of the errors are arrays over the pairs."""
+    genetic, descent = (excess(np.asarray(e), errors) for e in (errors.genetic, errors.gauss_newton))
+    return {
+        "clip": name,
+        "pairs": len(genetic),
+        "median": float(np.median(genetic)),
+        "p90": float(np.percentile(genetic, 90)),
+        "p95": float(np.percentile(genetic, 95)),
+        "max": float(np.max(genetic)),
+        "share": float(np.mean(genetic <= TOLERANCE)),
+        "gauss_newton_share": float(np.mean(descent <= TOLERANCE)),
+    }
+
+
+def main(clips: str = common.CLIPS, preset: str = "default", seed: int = 0, json: Path | None = None) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: as for drift.py, with commas between.
+        preset: settings of both methods; the GA's objective is the one that counts.
+        seed: of the GA.
+        json: file for the figures and every pair's errors.
+    """
+    rows, pairs, everything = [], {}, []
+    for clip in common.names(clips):
+        errors = pair_errors(common.open_clip(clip), preset, seed)
+        everything += errors
+        stacked = stack(errors)
+        pairs[clip] = stacked._asdict()
+        rows.append(summarise(clip, stacked))
+    if len(rows) > 1:
+        rows.append(summarise("all", stack(everything)))
+    cells = [
+        [row["clip"], row["pairs"]]
+        + [number(row[key], 3) for key in ("median", "p90", "p95", "max", "share", "gauss_newton_share")]
+        for row in rows
+    ]
+    shares = (f"share <= {TOLERANCE} %", "Gauss-Newton's share")
+    columns = ("clip", "pairs", "median %", "p90", "p95", "max", *shares)
+    print_table(f"excess of E over the minimum, GA preset {preset}", columns, cells)
+    results = {"preset": preset, "seed": seed, "summary": rows, "pairs": pairs}
+    common.record(json, "optimality", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)
