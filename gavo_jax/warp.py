@@ -145,12 +145,17 @@ def inverse_depth_slopes(inverse_depth: Float[Array, "h w"], limit: float = 0.1)
     """
 
     def along(q: jax.Array, axis: int) -> jax.Array:
-        ahead = jnp.roll(q, -1, axis) - q
-        behind = q - jnp.roll(q, 1, axis)
-        count_ahead = (jnp.roll(q, -1, axis) > 0) & (jnp.abs(ahead) < limit * q)
-        count_behind = (jnp.roll(q, 1, axis) > 0) & (jnp.abs(behind) < limit * q)
-        total = jnp.where(count_ahead, ahead, 0.0) + jnp.where(count_behind, behind, 0.0)
-        return total / jnp.maximum(count_ahead.astype(jnp.float32) + count_behind, 1.0)
+        width = [(int(a == axis), int(a == axis)) for a in range(2)]
+        # beyond the border there is no reading
+        padded = jnp.pad(q, width)
+        size = q.shape[axis]
+        last, following = (jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in (0, 2))
+        ahead, behind = following - q, q - last
+        near_ahead = (following > 0) & (jnp.abs(ahead) < limit * q)
+        near_behind = (last > 0) & (jnp.abs(behind) < limit * q)
+        total = jnp.where(near_ahead, ahead, 0.0) + jnp.where(near_behind, behind, 0.0)
+        count = near_ahead.astype(jnp.float32) + near_behind.astype(jnp.float32)
+        return total / jnp.maximum(count, 1.0)
 
     return along(inverse_depth, 1), along(inverse_depth, 0)
 

@@ -151,13 +151,14 @@ def surrogate_minimum(x: Float[Array, "p 6"], error: Float[Array, " p"]) -> Floa
     step is held within four times the population's spread.
     """
     finite = jnp.isfinite(error)
+    counted = finite.astype(jnp.float32)
     offset = jnp.where(finite[:, None], x - x[0], 0.0)
-    count = jnp.maximum(jnp.sum(finite), 1)
+    count = jnp.maximum(jnp.sum(counted), 1.0)
     radius = jnp.sqrt(jnp.sum(offset**2) / (6.0 * count)) + 1e-6
     z = offset / radius
     height = jnp.where(finite, error - error[0], 0.0)
     height = height / (jnp.sum(height) / count + 1e-12)
-    weight = finite / (1.0 + height) ** 2
+    weight = counted / (1.0 + height) ** 2
     square = jnp.sum(z**2, axis=1, keepdims=True)
     features = jnp.concatenate(
         [jnp.ones_like(square), z, square, z**2 - square / 6.0, z[:, _PAIRS[0]] * z[:, _PAIRS[1]]], axis=1

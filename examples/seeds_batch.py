@@ -1,0 +1,44 @@
+"""A batch of experiments in one compiled call: a pair of frames, many seeds, several settings of the genetic algorithm.
+
+A solver is a value whose rates are ordinary inputs of the program, so a sweep over them is a `vmap` and compiles once.
+
+Run it as `python examples/seeds_batch.py`.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gavo_jax as gavo
+from gavo_jax.alignment import View, align_pyramids
+from gavo_jax.pyramid import Pyramid, build_pyramid
+
+SOLVER = gavo.GeneticAlgorithm(population=(0, 0, 0, 32, 64), iterations=(0, 0, 0, 10, 12))
+"""An entry a pyramid level, the full image first: the two coarsest levels, 40 x 30 and 80 x 60 pixels."""
+
+
+def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndarray:
+    """Print the final error's median and spread over seeds, for each decay of the mutation's step."""
+    sequence = gavo.SyntheticSequence(frames=2)
+    camera, still = sequence.camera, jnp.eye(4)
+    build = jax.jit(build_pyramid)
+    reference, target = (build(frame.grey, frame.depth, camera.depth_scale) for frame in sequence)
+
+    def final_error(key: jax.Array, decay: jax.Array, reference: Pyramid, target: Pyramid) -> jax.Array:
+        solver = replace(SOLVER, mutation_decay=decay)
+        views = (View(reference, still),)
+        return align_pyramids(views, target, camera, solver, gavo.AlignmentOptions(), key, still[None]).error
+
+    over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
+    over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))
+    errors = np.asarray(over_both(jax.random.split(jax.random.key(0), seeds), jnp.array(decays), reference, target))
+
+    for decay, row in zip(decays, errors, strict=True):
+        print(f"mutation_decay {decay:.2f}: median {np.median(row):.4f}, from {row.min():.4f} to {row.max():.4f}")
+    return errors
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""Motions between two frames: accuracy, direction, batches, what is said of pairs that cannot be aligned."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus, align, align_batch
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.presets import METHODS, PRESETS, get_preset
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.warp import exp
+
+FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
+QUICK = GaussNewton(iterations=(0, 0, 0, 10, 20))
+"""Two coarse levels: soon compiled."""
+PAIRS = ((0, 1), (1, 0), (8, 9), (14, 15), (22, 23))
+
+
+@pytest.fixture(scope="module")
+def sequence() -> SyntheticSequence:
+    """Noise-free, 640 x 480."""
+    return SyntheticSequence(frames=30, noise=NONE)
+
+
+@pytest.fixture(scope="module")
+def frames(sequence: SyntheticSequence) -> dict[int, Frame]:
+    return {i: sequence[i] for i in FRAMES}
+
+
+def target_T_reference(sequence: SyntheticSequence, reference: int, target: int) -> np.ndarray:
+    world_T_camera = sequence.ground_truth.world_T_camera
+    return np.linalg.inv(world_T_camera[target]) @ world_T_camera[reference]
+
+
+def difference(estimate: Any, truth: np.ndarray) -> tuple[float, float]:
+    """Metres and degrees between two motions."""
+    delta = np.linalg.inv(truth) @ np.asarray(estimate, np.float64)
+    sine = np.linalg.norm(delta[:3, :3] - delta[:3, :3].T) / np.sqrt(8)
+    return float(np.linalg.norm(delta[:3, 3])), float(np.degrees(np.arctan2(sine, (np.trace(delta[:3, :3]) - 1) / 2)))
+
+
+def run(method: str, reference: Frame, target: Frame, camera: Camera, seed: int = 0) -> Alignment:
+    """Align by a method's default preset."""
+    preset = get_preset(method)
+    return align(reference, target, camera, solver=preset.solver, key=jax.random.key(seed), options=preset.alignment)
+
+
+@pytest.mark.parametrize("reference, target", PAIRS)
+@pytest.mark.parametrize("method", ["ga", "gauss-newton"])
+def test_recovers_an_exact_motion(
+    method: str, reference: int, target: int, sequence: SyntheticSequence, frames: dict[int, Frame]
+) -> None:
+    result = run(method, frames[reference], frames[target], sequence.camera)
+    metres, degrees = difference(result.target_T_reference, target_T_reference(sequence, reference, target))
+    assert metres < 0.0005 and degrees < 0.02
+    assert result.status is AlignmentStatus.OK
+    assert 0.9 < result.overlap <= 1
+
+
+def test_the_result_tells_all(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    result = run("ga", frames[0], frames[1], sequence.camera)
+    solver = get_preset("ga").solver
+    assert result.target_T_reference.shape == (4, 4) and result.covariance.shape == (6, 6)
+    assert all(np.asarray(field).dtype == np.float32 for field in result if field is not result.status)
+    np.testing.assert_allclose(exp(result.xi), result.target_T_reference, atol=1e-6)
+    np.testing.assert_array_equal(result.target_T_reference[3], [0, 0, 0, 1])
+    assert result.error > 0
+    assert result.history.shape == (sum(solver.iterations),)
+    ends = np.cumsum([solver.iterations[level] for level in solver.levels])
+    for part in np.split(result.history, ends[:-1]):
+        part = part[np.isfinite(part)]
+        assert len(part) and np.all(np.diff(part) <= 0)
+    assert result.status.sentence.endswith(".")
+
+
+def test_the_inverse_is_the_cameras_motion(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    world_T_camera = sequence.ground_truth.world_T_camera
+    result = run("gauss-newton", frames[8], frames[9], sequence.camera)
+    moved = world_T_camera[8] @ np.linalg.inv(result.target_T_reference)
+    assert np.abs(moved - world_T_camera[9]).max() < 1e-3
+    step = world_T_camera[9, :3, 3] - world_T_camera[8, :3, 3]
+    assert (moved[:3, 3] - world_T_camera[8, :3, 3]) @ step > 0.9 * step @ step
+
+
+def test_covariance_is_one(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    for method in ("ga", "gauss-newton"):
+        covariance = np.asarray(run(method, frames[0], frames[1], sequence.camera).covariance, float)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        deviation = np.sqrt(np.diag(covariance))
+        assert np.all(deviation < 0.02) and np.all(deviation > 1e-7)
+
+
+def test_covariance_covers_the_error_under_noise(sequence: SyntheticSequence) -> None:
+    noisy = SyntheticSequence(frames=30)
+    distances = []
+    for i in range(0, 12, 2):
+        result = run("gauss-newton", noisy[i], noisy[i + 1], noisy.camera)
+        delta = np.linalg.inv(np.asarray(result.target_T_reference, float)) @ target_T_reference(noisy, i, i + 1)
+        small = np.array([*delta[:3, 3], delta[2, 1], delta[0, 2], delta[1, 0]])
+        distances.append(small @ np.linalg.solve(np.asarray(result.covariance, float), small))
+    # chi-square with six degrees of freedom has a median of 5.3
+    assert 0.5 < np.median(distances) < 50
+
+
+def test_same_key_same_bits(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    first, second, other = (run("ga", frames[0], frames[1], sequence.camera, seed) for seed in (3, 3, 4))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert np.any(first.xi != other.xi)
+
+
+@pytest.fixture(scope="module")
+def batch(sequence: SyntheticSequence, frames: dict[int, Frame]) -> Alignment:
+    """Two pairs by the default genetic algorithm."""
+    references, targets = ([frames[i] for i in side] for side in ((0, 8), (1, 9)))
+    return align_batch(references, targets, sequence.camera, keys=jax.random.split(jax.random.key(5), 2))
+
+
+def test_a_batch_is_its_pairs(batch: Alignment, sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    keys = jax.random.split(jax.random.key(5), 2)
+    for i, (reference, target) in enumerate(((0, 1), (8, 9))):
+        single = align(frames[reference], frames[target], sequence.camera, key=keys[i])
+        assert AlignmentStatus(int(batch.status[i])) is single.status
+        for name in ("target_T_reference", "xi", "error", "overlap", "covariance", "history"):
+            np.testing.assert_array_equal(getattr(batch, name)[i], getattr(single, name))
+
+
+def test_a_batch_of_arrays_is_a_batch_of_frames(
+    batch: Alignment, sequence: SyntheticSequence, frames: dict[int, Frame]
+) -> None:
+    def stacked(indices: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        chosen = [frames[i] for i in indices]
+        return np.stack([f.grey for f in chosen]), np.stack([f.depth for f in chosen])
+
+    keys = jax.random.split(jax.random.key(5), 2)
+    again = align_batch(stacked((0, 8)), stacked((1, 9)), sequence.camera, keys=keys)
+    for a, b in zip(batch, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_arrays_of_metres_are_frames_of_raw_depth(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    camera = sequence.camera
+    images = [(frames[i].grey, frames[i].depth.astype(np.float32) / np.float32(5000)) for i in (0, 1)]
+    metric = align(images[0], images[1], replace(camera, depth_scale=1.0), solver=QUICK)
+    raw = align(frames[0], frames[1], camera, solver=QUICK)
+    np.testing.assert_allclose(metric.target_T_reference, raw.target_T_reference, atol=1e-5)
+    on_device = [(jnp.asarray(grey), jnp.asarray(depth)) for grey, depth in images]
+    again = align(on_device[0], on_device[1], replace(camera, depth_scale=1.0), solver=QUICK)
+    np.testing.assert_array_equal(again.target_T_reference, metric.target_T_reference)
+
+
+def test_a_guess_is_where_the_search_starts(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    truth = target_T_reference(sequence, 0, 23)
+    blind = align(frames[0], frames[23], sequence.camera, solver=GaussNewton())
+    guided = align(frames[0], frames[23], sequence.camera, solver=GaussNewton(), guess=jnp.asarray(truth, jnp.float32))
+    metres, degrees = difference(guided.target_T_reference, truth)
+    assert metres < 0.005 and degrees < 0.1
+    assert difference(blind.target_T_reference, truth) > (metres, degrees)
+
+
+def test_lens_distortion_is_taken_out(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    camera = replace(sequence.camera, distortion=(0.2, -0.7, -0.004, 0.002, 0.9))
+    plain = [camera.undistort(frames[i].grey, frames[i].depth) for i in (0, 1)]
+    expected = align(plain[0], plain[1], sequence.camera, solver=GaussNewton())
+    found = align(frames[0], frames[1], camera, solver=GaussNewton())
+    np.testing.assert_array_equal(found.target_T_reference, expected.target_T_reference)
+
+
+def black(frame: Frame) -> Frame:
+    return replace(frame, grey=np.zeros_like(frame.grey))
+
+
+def blind(frame: Frame) -> Frame:
+    return replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def upside_down(frame: Frame) -> Frame:
+    return replace(frame, grey=frame.grey[::-1, ::-1].copy(), depth=frame.depth[::-1, ::-1].copy())
+
+
+def blank(frame: Frame) -> Frame:
+    return replace(frame, grey=np.full_like(frame.grey, 128))
+
+
+@pytest.mark.parametrize("spoil", [black, blind, upside_down, blank])
+@pytest.mark.parametrize("side", ["reference", "target", "both"])
+@pytest.mark.parametrize("method", ["ga", "gauss-newton"])
+def test_what_cannot_be_aligned_is_not_ok(
+    spoil: Callable[[Frame], Frame],
+    side: str,
+    method: str,
+    sequence: SyntheticSequence,
+    frames: dict[int, Frame],
+) -> None:
+    reference = spoil(frames[0]) if side in ("reference", "both") else frames[0]
+    target = spoil(frames[1]) if side in ("target", "both") else frames[1]
+    if (spoil is blind and side == "target") or (spoil is upside_down and side == "both"):
+        pytest.skip("enough is known of such a pair")
+    result = run(method, reference, target, sequence.camera)
+    assert result.status is not AlignmentStatus.OK or is_right(result, sequence)
+    if spoil is blind:
+        assert result.status is AlignmentStatus.NO_DEPTH
+
+
+def is_right(result: Alignment, sequence: SyntheticSequence) -> bool:
+    """Whether the motion was found in spite of all, say from depth alone."""
+    metres, degrees = difference(result.target_T_reference, target_T_reference(sequence, 0, 1))
+    return metres < 0.005 and degrees < 0.3
+
+
+def test_frames_of_two_rooms_are_not_ok(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    elsewhere = SyntheticSequence(frames=30, noise=NONE, seed=11)[15]
+    for method in ("ga", "gauss-newton"):
+        assert run(method, frames[0], elsewhere, sequence.camera).status is not AlignmentStatus.OK
+
+
+def test_a_target_without_depth_is_aligned_by_its_grey(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    result = run("gauss-newton", frames[0], blind(frames[1]), sequence.camera)
+    metres, degrees = difference(result.target_T_reference, target_T_reference(sequence, 0, 1))
+    assert metres < 0.002 and degrees < 0.05
+
+
+def test_nothing_but_numbers_comes_out_of_nothing(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    result = run("gauss-newton", blind(black(frames[0])), blind(black(frames[1])), sequence.camera)
+    assert np.isfinite(result.target_T_reference).all()
+    assert result.status is not AlignmentStatus.OK
+
+
+def test_wrong_sizes_are_refused(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    camera, frame = sequence.camera, frames[0]
+    cut = replace(frame, depth=frame.depth[:-1])
+    coloured = (np.zeros((480, 640, 3), np.uint8), frame.depth)
+    for reference, target in ((cut, frame), (frame, cut), (coloured, frame), (frame, (frame.grey, frame.grey[:5]))):
+        with pytest.raises(GavoError, match="shape"):
+            align(reference, target, camera)
+    with pytest.raises(GavoError):
+        align(frame, frame, camera.level(1))
+    with pytest.raises(GavoError):
+        align_batch([frame, frame], [frame], camera)
+    stack = np.zeros((2, 480, 640), np.uint8)
+    with pytest.raises(GavoError):
+        align_batch((stack, stack[:, :-1]), (stack, stack), camera)
+
+
+def test_statuses_say_a_sentence() -> None:
+    sentences = {status.sentence for status in AlignmentStatus}
+    assert len(sentences) == len(AlignmentStatus)
+    assert all(sentence[0].isupper() and sentence.endswith(".") for sentence in sentences)
+
+
+def test_every_preset_has_a_solver_for_all_levels() -> None:
+    for method in METHODS:
+        for name in PRESETS:
+            preset = get_preset(method, name)
+            assert len(preset.solver.iterations) == len(preset.alignment.cells) == len(preset.alignment.islands)
+            assert preset.solver.levels[0] == 4
+    assert get_preset("ga", "paper").solver.levels[-1] == 0
+    for bad in (("simplex", "default"), ("ga", "best")):
+        with pytest.raises(GavoError, match="unknown"):
+            get_preset(*bad)
+
+
+def test_bounds_are_inputs_of_the_program(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    """Half-widths that shut the true motion out show in the result, without a second compilation."""
+    options = AlignmentOptions(bounds=(0.001, 0.001))
+    result = align(frames[0], frames[1], sequence.camera, solver=GaussNewton(), options=options)
+    metres, degrees = difference(result.target_T_reference, np.eye(4))
+    true_metres, true_degrees = difference(target_T_reference(sequence, 0, 1), np.eye(4))
+    assert true_degrees > 0.3 and true_metres > 0.005
+    assert degrees < 0.9 * true_degrees or metres < 0.9 * true_metres

@@ -1,0 +1,117 @@
+"""Every benchmark runs, on a few small frames, and its figures follow from what it measured."""
+
+import importlib
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.errors import GavoError
+
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+CLIP = "small"
+
+
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch):
+    """Return what imports a benchmark, with a slow walk of 8 frames in 1.4 s behind every clip's name."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    common = importlib.import_module("common")
+    monkeypatch.setattr(common, "open_clip", lambda _: SyntheticSequence(8, rate=5.0, speed=0.2))
+    return importlib.import_module
+
+
+def read(path: Path) -> dict[str, Any]:
+    record = json.loads(path.read_text())
+    assert {"benchmark", "date", "processor", "cores", "device", "versions"} <= set(record)
+    return record
+
+
+def test_drift_compares_methods_with_peers(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drift: ModuleType = load("drift")
+    drift.main(clips=CLIP, methods="ga,gauss-newton,opencv-rgb", seeds=2, json=tmp_path / "drift.json")
+    record = read(tmp_path / "drift.json")
+    assert [(run["name"], run["seed"]) for run in record["runs"]] == [
+        ("ga", 0),
+        ("gauss-newton", 0),
+        ("opencv-rgb", 0),
+        ("ga", 1),
+        ("gauss-newton", 1),
+    ]
+    genetic, newton, peer = record["summary"]
+    drifts = [run["rpe_translation_rmse_m_per_s"] for run in record["runs"] if run["name"] == "ga"]
+    assert genetic["translation"] == pytest.approx(np.median(drifts))
+    assert genetic["translation_spread"] == pytest.approx(max(drifts) / min(drifts))
+    ratios = {ratio["name"]: ratio["by_clip"][CLIP] for ratio in record["ratios"]}
+    assert ratios["ga / best peer, rotation"] == pytest.approx(genetic["rotation"] / peer["rotation"])
+    assert ratios["ga / gauss-newton, translation"] == pytest.approx(genetic["translation"] / newton["translation"])
+    assert "ratios of the medians" in capsys.readouterr().out
+
+
+def test_drift_refuses_unknown_methods(load) -> None:
+    with pytest.raises(GavoError, match="nonsense"):
+        load("drift").main(clips=CLIP, methods="ga:nonsense")
+
+
+def test_ablation_compares_with_the_full_preset(load, tmp_path: Path) -> None:
+    load("ablation").main(clips=CLIP, variants="recover", seeds=1, json=tmp_path / "ablation.json")
+    record = read(tmp_path / "ablation.json")
+    assert [summary["name"] for summary in record["summary"]] == ["full", "recover: no second try"]
+    full, without = record["summary"]
+    assert record["ratios"][0]["translation"]["mean"] == pytest.approx(without["translation"] / full["translation"])
+
+
+def test_ablation_switches_off_what_it_says(load) -> None:
+    ablation: ModuleType = load("ablation")
+    for name, (_, switch_off) in ablation.VARIANTS.items():
+        full = ablation.get_preset("ga", "default")
+        assert switch_off(full) != full, name
+
+
+def test_basin_counts_successes_and_flags(load, tmp_path: Path) -> None:
+    basin: ModuleType = load("basin")
+    basin.main(clip=CLIP, gaps="1,3", methods="gauss-newton,opencv-rgb", step=2, json=tmp_path / "basin.json")
+    record = read(tmp_path / "basin.json")
+    assert [(row["gap"], row["pairs"]) for row in record["success"]] == [(1, 4), (3, 3)]
+    assert record["success"][0]["success"] == {"gauss-newton": 1.0, "opencv-rgb": 1.0}
+    assert record["success"][1]["motion_deg"] > record["success"][0]["motion_deg"]
+    attempts = [dict(found=True, flagged=True), dict(found=False, flagged=True), dict(found=False, flagged=False)]
+    [agreement] = basin.status_agreement([dict(method="x", milliseconds=1.0, **attempt) for attempt in attempts])
+    assert (agreement["precision"], agreement["recall"]) == (0.5, 0.5)
+
+
+def test_optimality_is_judged_from_below(load, tmp_path: Path) -> None:
+    load("optimality").main(clips=CLIP, json=tmp_path / "optimality.json")
+    record = read(tmp_path / "optimality.json")
+    [row] = record["summary"]
+    assert row["pairs"] == 7
+    assert -0.01 <= row["median"] <= row["p90"] <= row["p95"] <= row["max"] < np.inf
+    pairs = record["pairs"][CLIP]
+    assert np.all(np.array(pairs["minimum_from_genetic"]) <= np.array(pairs["genetic"]) * (1 + 1e-4))
+
+
+def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path) -> None:
+    load("kernel").main(levels="3,4", population=8, rounds=1, json=tmp_path / "kernel.json")
+    record = read(tmp_path / "kernel.json")
+    assert list(record["nanoseconds"]) == ["80x60", "40x30"]
+    for times in record["nanoseconds"].values():
+        assert {"score", "plain vmap", "numba"} <= set(times)
+        assert all(time > 0 for time in times.values())
+    times = record["nanoseconds"]["80x60"]
+    assert record["ratios"]["score / numba"]["80x60"] == pytest.approx(times["score"] / times["numba"])
+
+
+def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    open_clip = importlib.import_module("common").open_clip
+    monkeypatch.setenv("GAVO_DATA", str(data_dir))
+    assert len(open_clip("fr1_xyz")) == 90
+    assert len(open_clip("fr1_xyz:12")) == 12
+    assert len(open_clip("synthetic:3")) == 3
+    for text in ("fr1_xyz:1", "fr1_xyz:x", "no_such_clip"):
+        with pytest.raises(GavoError, match=text.partition(":")[0]):
+            open_clip(text)

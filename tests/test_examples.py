@@ -1,0 +1,54 @@
+"""The examples run, with nothing downloaded, and find what they look for."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.datasets.synthetic import SyntheticSequence
+
+FOLDER = Path(__file__).parent.parent / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_example_is_run_here() -> None:
+    tested = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    assert {path.stem for path in FOLDER.glob("*.py")} <= tested
+
+
+def test_one_pair(capsys: pytest.CaptureFixture[str]) -> None:
+    pair = load("one_pair").main()
+    assert pair.status is AlignmentStatus.OK
+    assert "target_T_reference" in capsys.readouterr().out
+
+
+def test_sequence(capsys: pytest.CaptureFixture[str]) -> None:
+    run = load("sequence").main(frames=5)
+    assert run.metrics["lost_pairs"] == 0
+    assert run.metrics["distance_error_final_m"] < 0.01
+    assert len(capsys.readouterr().out.splitlines()) == 4 + len(run.metrics)
+
+
+def test_seeds_batch(capsys: pytest.CaptureFixture[str]) -> None:
+    errors = load("seeds_batch").main(seeds=4, decays=(0.7, 0.9))
+    assert errors.shape == (2, 4)
+    assert np.isfinite(errors).all() and len(np.unique(errors)) > 4
+    assert errors.max() < 1.2 * errors.min()
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_custom_loss() -> None:
+    pair = load("custom_loss").main()
+    world_T_camera = SyntheticSequence(frames=2).ground_truth.world_T_camera
+    exact = np.linalg.inv(world_T_camera[1]) @ world_T_camera[0]
+    assert np.linalg.norm(pair.target_T_reference[:3, 3] - exact[:3, 3]) < 0.005

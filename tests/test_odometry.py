@@ -1,0 +1,348 @@
+"""The driver: poses chained, lost frames survived, the same bits for the same seed, nothing kept that is not needed."""
+
+import threading
+import weakref
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry import Odometry, OdometryRun, Step, run_odometry, track
+from gavo_jax.presets import OdometryOptions
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.trajectory import Trajectory
+
+CAMERA = DEFAULT_CAMERA.level(1)
+FRAMES = 12
+PLAIN = OdometryOptions(recover=False)
+"""No wide search where a pair looks wrong: what happens to lost pairs is the subject here."""
+
+
+SOLVER = GaussNewton(iterations=(0, 15, 0, 0, 20))
+"""Two levels: soon compiled."""
+
+
+class Altered:
+    """A sequence whose frames pass through a function (index, frame) -> frame, which may also raise FrameError."""
+
+    def __init__(self, inner: Any, alter: Callable[[int, Frame], Frame], ground_truth: bool = True):
+        self.inner, self.alter, self.has_truth = inner, alter, ground_truth
+        self.read: list[int] = []
+        self.checked = 0
+        self.name, self.camera, self.timestamps = inner.name, inner.camera, inner.timestamps
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        return self.inner.ground_truth if self.has_truth else None
+
+    def __len__(self) -> int:
+        return len(self.inner)
+
+    def __getitem__(self, index: Any) -> Any:
+        self.read.append(index)
+        return self.alter(index, self.inner[index])
+
+    def __iter__(self) -> Any:
+        return (self[i] for i in range(len(self)))
+
+    def check(self) -> None:
+        self.checked += 1
+
+
+class Rendered(SyntheticSequence):
+    """A synthetic sequence that keeps its frames: several tests run over the same ones."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        self.kept: dict[float, Frame] = {}
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return super().__getitem__(index)
+        stamp = float(self.timestamps[index])
+        if stamp not in self.kept:
+            self.kept[stamp] = super().__getitem__(index)
+        return self.kept[stamp]
+
+
+@pytest.fixture(scope="module")
+def sequence() -> SyntheticSequence:
+    """Twelve frames with a Kinect's noise."""
+    return Rendered(frames=FRAMES, camera=CAMERA)
+
+
+def run(sequence: Any, options: OdometryOptions = PLAIN, **arguments: Any) -> OdometryRun:
+    return run_odometry(sequence, solver=SOLVER, options=options, **arguments)
+
+
+@pytest.fixture(scope="module")
+def plain_run(sequence: SyntheticSequence) -> OdometryRun:
+    return run(sequence)
+
+
+def errors(result: OdometryRun, sequence: Any) -> np.ndarray:
+    """Distance of each recorded position from the truth, metres, both relative to the first camera."""
+    world_T_camera, _ = sequence.ground_truth.interpolate(result.trajectory.timestamps)
+    truth = np.linalg.inv(world_T_camera[0]) @ world_T_camera
+    return np.linalg.norm(result.trajectory.world_T_camera[:, :3, 3] - truth[:, :3, 3], axis=1)
+
+
+def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
+    trajectory = plain_run.trajectory
+    np.testing.assert_array_equal(trajectory.timestamps, sequence.timestamps)
+    np.testing.assert_array_equal(trajectory.world_T_camera[0], np.eye(4))
+    truth = sequence.ground_truth.world_T_camera[:, :3, 3]
+    travelled = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
+    assert errors(plain_run, sequence)[-1] < 0.1 * travelled
+    assert not any(step.lost for step in plain_run.steps)
+
+
+def test_a_step_for_every_frame_after_the_first(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
+    steps = plain_run.steps
+    assert [step.index for step in steps] == list(range(1, FRAMES))
+    assert [step.timestamp for step in steps] == list(sequence.timestamps[1:])
+    assert [step.reference_timestamp for step in steps] == list(sequence.timestamps[:-1])
+    assert plain_run.alignments == [step.alignment for step in steps]
+    for step in steps:
+        assert isinstance(step.alignment.status, AlignmentStatus)
+        assert isinstance(step.alignment.xi, np.ndarray)
+        assert step.milliseconds > 0
+
+
+def test_poses_are_chained_inverses(plain_run: OdometryRun) -> None:
+    world_T_camera = np.eye(4)
+    for step in plain_run.steps:
+        world_T_camera = world_T_camera @ np.linalg.inv(step.alignment.target_T_reference.astype(np.float64))
+        np.testing.assert_allclose(step.world_T_camera, world_T_camera, atol=1e-5)
+
+
+def test_poses_stay_rigid(plain_run: OdometryRun) -> None:
+    rotation = plain_run.trajectory.world_T_camera[:, :3, :3]
+    identity = np.broadcast_to(np.eye(3), rotation.shape)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), identity, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
+
+
+METRICS = {
+    "device",
+    "frames",
+    "pairs",
+    "lost_pairs",
+    "rpe_translation_rmse_m_per_s",
+    "rpe_rotation_rmse_deg_per_s",
+    "rpe_translation_rmse_m_per_frame",
+    "ate_translation_rmse_m",
+    "distance_error_final_m",
+    "compile_seconds",
+    "milliseconds_per_pair_median",
+    "frames_per_second",
+}
+
+
+def test_metrics(plain_run: OdometryRun, sequence: SyntheticSequence) -> None:
+    metrics = plain_run.metrics
+    assert METRICS <= set(metrics)
+    assert (metrics["frames"], metrics["pairs"], metrics["lost_pairs"]) == (FRAMES, FRAMES - 1, 0)
+    assert metrics["sequence"] == "synthetic" and metrics["seed"] == 0
+    assert metrics["distance_error_final_m"] == pytest.approx(errors(plain_run, sequence)[-1], abs=1e-6)
+    assert 0 < metrics["rpe_translation_rmse_m_per_frame"] < 0.01
+    assert metrics["rpe_translation_rmse_m_per_s"] is None, "the sequence is shorter than a second"
+    for key in ("compile_seconds", "milliseconds_per_pair_median", "frames_per_second"):
+        assert metrics[key] > 0
+
+
+def test_without_ground_truth_there_are_no_errors(sequence: SyntheticSequence) -> None:
+    blind = Altered(sequence[:4], lambda _, frame: frame, ground_truth=False)
+    metrics = run(blind).metrics
+    about_truth = {key for key in METRICS if key.startswith(("rpe", "ate", "distance"))}
+    assert {key for key in METRICS if metrics[key] is None} == about_truth
+
+
+def test_same_seed_same_bits() -> None:
+    part = Rendered(frames=4)
+    poses = [run_odometry(part, seed=seed).trajectory.world_T_camera for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert np.any(poses[0] != poses[2])
+    np.testing.assert_allclose(poses[0], poses[2], atol=0.01)
+
+
+def unreadable(*indices: int) -> Callable[[int, Frame], Frame]:
+    def alter(index: int, frame: Frame) -> Frame:
+        if index in indices:
+            raise FrameError(f"{index}.png: cannot be read")
+        return frame
+
+    return alter
+
+
+@pytest.mark.parametrize("missing", [(5,), (5, 6), (1,), (FRAMES - 1,), (3, 7)])
+def test_unreadable_frames_are_lost_and_the_run_goes_on(
+    missing: tuple[int, ...], sequence: SyntheticSequence, plain_run: OdometryRun
+) -> None:
+    result = run(Altered(sequence, unreadable(*missing)))
+    assert [step.index for step in result.steps if step.lost] == list(missing)
+    assert result.metrics["lost_pairs"] == len(missing)
+    assert len(result.trajectory) == FRAMES
+    for step in result.steps:
+        if step.lost:
+            assert step.alignment.status is AlignmentStatus.UNREADABLE
+            before = result.trajectory.world_T_camera[step.index - 1]
+            np.testing.assert_array_equal(step.world_T_camera, before)
+        elif step.index - 1 in missing:
+            assert step.reference_timestamp < sequence.timestamps[step.index - 1]
+    seen = [i for i in range(FRAMES) if i not in missing]
+    assert errors(result, sequence)[seen].max() < errors(plain_run, sequence).max() + 0.004
+
+
+def test_on_lost_predict_goes_on_as_before(sequence: SyntheticSequence) -> None:
+    lossy = Altered(sequence, unreadable(5))
+    held = run(lossy)
+    predicted = run(lossy, replace(PLAIN, on_lost="predict"))
+    assert predicted.steps[4].lost
+    assert errors(predicted, sequence)[5] < 0.7 * errors(held, sequence)[5]
+    others = [i for i in range(FRAMES) if i != 5]
+    np.testing.assert_array_equal(predicted.trajectory.world_T_camera[others], held.trajectory.world_T_camera[others])
+
+
+def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
+    result = run(Altered(sequence, unreadable(5)), replace(PLAIN, on_lost="stop"))
+    assert [step.index for step in result.steps] == [1, 2, 3, 4, 5]
+    assert result.steps[-1].lost
+    assert result.metrics["frames"] == 6
+
+
+def test_a_covered_lens_is_survived(sequence: SyntheticSequence) -> None:
+    """Black images without depth for a while: they are lost, and tracking comes back."""
+
+    def alter(index: int, frame: Frame) -> Frame:
+        if 3 <= index < 6:
+            return replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        return frame
+
+    result = run(Altered(sequence, alter))
+    assert all(step.lost for step in result.steps if 3 <= step.index < 6)
+    assert not any(step.lost for step in result.steps[-2:])
+    assert np.isfinite(result.trajectory.world_T_camera).all()
+
+
+def test_the_first_frame_is_needed(sequence: SyntheticSequence) -> None:
+    with pytest.raises(FrameError, match="0.png"):
+        run(Altered(sequence, unreadable(0)))
+    with pytest.raises(FrameError):
+        Odometry(CAMERA, SOLVER).register(None, 0.0)
+
+
+def test_an_odometry_needs_two_frames(sequence: SyntheticSequence) -> None:
+    for count in (0, 1):
+        with pytest.raises(GavoError, match="two frames"):
+            run(sequence[:count])
+
+
+def test_a_sequence_is_checked_before_the_run(sequence: SyntheticSequence) -> None:
+    class Refused(Altered):
+        def check(self) -> None:
+            raise GavoError("rgb.txt: nonsense")
+
+    refused = Refused(sequence, lambda _, frame: frame)
+    with pytest.raises(GavoError, match="nonsense"):
+        run(refused)
+    assert refused.read == []
+
+
+def test_streams(sequence: SyntheticSequence) -> None:
+    """Each frame is decoded once, in order, in another thread, and let go soon after."""
+    alive: list[weakref.ref[Frame]] = []
+    most, threads = [0], set()
+
+    def alter(_: int, frame: Frame) -> Frame:
+        copy = replace(frame, grey=frame.grey.copy(), depth=frame.depth.copy())
+        alive.append(weakref.ref(copy))
+        most[0] = max(most[0], sum(reference() is not None for reference in alive))
+        threads.add(threading.get_ident())
+        return copy
+
+    streamed = Altered(sequence, alter)
+    told: list[Step] = []
+    result = run(streamed, on_step=told.append)
+    assert streamed.read == list(range(FRAMES))
+    assert threading.get_ident() not in threads
+    assert most[0] <= 4
+    assert told == result.steps
+
+
+def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> None:
+    altered = Altered(sequence, lambda _, frame: frame)
+    steps = track(altered, SOLVER, options=PLAIN)
+    assert altered.read == []
+    first = next(steps)
+    assert first.index == 1 and max(altered.read) <= 3
+    steps.close()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_frame_to_frame(sequence: SyntheticSequence) -> None:
+    result = run(sequence[:6], replace(PLAIN, reference="previous", prior=False))
+    assert result.metrics["lost_pairs"] == 0
+    assert errors(result, sequence).max() < 0.01
+
+
+def late_depth(source: SyntheticSequence) -> Altered:
+    """Every other frame of a sequence, with the depth of the frame that follows it: half a frame's time late."""
+
+    def alter(index: int, frame: Frame) -> Frame:
+        later = source[2 * index + 1]
+        return replace(frame, depth=later.depth, depth_timestamp=later.timestamp)
+
+    return Altered(source[::2], alter)
+
+
+def test_synchronised_depth_drifts_less() -> None:
+    late = late_depth(Rendered(frames=40, camera=CAMERA, noise=NONE, rate=60.0, speed=4.0))
+    figures = {}
+    for synchronise in (True, False):
+        metrics = run(late, replace(PLAIN, synchronise=synchronise)).metrics
+        assert metrics["lost_pairs"] == 0
+        figures[synchronise] = metrics["rpe_translation_rmse_m_per_frame"]
+    assert figures[True] < 0.92 * figures[False]
+
+
+def test_synchronising_without_delay_changes_nothing(sequence: SyntheticSequence) -> None:
+    """Stamps that agree, and stamps that are not known, leave depth as it is."""
+    same = Altered(sequence[:5], lambda _, frame: replace(frame, depth_timestamp=frame.timestamp))
+    known, unknown = run(same), run(sequence[:5])
+    np.testing.assert_array_equal(known.trajectory.world_T_camera, unknown.trajectory.world_T_camera)
+
+
+def test_warm_up_leaves_no_trace(sequence: SyntheticSequence) -> None:
+    steps = []
+    for warm in (True, False):
+        odometry = Odometry(CAMERA, SOLVER, options=PLAIN)
+        if warm:
+            assert odometry.warm_up() > 0
+        assert odometry.register(sequence[0], 0.0) is None
+        step = odometry.register(sequence[1], float(sequence.timestamps[1]))
+        assert step is not None
+        steps.append(step)
+    np.testing.assert_array_equal(steps[0].world_T_camera, steps[1].world_T_camera)
+
+
+def test_real_frames(data_dir: Path) -> None:
+    result = run_odometry(TumSequence(data_dir / "fr1_xyz")[:40])
+    assert result.metrics["lost_pairs"] == 0
+    assert result.metrics["rpe_translation_rmse_m_per_s"] < 0.03
+    assert result.metrics["rpe_rotation_rmse_deg_per_s"] < 2.0
+    assert result.metrics["ate_translation_rmse_m"] < 0.02
+
+
+@pytest.mark.slow
+def test_the_wide_search_recovers_what_the_default_loses() -> None:
+    jump = SyntheticSequence(frames=60, camera=CAMERA)[::25]
+    lost = run_odometry(jump, GaussNewton(), options=PLAIN).metrics["lost_pairs"]
+    assert run_odometry(jump, GaussNewton()).metrics["lost_pairs"] < max(lost, 1)
