@@ -134,10 +134,15 @@ class Alignment(NamedTuple):
 
 
 MIN_DEPTH_SHARE = 0.05
+"""Share of the reference's points with a reading below which a pair is `NO_DEPTH`."""
 MIN_FINAL_OVERLAP = 0.3
+"""Overlap of the result below which a pair is `LOW_OVERLAP`."""
 MIN_EXPLAINED = 0.5
+"""Share of the reference's grey variance that a result must explain; below, a pair is `HIGH_ERROR`."""
 MAX_TRANSLATION_DEVIATION = 0.05
+"""Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
+"""Radians, likewise for the rotation."""
 
 
 class View(NamedTuple):
