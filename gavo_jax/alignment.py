@@ -135,6 +135,8 @@ class Alignment(NamedTuple):
 
 MIN_DEPTH_SHARE = 0.05
 """Share of the reference's points with a reading below which a pair is `NO_DEPTH`."""
+MIN_CONTRAST = 2.0
+"""Grey levels: a smaller standard deviation over the reference makes a pair `LOW_TEXTURE`."""
 MIN_FINAL_OVERLAP = 0.3
 """Overlap of the result below which a pair is `LOW_OVERLAP`."""
 MIN_EXPLAINED = 0.5
@@ -350,9 +352,10 @@ def _conclude(
     depth_share = jnp.mean((objective.reference.points.q > 0).astype(jnp.float32))
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(problem.origin)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
+    contrast = jnp.std(objective.reference.grey, where=objective.reference.points.q > 0)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
-        (wide, AlignmentStatus.LOW_TEXTURE),
+        (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
         (explained_variance(objective, problem.origin) < MIN_EXPLAINED, AlignmentStatus.HIGH_ERROR),
         (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),
         (~finite, AlignmentStatus.NOT_FINITE),
@@ -383,19 +386,41 @@ def _align_images(
     return align_pyramids((view,), pyramids[1], camera, solver, options, key, guess[None])
 
 
-_align_pair = jax.jit(_align_images)
-
-
 @jax.jit
-def _align_pairs(references, targets, camera, solver, options, keys, guesses):
-    """Pair after pair on a CPU, which one pair already fills; side by side elsewhere."""
+def _align_pairs(count, references, targets, camera, solver, options, keys, guesses):
+    """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere.
 
-    def one(arguments):
-        reference, target, key, guess = arguments
+    The count is an input, so that XLA compiles one and the same loop body for one pair and for many, whose results then
+    agree to the last bit; unrolled, a single pair would round differently.
+    """
+
+    def one(i):
+        reference, target, key, guess = jax.tree.map(lambda leaf: leaf[i], (references, targets, keys, guesses))
         return _align_images(reference, target, camera, solver, options, key, guess)
 
-    arguments = (references, targets, keys, guesses)
-    return jax.lax.map(one, arguments) if jax.default_backend() == "cpu" else jax.vmap(one)(arguments)
+    if jax.default_backend() != "cpu":
+        return jax.vmap(one)(jnp.arange(keys.shape[0]))
+    empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
+    return jax.lax.fori_loop(
+        0, count, lambda i, results: jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i)), empty
+    )
+
+
+def _align_rows(sides, camera, solver, options, keys, guesses):
+    """`_align_pairs` of B pairs; a single one is padded to two rows, of which one is computed."""
+    count = len(guesses)
+    if count == 1:
+        sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
+    result = _align_pairs(
+        jnp.int32(count),
+        *sides,
+        camera.rectified(),
+        GeneticAlgorithm() if solver is None else solver,
+        AlignmentOptions() if options is None else options,
+        keys,
+        guesses,
+    )
+    return jax.tree.map(lambda leaf: leaf[:count], result)
 
 
 def align(
@@ -425,16 +450,11 @@ def align(
     Raises:
         GavoError: The images are not of the camera's size, or of a wrong shape.
     """
-    images = [_rectified_images(frame, camera) for frame in (reference, target)]
-    result = _align_pair(
-        *images,
-        camera.rectified(),
-        GeneticAlgorithm() if solver is None else solver,
-        AlignmentOptions() if options is None else options,
-        jax.random.key(0) if key is None else key,
-        jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32),
-    )
-    return on_host(result)
+    sides = [_stacked_images([frame], camera) for frame in (reference, target)]
+    keys = (jax.random.key(0) if key is None else key)[None]
+    guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
+    result = _align_rows(sides, camera, solver, options, keys, guesses)
+    return on_host(jax.tree.map(lambda leaf: leaf[0], result))
 
 
 def align_batch(
@@ -468,14 +488,9 @@ def align_batch(
     count = len(sides[0].grey)
     if len(sides[1].grey) != count:
         raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
-    return _align_pairs(
-        *sides,
-        camera.rectified(),
-        GeneticAlgorithm() if solver is None else solver,
-        AlignmentOptions() if options is None else options,
-        jax.random.split(jax.random.key(0), count) if keys is None else keys,
-        jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32),
-    )
+    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
+    guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
+    return _align_rows(sides, camera, solver, options, keys, guesses)
 
 
 def on_host(alignment: Alignment) -> Alignment:

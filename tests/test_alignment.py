@@ -191,8 +191,12 @@ def blank(frame: Frame) -> Frame:
     return replace(frame, grey=np.full_like(frame.grey, 128))
 
 
-@pytest.mark.parametrize("spoil", [black, blind, upside_down, blank])
-@pytest.mark.parametrize("side", ["reference", "target", "both"])
+SPOILT = [(spoil, side) for spoil in (black, blank, upside_down, blind) for side in ("reference", "target", "both")]
+# enough is known of these two: grey alone finds the motion, and so it does when the world stands on its head
+SPOILT = [case for case in SPOILT if case not in ((blind, "target"), (upside_down, "both"))]
+
+
+@pytest.mark.parametrize("spoil, side", SPOILT)
 @pytest.mark.parametrize("method", ["ga", "gauss-newton"])
 def test_what_cannot_be_aligned_is_not_ok(
     spoil: Callable[[Frame], Frame],
@@ -203,8 +207,6 @@ def test_what_cannot_be_aligned_is_not_ok(
 ) -> None:
     reference = spoil(frames[0]) if side in ("reference", "both") else frames[0]
     target = spoil(frames[1]) if side in ("target", "both") else frames[1]
-    if (spoil is blind and side == "target") or (spoil is upside_down and side == "both"):
-        pytest.skip("enough is known of such a pair")
     result = run(method, reference, target, sequence.camera)
     assert result.status is not AlignmentStatus.OK or is_right(result, sequence)
     if spoil is blind:
