@@ -5,7 +5,6 @@ import dataclasses
 import enum
 import json
 import math
-import os
 import platform
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -20,13 +19,12 @@ import numpy as np
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Step
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
-from gavo_jax.trajectory import format_tum_row
+from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row, write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
 TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
 
-TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
     ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "lost") + DEVIATIONS + ("milliseconds",)
@@ -201,13 +199,7 @@ def write_json(path: Path, value: Any) -> None:
     Raises:
         GavoError: the file cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(json.dumps(describe(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+    write_lines(path, [json.dumps(describe(value), indent=2, allow_nan=False)])
 
 
 def _digits(value: Any) -> str:

@@ -19,6 +19,9 @@ MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
 
+TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Where a camera was, when.
@@ -74,7 +77,7 @@ class Trajectory:
             GavoError: the file cannot be written; nothing is left under its name then.
         """
         rows = map(format_tum_row, self.timestamps, self.world_T_camera)
-        _write_lines(path, ["# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)", *rows])
+        write_lines(path, [TRAJECTORY_HEADER, *rows])
 
     def write_kitti(self, path: str | Path) -> None:
         """Write the upper 3×4 of each matrix, row by row, twelve numbers a line (KITTI odometry format, no stamps).
@@ -83,7 +86,7 @@ class Trajectory:
             GavoError: the file cannot be written; nothing is left under its name then.
         """
         rows = self.world_T_camera[:, :3].reshape(len(self), 12)
-        _write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
+        write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
 
     def interpolate(
         self, timestamps: Float[np.ndarray, " m"], max_gap: float = MAX_GAP
@@ -260,8 +263,12 @@ def _digits(value: float, decimals: int) -> str:
     return np.format_float_positional(float(value) + 0.0, unique=True, min_digits=decimals)
 
 
-def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    """Write a text file whole or not at all: beside it first, then renamed into place."""
+def write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    """Write a text file whole or not at all: beside it first, then renamed into place.
+
+    Raises:
+        GavoError: the file cannot be written.
+    """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
