@@ -24,22 +24,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import AlignmentOptions, View, level_objective
+from gavo_jax.alignment import (
+    AlignmentOptions,
+    View,
+    fit_objective,
+    prepare_reference,
+    prepare_target,
+    stack_levels,
+)
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import Objective, l2
-from gavo_jax.pyramid import Pyramid, build_pyramid
+from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
+from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.warp import exp
 
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
 PLAIN, NUMBA, SCIPY = "plain vmap", "numba", "scipy"
-ALL_PIXELS = (1, 1, 1, 1, 1)
-GREY_ONLY = AlignmentOptions(
-    loss=l2, depth=False, brightness=False, robust_scale=False, cells=ALL_PIXELS, min_overlap=0.0
-)
+GREY_ONLY = AlignmentOptions(loss=l2, depth=False, brightness=False, robust_scale=False, points=None, min_overlap=0.0)
 SCIPY_CANDIDATES = 4
 LEAST_SECONDS = 0.02
 """A measurement repeats its call until it takes about this long."""
@@ -129,9 +134,15 @@ def make_objective(
     pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, options: AlignmentOptions
 ) -> Objective:
     """E of a level of a pair, every pixel a point."""
-    views = (View(pyramids[0], jnp.eye(4)),)
-    make = jax.jit(level_objective, static_argnames=("level", "brightness"))
-    return make(views, pyramids[1], camera, level=level, guess=jnp.eye(4), options=options, brightness=False)
+    solver = GaussNewton(iterations=tuple(int(k == level) for k in range(LEVELS)))
+
+    @jax.jit
+    def make() -> Objective:
+        view = View(prepare_reference(pyramids[0], camera, solver, options), jnp.eye(4))
+        only = jax.tree.map(lambda leaf: leaf[0], stack_levels((view,), camera, solver, options))
+        return fit_objective(only, prepare_target(pyramids[1], solver), options, jnp.eye(4))[0]
+
+    return make()
 
 
 def make_scene(pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, motions: np.ndarray) -> Scene:
@@ -238,7 +249,7 @@ def main(levels: str = "0,1,2,3,4", population: int = 64, rounds: int = 7, json:
     for level in map(int, common.names(levels)):
         scene = make_scene(pyramids, camera, level, motions)
         objective = make_objective(pyramids, camera, level, GREY_ONLY)
-        full = make_objective(pyramids, camera, level, AlignmentOptions(cells=ALL_PIXELS, min_overlap=0.0))
+        full = make_objective(pyramids, camera, level, AlignmentOptions(points=None, min_overlap=0.0))
         size = f"{scene.camera.width}x{scene.camera.height}"
         by_size[size] = measure(formulations(scene, objective, full), scene.grey.size, rounds)
     rows = [[name, *(number(times[name], 2) for times in by_size.values())] for name in next(iter(by_size.values()))]

@@ -21,7 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.alignment import AlignmentOptions, Images, View, align_pyramids, level_objective
+from gavo_jax.alignment import (
+    AlignmentOptions,
+    Images,
+    View,
+    align_views,
+    fit_objective,
+    prepare_reference,
+    prepare_target,
+    stack_levels,
+)
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
@@ -66,12 +75,14 @@ def final_errors(
 ) -> FinalErrors:
     """E of one pair, everything by the same objective (see the module)."""
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale) for image in (reference, target)]
-    views = (View(pyramids[0], jnp.eye(4)),)
+    views = (View(prepare_reference(pyramids[0], camera, genetic, options), jnp.eye(4)),)
+    packed = prepare_target(pyramids[1], genetic)
     found, descended = (
-        align_pyramids(views, pyramids[1], camera, solver, options, key, jnp.eye(4)[None]).target_T_reference
+        align_views(views, packed, camera, solver, options, key, jnp.eye(4)[None]).target_T_reference
         for solver in (genetic, gauss_newton)
     )
-    objective = level_objective(views, pyramids[1], camera, min(genetic.levels), found, options, options.brightness)
+    finest = jax.tree.map(lambda leaf: leaf[-1], stack_levels(views, camera, genetic, options))
+    objective, _ = fit_objective(finest, packed, options, found)
     return FinalErrors(
         objective.error(found)[0],
         objective.error(descended)[0],

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import gavo_jax as gavo
-from gavo_jax.alignment import View, align_pyramids
-from gavo_jax.pyramid import Pyramid, build_pyramid
+from gavo_jax.alignment import View, align_views, prepare_reference, prepare_target
+from gavo_jax.objective import Reference
+from gavo_jax.pyramid import build_pyramid
+from gavo_jax.warp import Target
 
 SOLVER = gavo.GeneticAlgorithm(population=(0, 0, 0, 32, 64), iterations=(0, 0, 0, 10, 12))
 """An entry a pyramid level, the full image first: the two coarsest levels, 40 x 30 and 80 x 60 pixels."""
@@ -23,13 +25,14 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     """Print the final error's median and spread over seeds, for each decay of the mutation's step."""
     sequence = gavo.SyntheticSequence(frames=2)
     camera, still = sequence.camera, jnp.eye(4)
-    build = jax.jit(build_pyramid)
-    reference, target = (build(frame.grey, frame.depth, camera.depth_scale) for frame in sequence)
+    options = gavo.AlignmentOptions()
+    pyramids = [build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence]
+    reference, target = prepare_reference(pyramids[0], camera, SOLVER, options), prepare_target(pyramids[1], SOLVER)
 
-    def final_error(key: jax.Array, decay: jax.Array, reference: Pyramid, target: Pyramid) -> jax.Array:
+    def final_error(key: jax.Array, decay: jax.Array, reference: Reference, target: Target) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
         views = (View(reference, still),)
-        return align_pyramids(views, target, camera, solver, gavo.AlignmentOptions(), key, still[None]).error
+        return align_views(views, target, camera, solver, options, key, still[None]).error
 
     over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
     over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))

@@ -1,12 +1,11 @@
 """Coarse to fine: the motion between two RGB-D frames (paper, section 3).
 
-`align_pyramids` is the method in one place. From the coarsest level to the finest it takes the reference's points,
+`align_views` is the method in one place. From the coarsest level to the finest it takes the reference's points,
 estimates what the data say about brightness and noise, chooses search coordinates, lets a solver minimise E there, and
 starts the next level from its best candidate. Everything from images to `Alignment` is one compiled program.
 """
 
 import enum
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,31 +13,32 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Integer, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
+    DEPTH_WEIGHT_RANGE,
     Loss,
     Objective,
     Problem,
     Reference,
     Scales,
-    concatenate_references,
+    cell_of,
     estimate_brightness,
     estimate_scales,
     explained_variance,
-    make_reference,
+    geman_mcclure,
+    make_references,
     move_reference,
     preconditioner,
     reference_curvature,
-    student_t,
 )
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
 from gavo_jax.solvers.base import Bounds, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import exp, log, pack_target
+from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -82,7 +82,8 @@ class AlignmentOptions:
         brightness: Whether a gain and a bias between the frames are estimated (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
-        cells: Side of the blocks that give one point each, an entry a level (static); 1 takes every pixel.
+        points: Largest number of reference points a level, one a square block of pixels (static); None takes every
+            pixel.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Factor on the depth cost's weight, which comes from the data; see `objective.estimate_scales`.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
@@ -95,12 +96,12 @@ class AlignmentOptions:
         scout_spread: Standard deviations of the scouts, metres and radians.
     """
 
-    loss: Loss = static(student_t)
+    loss: Loss = static(geman_mcclure)
     depth: bool = static(True)
     brightness: bool = static(True)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
-    cells: tuple[int, ...] = static((2, 2, 2, 1, 1))
+    points: int | None = static(4800)
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: float = 1.0
     min_overlap: float = 0.35
@@ -150,81 +151,141 @@ MAX_ROTATION_DEVIATION = 0.05
 class View(NamedTuple):
     """A frame that serves as reference, and where it stands."""
 
-    pyramid: Pyramid
+    references: Reference
+    """Its points, [L, N], coarsest level first; see `prepare_reference`."""
     anchor_T_view: Float[Array, "4 4"]
     """Maps the view's points into the camera that the result is relative to."""
 
 
-def level_objective(
-    views: tuple[View, ...],
-    target: Pyramid,
-    camera: Camera,
-    level: int,
-    guess: Float[Array, "4 4"],
-    options: AlignmentOptions,
-    brightness: bool,
-) -> Objective:
-    """E of one level, with its scales, and from the second level on its brightness model, estimated at the guess.
+def prepare_reference(pyramid: Pyramid, camera: Camera, solver: Any, options: AlignmentOptions) -> Reference:
+    """What a search needs of a reference frame: points of the solver's levels, [L, N], coarsest first."""
+    return make_references(pyramid, camera, solver.levels, options.points)
 
-    Before anything is aligned a regression of one image on the other would only tell that they differ: its gain would
-    fall towards 0 and reward motions that hide contrast.
+
+def prepare_target(pyramid: Pyramid, solver: Any) -> Target:
+    """What a search needs of a target frame: the solver's levels packed for sampling, coarsest first."""
+    return pack_target(*(pyramid[level] for level in solver.levels))
+
+
+class Level(NamedTuple):
+    """What changes from level to level; with a leading axis L the input of the scan over the levels."""
+
+    number: Integer[Array, ""]
+    """In the pyramid; 0 is the full image."""
+    is_first: Bool[Array, ""]
+    plane: ImagePlane
+    reference: Reference
+    """[V, N]: the points of all views as rays of the anchor camera."""
+    points: Integer[Array, ""]
+    """Points a view on this level; places from there on are empty."""
+    columns: Integer[Array, ""]
+    """Points a row."""
+    islands: Integer[Array, ""]
+    """Independent populations."""
+
+
+def stack_levels(views: tuple[View, ...], camera: Camera, solver: Any, options: AlignmentOptions) -> Level:
+    """The levels of a search, [L], coarsest first."""
+    levels = solver.levels
+    moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
+    cameras = [camera.level(level) for level in levels]
+    cells = [cell_of(c, options.points) for c in cameras]
+    columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
+    rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
+    return Level(
+        jnp.array(levels),
+        jnp.arange(len(levels)) == 0,
+        image_planes(camera, levels),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved),
+        jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
+        jnp.array(columns),
+        jnp.array([options.islands[level] for level in levels]),
+    )
+
+
+class Brightness(NamedTuple):
+    """Gain and bias of every view, [V]: I_{t+1}(ω(ξ, p)) ≈ gain · I_t(p) + bias."""
+
+    gain: Float[Array, " v"]
+    bias: Float[Array, " v"]
+
+
+def level_objective(level: Level, target: Target, options: AlignmentOptions, brightness: Brightness) -> Objective:
+    """E of one level under a brightness model, its scales still those of (2)."""
+    gain, bias = brightness
+    reference = level.reference._replace(grey=gain[:, None] * level.reference.grey + bias[:, None])
+    charge = 0.0 if options.outside_cost is None else jnp.where(level.islands > 1, options.outside_cost, 0.0)
+    return Objective(
+        reference,
+        target,
+        level.plane,
+        Scales.unit(),
+        jnp.float32(options.min_overlap),
+        jnp.float32(charge),
+        level.points,
+        level.columns,
+        options.loss,
+        options.depth,
+    )
+
+
+def fit_objective(
+    level: Level, target: Target, options: AlignmentOptions, guess: Float[Array, "4 4"]
+) -> tuple[Objective, Brightness]:
+    """E of one level with everything that is estimated from the data at the motion that it starts from.
+
+    On the first level nothing is aligned yet. A regression of one image on the other would only tell that they differ,
+    its gain would fall towards 0 and reward motions that hide contrast; and residuals of a wrong motion say nothing of
+    how much depth is worth. So brightness is left alone there, and depth has its largest weight.
     """
-    charge_outside = options.outside_cost is not None and options.islands[level] > 1
-    camera = camera.level(level)
-    packed = pack_target(target[level].grey, target[level].inverse_depth)
+    brightness = unchanged_brightness(level)
+    objective = level_objective(level, target, options, brightness)
+    if options.brightness:
 
-    def objective(reference: Reference) -> Objective:
-        return Objective(
-            reference,
-            packed,
-            camera,
-            Scales.unit(),
-            jnp.float32(options.min_overlap),
-            options.loss,
-            options.depth,
-            camera.width // options.cells[level],
-            jnp.float32(options.outside_cost) if charge_outside else None,
-        )
+        def estimate(reference: Reference) -> Brightness:
+            return Brightness(*estimate_brightness(replace(objective, reference=reference), guess))
 
-    references = []
-    for i, view in enumerate(views):
-        reference = make_reference(view.pyramid[level], camera, options.cells[level])
-        if i > 0:
-            reference = move_reference(reference, view.anchor_T_view)
-        if brightness:
-            gain, bias = estimate_brightness(objective(reference), guess)
-            reference = reference._replace(grey=gain * reference.grey + bias)
-        references.append(reference)
-    whole = objective(concatenate_references(references))
-    if not options.robust_scale:
-        return whole
-    return replace(whole, scales=estimate_scales(whole, guess, options.depth_weight))
+        estimated = jax.vmap(estimate)(level.reference)
+        brightness = jax.tree.map(lambda a, b: jnp.where(level.is_first, a, b), brightness, estimated)
+        objective = level_objective(level, target, options, brightness)
+    if options.robust_scale:
+        scales = estimate_scales(objective, guess, options.depth_weight)
+        largest_weight = options.depth_weight * DEPTH_WEIGHT_RANGE[1]
+        weight = jnp.where(level.is_first, largest_weight, scales.depth_weight)
+        objective = replace(objective, scales=scales._replace(depth_weight=weight))
+    return objective, brightness
 
 
-def _best_guess(
-    make_objective: Callable[[Float[Array, "4 4"]], Objective], guesses: Float[Array, "g 4 4"]
-) -> tuple[Float[Array, "4 4"], Objective]:
-    """The guess with the smallest residuals, and the objective with its scales estimated there.
+def unchanged_brightness(level: Level) -> Brightness:
+    """Every view as bright as the target."""
+    views = level.reference.grey.shape[0]
+    return Brightness(jnp.ones(views), jnp.zeros(views))
 
-    Unscaled residuals are compared: each guess has its own scales, and E in units of them says nothing.
+
+def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[Array, "4 4"]:
+    """The guess with the smallest grey residuals.
+
+    Unscaled residuals are compared: each guess would have its own scales, and E in units of them says nothing.
     """
     if guesses.shape[0] == 1:
-        return guesses[0], make_objective(guesses[0])
-    objectives = jax.vmap(make_objective)(guesses)
-
-    def unexplained(objective: Objective, guess: jax.Array) -> jax.Array:
-        r = objective.residuals(guess)
-        share = jnp.sum(r.inside) / jnp.maximum(jnp.sum(objective.reference.points.q > 0), 1.0)
-        error = jnp.sum(r.inside * jnp.abs(r.grey)) / jnp.maximum(jnp.sum(r.inside), 1.0)
-        return jnp.where(share < objective.min_overlap, jnp.inf, error)
-
-    best = jnp.argmin(jax.vmap(unexplained)(objectives, guesses))
-    return guesses[best], jax.tree.map(lambda leaf: leaf[best], objectives)
+        return guesses[0]
+    plain = replace(objective, use_depth=False, loss=jnp.sqrt, outside_cost=jnp.float32(0.0))
+    return guesses[jnp.argmin(jax.vmap(lambda guess: plain.error(guess)[0])(guesses))]
 
 
-def align_pyramids(
+class Search(NamedTuple):
+    """What one level hands on to the next."""
+
+    islands: Float[Array, "i 4 4"]
+    """Motions, the best one first."""
+    box: Float[Array, " 6"]
+    """Half-widths of the search box, metres and radians."""
+    brightness: Brightness
+
+
+def align_views(
     views: tuple[View, ...],
-    target: Pyramid,
+    target: Target,
     camera: Camera,
     solver: Any,
     options: AlignmentOptions,
@@ -233,45 +294,49 @@ def align_pyramids(
 ) -> Alignment:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
+    The levels are one `lax.scan`: what a level does is compiled once and serves all of them.
+
     Args:
         views: Reference frames; the first one is the anchor, the others' points are moved into its camera.
-        target: Pyramid of the target frame.
+        target: Of `prepare_target`, as the views are of `prepare_reference`, for the same solver.
         camera: Camera of level 0.
         solver: Any `solvers.base.Solver` with an entry a level.
         options: What is minimised.
         key: Random key.
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
     """
-    box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
-    islands, centre, objective = guesses, guesses[0], None
-    histories: list[jax.Array] = []
-    for level in solver.levels:
-        first, count = not histories, options.islands[level]
-        make_objective = partial(
-            level_objective, views, target, camera, level, options=options, brightness=options.brightness and not first
-        )
-        leader, objective = _best_guess(make_objective, guesses if first else islands[:1])
+    levels = stack_levels(views, camera, solver, options)
+    first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
+    start_key, key = jax.random.split(key)
+    origins = _origins(first, target, options, guesses, start_key)
+    start = Search(
+        origins,
+        jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
+        unchanged_brightness(first),
+    )
+
+    def search_level(search: Search, level: Level) -> tuple[Search, jax.Array]:
+        objective, brightness = fit_objective(level, target, options, search.islands[0])
         basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
-        key, level_key, start_key = jax.random.split(key, 3)
-        if not first:
-            origins = islands[:count]
-        elif options.scouts:
-            origins = _scout(objective, leader, options, count, start_key)
+        problem = Problem(objective, search.islands[0], basis, origins[0])
+        places = search.islands.shape[0]
+        keys = jax.random.split(jax.random.fold_in(key, level.number), places)
+        island = partial(_search_island, problem, solver.at_level(level.number), options, search.box)
+        inhabited = jnp.arange(places) < level.islands
+        if places == 1:
+            found, errors, history = jax.tree.map(
+                lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0])
+            )
         else:
-            origins = jnp.repeat(leader[None], count, axis=0)
-        centre = leader if first else centre
-        search = partial(
-            _search_island, Problem(objective, leader, basis, centre), solver.at_level(level), options, box
-        )
-        if count == 1:
-            islands, errors, history = jax.tree.map(lambda a: a[None], search(level_key, origins[0]))
-        else:
-            islands, errors, history = jax.vmap(search)(jax.random.split(level_key, count), origins)
-        histories.append(history[jnp.argmin(errors)])
-        islands = islands[_best_distinct(islands, errors, count)]
-        box = box * options.bounds_factor
-    assert objective is not None, "the solver has no level with an iteration"
-    return _conclude(objective, islands[0], options, jnp.concatenate(histories))
+            found, errors, history = jax.vmap(island)(keys, search.islands, inhabited)
+        order = _best_distinct(found, errors, places)
+        return Search(found[order], search.box * options.bounds_factor, brightness), history[order[0]]
+
+    search, histories = jax.lax.scan(search_level, start, levels)
+    iterations = [solver.iterations[level] for level in solver.levels]
+    history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
+    objective = level_objective(finest, target, options, search.brightness)
+    return _conclude(objective, search.islands[0], options, history)
 
 
 def _search_island(
@@ -281,19 +346,39 @@ def _search_island(
     box: Float[Array, " 6"],
     key: PRNGKeyArray,
     origin: Float[Array, "4 4"],
+    inhabited: Bool[Array, ""],
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"]]:
     """Search one level from one origin."""
     if options.precondition:
-        problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]))
+        problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]), searched=inhabited)
         reach = jnp.abs(jnp.linalg.inv(problem.basis)) @ box
         bounds = Bounds(-reach, reach)
         guess = jnp.zeros((1, 6))
     else:
-        problem = replace(problem, origin=jnp.eye(4))
+        problem = replace(problem, origin=jnp.eye(4), searched=inhabited)
         bounds = Bounds(log(origin) - box, log(origin) + box)
         guess = log(origin)[None]
     solution = solve(key, solver, problem, guess, bounds)
     return problem.transform(solution.x), solution.error, solution.history
+
+
+def _origins(
+    level: Level, target: Target, options: AlignmentOptions, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray
+) -> Float[Array, "i 4 4"]:
+    """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
+    about it.
+    """
+    objective = level_objective(level, target, options, unchanged_brightness(level))
+    leader = _best_guess(objective, guesses)
+    places = max(options.islands)
+    if not options.scouts:
+        return jnp.repeat(leader[None], places, axis=0)
+    objective, _ = fit_objective(level, target, options, leader)
+    spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
+    twists = spread * jax.random.normal(key, (options.scouts, 6))
+    scouts = leader @ exp(twists.at[0].set(0.0))
+    errors, _ = objective.score(scouts)
+    return scouts[_best_distinct(scouts, errors, places)]
 
 
 NICHE = (0.08, 0.08)
@@ -315,22 +400,12 @@ def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], c
         near = jnp.sum((places - places[best]) ** 2, axis=1) < 1.0
         return jnp.where(near, cleared + CLEARED, cleared).at[best].set(jnp.inf), best
 
-    return jax.lax.scan(pick, jnp.minimum(jnp.nan_to_num(errors, nan=jnp.inf), CLEARED / 2), length=count)[1]
+    worthless = jnp.where(jnp.isfinite(errors), jnp.minimum(errors, CLEARED / 2), 10 * CLEARED)
+    return jax.lax.scan(pick, worthless, length=count)[1]
 
 
 CLEARED = 1e9
 """Added to the error of a motion whose mode is taken; above any error."""
-
-
-def _scout(
-    objective: Objective, leader: Float[Array, "4 4"], options: AlignmentOptions, count: int, key: PRNGKeyArray
-) -> Float[Array, "k 4 4"]:
-    """Origins of the coarsest level's islands: the best distinct ones of many motions drawn about the leader."""
-    spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
-    twists = spread * jax.random.normal(key, (options.scouts, 6))
-    scouts = leader @ exp(twists.at[0].set(0.0))
-    errors, _ = objective.score(scouts)
-    return scouts[_best_distinct(scouts, errors, count)]
 
 
 def _conclude(
@@ -338,25 +413,26 @@ def _conclude(
 ) -> Alignment:
     """Error, covariance and status at the motion that the search ended with.
 
-    The scales are estimated once more there, so that errors of different solvers can be compared.
+    The scales are estimated there once more, so that errors of different solvers can be compared.
     """
     if options.robust_scale:
         objective = replace(objective, scales=estimate_scales(objective, target_T_reference, options.depth_weight))
     problem = Problem(objective, target_T_reference, jnp.eye(6))
-    model = problem.linearize(jnp.zeros(6))
+    model, scatter, residuals = problem.examine(jnp.zeros(6))
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
     inverse = jnp.linalg.inv(model.hessian + ridge)
-    covariance = inverse @ problem.gradient_scatter(jnp.zeros(6)) @ inverse.T
+    covariance = inverse @ scatter @ inverse.T
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
-    depth_share = jnp.mean((objective.reference.points.q > 0).astype(jnp.float32))
+    has_reading = objective.reference.points.q > 0
+    depth_share = jnp.sum(has_reading) / (has_reading.shape[0] * has_reading.shape[1])
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(problem.origin)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
-    contrast = jnp.std(objective.reference.grey, where=objective.reference.points.q > 0)
+    contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
         (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
-        (explained_variance(objective, problem.origin) < MIN_EXPLAINED, AlignmentStatus.HIGH_ERROR),
+        (explained_variance(objective, residuals) < MIN_EXPLAINED, AlignmentStatus.HIGH_ERROR),
         (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),
         (~finite, AlignmentStatus.NOT_FINITE),
         (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
@@ -382,8 +458,8 @@ def _align_images(
     guess: Float[Array, "4 4"],
 ) -> Alignment:
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale, LEVELS) for image in (reference, target)]
-    view = View(pyramids[0], jnp.eye(4))
-    return align_pyramids((view,), pyramids[1], camera, solver, options, key, guess[None])
+    view = View(prepare_reference(pyramids[0], camera, solver, options), jnp.eye(4))
+    return align_views((view,), prepare_target(pyramids[1], solver), camera, solver, options, key, guess[None])
 
 
 @jax.jit

@@ -9,24 +9,26 @@ so the noise of 1/z is the same at every range and one scale serves all pixels.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.camera import Camera
-from gavo_jax.pyramid import PyramidLevel
+from gavo_jax.pyramid import Pyramid, PyramidLevel
 from gavo_jax.warp import (
     GENERATORS,
     DepthSample,
     GreySample,
+    ImagePlane,
     Points,
     Target,
     Warped,
     exp,
     inverse_depth_slopes,
     log,
+    look_up,
     right_jacobian,
     sample_depth,
     sample_grey,
@@ -34,7 +36,7 @@ from gavo_jax.warp import (
 )
 
 Loss = Callable[[jax.Array], jax.Array]
-"""A cost of the squared normalised residual s = (r/σ)²; ρ(s) ≈ s near 0. Any callable of arrays will do."""
+"""A cost of the squared normalised residual s = (r/σ)², never negative. Any callable of arrays will do."""
 
 
 def l2(s: jax.Array) -> jax.Array:
@@ -80,17 +82,19 @@ LOSSES: dict[str, Loss] = {
 
 
 class Reference(NamedTuple):
-    """What the objective keeps of a level of the reference frame: flat arrays of N points."""
+    """What the objective keeps of a level of the reference frame: arrays of N points, with an axis of views before it
+    where several frames serve together.
+    """
 
     points: Points
-    grey: Float[Array, " n"]
-    grey_u: Float[Array, " n"]
+    grey: Float[Array, "*views n"]
+    grey_u: Float[Array, "*views n"]
     """Intensity gradient along u (grey levels a pixel), and `grey_v` along v."""
-    grey_v: Float[Array, " n"]
-    slope_u: Float[Array, " n"]
+    grey_v: Float[Array, "*views n"]
+    slope_u: Float[Array, "*views n"]
     """Inverse-depth slope along u (1/m a pixel), and `slope_v` along v."""
-    slope_v: Float[Array, " n"]
-    facing: Float[Array, " n"]
+    slope_v: Float[Array, "*views n"]
+    facing: Float[Array, "*views n"]
     """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""
 
 
@@ -132,6 +136,33 @@ def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Refere
     return Reference(Points(x, y, q), grey, grey_u, grey_v, slope_u, slope_v, facing)
 
 
+def cell_of(camera: Camera, points: int | None) -> int:
+    """Side of the blocks that give one point each, so that an image gives at most `points`; None takes every pixel."""
+    cell = 1
+    while points is not None and (camera.width // cell) * (camera.height // cell) > points:
+        cell += 1
+    return cell
+
+
+def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: int | None) -> Reference:
+    """Points of some levels, [L, N]: shorter levels are filled up with points without a reading.
+
+    Args:
+        pyramid: Of the reference frame.
+        camera: Of level 0.
+        levels: Which ones, in the order of the result.
+        points: Largest number of points a level; None takes every pixel.
+    """
+    cameras = [camera.level(level) for level in levels]
+    references = [make_reference(pyramid[k], c, cell_of(c, points)) for k, c in zip(levels, cameras, strict=True)]
+    longest = max(reference.grey.shape[0] for reference in references)
+
+    def fill(*leaves: jax.Array) -> jax.Array:
+        return jnp.stack([jnp.pad(leaf, (0, longest - leaf.shape[0])) for leaf in leaves])
+
+    return jax.tree.map(fill, *references)
+
+
 def move_reference(reference: Reference, anchor_T_view: Float[Array, "4 4"]) -> Reference:
     """The same points as rays of another camera; what falls behind it loses its reading."""
     r, t = anchor_T_view[:3, :3], anchor_T_view[:3, 3]
@@ -143,15 +174,12 @@ def move_reference(reference: Reference, anchor_T_view: Float[Array, "4 4"]) -> 
     return reference._replace(points=points)
 
 
-def share_in_view(reference: Reference, target_T_reference: Float[Array, "4 4"], camera: Camera) -> Float[Array, ""]:
+def share_in_view(
+    reference: Reference, target_T_reference: Float[Array, "4 4"], camera: Camera | ImagePlane
+) -> Float[Array, ""]:
     """Share of the reference's points that land inside the target; nothing is sampled."""
     inside = warp(reference.points, target_T_reference, camera).inside
     return jnp.sum(inside) / jnp.maximum(jnp.sum(reference.points.q > 0), 1.0)
-
-
-def concatenate_references(references: list[Reference]) -> Reference:
-    """One set of points out of several, all in one camera's frame."""
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *references)
 
 
 class Scales(NamedTuple):
@@ -174,49 +202,78 @@ class Scales(NamedTuple):
 class Residuals(NamedTuple):
     """Residuals of one motion at every reference point, with what a derivative needs."""
 
-    grey: Float[Array, " n"]
+    grey: Float[Array, "*n"]
     """Grey levels; equation (1) after the brightness model."""
-    depth: Float[Array, " n"]
+    depth: Float[Array, "*n"]
     """Inverse depth, 1/m, along the surface normal; 0 where `depth_valid` is 0."""
-    inside: Float[Array, " n"]
-    depth_valid: Float[Array, " n"]
+    inside: Float[Array, "*n"]
+    depth_valid: Float[Array, "*n"]
     warped: Warped
     grey_sample: GreySample
     depth_sample: DepthSample
 
 
-MAP_FROM_POINTS = 6_000
-"""On a CPU, levels of at least this many points score candidate after candidate in one fused loop each; smaller ones,
-and every level on a GPU, score all candidates side by side (`benchmarks/kernel.py`)."""
+GROUP = 8
+"""Candidates that are scored side by side on a CPU; a population's size is best a multiple of it."""
+CHUNK = 1200
+"""Points a view on which a group of candidates is scored at a time on a CPU; what lies between two loops stays in the
+cache (`benchmarks/kernel.py`)."""
+LINEARIZED_CHUNK = 4800
+"""Points a view that are linearised at a time; there is only one candidate then."""
+MOST_CHUNKS = 16
+"""On large images chunks grow so that there are no more than these."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Objective:
-    """E of one level of one pair of frames: prepared arrays, scales and a loss."""
+    """E of one level of one pair of frames: prepared arrays, scales and a loss.
+
+    A point that lands inside costs ρ(r²/σ²) + λ ρ(q²/τ²), or λ ρ(1) for the second term where the target has no depth
+    reading: as much as a typical one, so that neither seeking nor shunning gaps pays. E is σ² times the mean cost.
+    """
 
     reference: Reference
     target: Target
-    camera: Camera
+    plane: ImagePlane
     scales: Scales
     min_overlap: Float[Array, ""]
+    outside_cost: Float[Array, ""] = field(default_factory=lambda: jnp.float32(0.0))
+    """Cost of a reference point that leaves the view, in units of ρ(1). Positive, and a motion cannot win by pushing
+    pixels out of view; 0 averages over the points in view alone, as (2) does."""
+    count: Integer[Array, ""] | None = None
+    """Points a view that hold something, from the first on; None: all."""
+    columns: Integer[Array, ""] | int = 1
+    """Reference points a row: they come from a grid, row after row."""
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
-    columns: int = field(default=1, metadata={"static": True})
-    """Reference points a row: they come from a grid, row after row."""
-    outside_cost: Float[Array, ""] | None = None
-    """Cost of a reference point that leaves the view, in units of that of a residual of one scale; None averages over
-    the points in view alone, as (2) does. With a cost, a motion cannot win by pushing pixels out of view."""
 
-    def residuals(self, target_T_reference: Float[Array, "4 4"]) -> Residuals:
-        """r_i(ξ) of one motion, equation (1)."""
-        reference = self.reference
-        warped = warp(reference.points, target_T_reference, self.camera)
-        grey_sample = sample_grey(self.target.grey, warped)
+    def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
+        """Sum of `part` over chunks of the reference's points, as far as there are any."""
+        points = self.reference.grey.shape[-1]
+        size = max(min(chunk_size, points), -(-points // MOST_CHUNKS))
+        chunks = -(-points // size)
+        if chunks == 1:
+            return part(self.reference)
+        fill = chunks * size - points
+        whole = jax.tree.map(lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, fill)]), self.reference)
+        used = chunks if self.count is None else -(-self.count // size)
+
+        def chunk(k: jax.Array | int) -> Reference:
+            return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, k * size, size, axis=a.ndim - 1), whole)
+
+        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: part(chunk(0))))
+        return jax.lax.fori_loop(0, used, lambda k, total: jax.tree.map(jnp.add, total, part(chunk(k))), zero)
+
+    def residuals(self, target_T_reference: Float[Array, "4 4"], reference: Reference | None = None) -> Residuals:
+        """r_i(ξ) of one motion, equation (1); at all points or at some of them."""
+        reference = self.reference if reference is None else reference
+        warped = warp(reference.points, target_T_reference, self.plane)
+        words = look_up(self.target, warped, self.plane)
+        grey_sample, depth_sample = sample_grey(words, warped), sample_depth(words, warped)
         grey = grey_sample.value - reference.grey
-        depth_sample = sample_depth(self.target.depth, warped)
-        depth_valid = depth_sample.valid * warped.inside
         depth = reference.facing * (depth_sample.value - warped.inverse_depth)
+        depth_valid = depth_sample.valid * warped.inside
         return Residuals(
             jnp.where(warped.inside > 0, grey, 0.0),
             jnp.where(depth_valid > 0, depth, 0.0),
@@ -227,28 +284,108 @@ class Objective:
             depth_sample,
         )
 
-    def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
-        """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
-        r, scales = self.residuals(target_T_reference), self.scales
-        count = jnp.sum(r.inside)
-        variance = scales.grey**2
-        total = jnp.sum(r.inside * self.loss(r.grey**2 / variance))
-        valid = jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
-        if self.outside_cost is None:
-            error = variance * total / jnp.maximum(count, 1.0)
-        else:
-            error = variance * (total + (valid - count) * self.outside_cost * self.loss(jnp.float32(1.0))) / valid
+    def _cost(self, reference: Reference, target_T_reference: Float[Array, "4 4"]) -> Float[Array, "*n"]:
+        """Cost of every point under one motion; −1 marks those outside, so that one pass over the points does."""
+        return self._cost_of(self.residuals(target_T_reference, reference))
+
+    def _cost_of(self, r: Residuals) -> Float[Array, "*n"]:
+        scales = self.scales
+        cost = self.loss(r.grey**2 * (1.0 / scales.grey**2))
         if self.use_depth:
-            cost = jnp.sum(r.depth_valid * self.loss((r.depth / scales.depth) ** 2))
-            error += variance * scales.depth_weight * cost / jnp.maximum(jnp.sum(r.depth_valid), 1.0)
-        overlap = count / valid
+            depth_cost = self.loss(r.depth**2 * (1.0 / scales.depth**2))
+            cost += scales.depth_weight * jnp.where(r.depth_valid > 0, depth_cost, self.loss(jnp.float32(1.0)))
+        return jnp.where(r.inside > 0, cost, -1.0)
+
+    def _sums(self, cost: Float[Array, "*n"]) -> Float[Array, " 2"]:
+        """Sum of the costs inside, and the number of points there."""
+        return jnp.stack([_lane_sum(jnp.maximum(cost, 0.0)), _lane_sum((cost >= 0).astype(jnp.float32))])
+
+    def _conclude(self, sums: Float[Array, "2 ..."]) -> tuple[Float[Array, "*p"], Float[Array, "*p"]]:
+        """Errors and overlaps from the sums over all points."""
+        total, inside = sums
+        valid = jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
+        outside = (valid - inside) * self.outside_cost * self.loss(jnp.float32(1.0))
+        overlap = inside / valid
+        error = self.scales.grey**2 * (total + outside) / self._divisor(inside)
         return jnp.where(overlap < self.min_overlap, jnp.inf, error), overlap
 
-    def score(self, target_T_reference: Float[Array, "p 4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P motions in one call."""
-        if self.reference.grey.shape[0] >= MAP_FROM_POINTS and jax.default_backend() == "cpu":
-            return jax.lax.map(self.error, target_T_reference)
-        return jax.vmap(self.error)(target_T_reference)
+    def _divisor(self, inside: Float[Array, "*p"]) -> Float[Array, "*p"]:
+        """Number of points that E is the mean over."""
+        valid = jnp.sum(self.reference.points.q > 0).astype(jnp.float32)
+        return jnp.maximum(jnp.where(self.outside_cost > 0, valid, inside), 1.0)
+
+    def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
+        """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
+        return self._conclude(self._sums(self._cost(self.reference, target_T_reference)))
+
+    def score(
+        self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
+    ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Errors and overlaps of P motions in one call; those not `counted` cost nothing and have an error of +inf."""
+        if counted is None:
+            counted = jnp.ones(target_T_reference.shape[0], bool)
+        return _score(self, target_T_reference, counted)
+
+
+def _lane_sum(values: Float[Array, "*n"]) -> Float[Array, ""]:
+    """Sum over all points in lanes: a plain sum is one chain of additions, which no compiler may reorder."""
+    flat = values.reshape(-1)
+    lanes = next(size for size in (480, 240, 120, 60, 32, 1) if flat.shape[0] % size == 0)
+    return jnp.sum(jnp.sum(flat.reshape(-1, lanes), axis=0))
+
+
+def _score_side_by_side(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """All candidates and points at once: what a GPU wants."""
+    sums = jax.vmap(lambda motion: objective._sums(objective._cost(objective.reference, motion)), out_axes=1)(motions)
+    error, overlap = objective._conclude(sums)
+    return jnp.where(counted, error, jnp.inf), overlap
+
+
+def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Groups of candidates on chunks of points: what a CPU wants. Both loops run only as far as there is something."""
+    candidates = motions.shape[0]
+    group = min(GROUP, candidates)
+    groups = -(-candidates // group)
+    order = jnp.argsort(~counted, stable=True)
+    order = jnp.concatenate([order, jnp.full(groups * group - candidates, candidates)])
+
+    def score_group(i: jax.Array, sums: jax.Array) -> jax.Array:
+        members = jax.lax.dynamic_slice_in_dim(order, i * group, group)
+        chosen = motions.at[members].get(mode="clip")
+
+        def chunk_sums(chunk: Reference) -> jax.Array:
+            return jax.vmap(lambda motion: objective._sums(objective._cost(chunk, motion)), out_axes=1)(chosen)
+
+        return sums.at[:, members].set(objective.sum_over_points(chunk_sums, CHUNK), mode="drop")
+
+    busy = -(-jnp.sum(counted) // group)
+    sums = jax.lax.fori_loop(0, busy, score_group, jnp.zeros((2, candidates)))
+    error, overlap = objective._conclude(sums)
+    return jnp.where(counted, error, jnp.inf), overlap
+
+
+@jax.custom_batching.custom_vmap
+def _score(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The form that suits the backend."""
+    if jax.default_backend() == "cpu":
+        return _score_in_groups(objective, motions, counted)
+    return _score_side_by_side(objective, motions, counted)
+
+
+@_score.def_vmap
+def _score_batch(
+    size: int, batched: Any, objective: Objective, motions: jax.Array, counted: jax.Array
+) -> tuple[Any, tuple[bool, bool]]:
+    """Several populations on one objective are one large population; several objectives are side by side."""
+    if any(jax.tree.leaves(batched[0])):
+        axes = jax.tree.map(lambda flag: 0 if flag else None, batched)
+        return jax.vmap(_score_side_by_side, in_axes=tuple(axes))(objective, motions, counted), (True, True)
+    motions, counted = (
+        array if flag else jnp.broadcast_to(array, (size, *array.shape))
+        for array, flag in zip((motions, counted), batched[1:], strict=True)
+    )
+    error, overlap = _score(objective, motions.reshape(-1, 4, 4), counted.reshape(-1))
+    return (error.reshape(size, -1), overlap.reshape(size, -1)), (True, True)
 
 
 class Linearization(NamedTuple):
@@ -266,9 +403,9 @@ def _jacobian(
     along_inverse_depth: jax.Array,
     warped: Warped,
     points: Points,
-    camera: Camera,
+    camera: Camera | ImagePlane,
     tangent: Float[Array, "4 4 6"],
-) -> Float[Array, "6 n"]:
+) -> Float[Array, "6 ..."]:
     """Chain rule from (u, v, 1/z) of the warped points to six coordinates; `tangent` is ∂(4x4 motion)/∂x."""
     per_depth = warped.inverse_depth / jnp.maximum(points.q, 1e-6)
     from_x = along_u * camera.fx * per_depth
@@ -284,6 +421,10 @@ def _jacobian(
         return from_x * moved[0] + from_y * moved[1] + from_z * moved[2]
 
     return jnp.stack([column(tangent[:, :, k]) for k in range(6)])
+
+
+Term = tuple[Float[Array, "6 n"], Float[Array, " n"], Float[Array, " n"]]
+"""A channel's Jacobian, residuals and weights."""
 
 
 @jax.tree_util.register_dataclass
@@ -302,6 +443,8 @@ class Problem:
     """Motion that the search is held about, and `reach`, the largest translation (m) and rotation (rad) from it; a
     candidate further off is worthless. None: the solver's bounds alone hold it."""
     reach: Float[Array, " 2"] | None = None
+    searched: Bool[Array, ""] | bool = True
+    """Whether anything is to be found here; if not, no candidate is worth anything and none costs anything."""
 
     def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
         """target_T_reference of search coordinates."""
@@ -311,10 +454,17 @@ class Problem:
         """Search coordinates of a motion, the inverse of `transform`."""
         return jnp.linalg.solve(self.basis, log(jnp.linalg.inv(self.origin) @ target_T_reference))
 
-    def score(self, x: Float[Array, "p 6"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every solver."""
+    def score(
+        self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None
+    ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every solver.
+
+        Candidates that are not `counted` cost nothing and have an error of +inf: a population that is smaller on one
+        level than on another leaves places empty.
+        """
         motions = self.transform(x)
-        error, overlap = self.objective.score(motions)
+        counted = jnp.ones(x.shape[0], bool) if counted is None else counted
+        error, overlap = self.objective.score(motions, counted & self.searched)
         if self.centre is not None and self.reach is not None:
             offset = jnp.linalg.inv(self.centre) @ motions
             cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
@@ -322,12 +472,49 @@ class Problem:
             error = jnp.where(far, jnp.inf, error)
         return jnp.where(jnp.isnan(error), jnp.inf, error), overlap
 
-    def _weighted_terms(self, x: Float[Array, " 6"]) -> tuple[Residuals, list[tuple[jax.Array, jax.Array, jax.Array]]]:
-        """For each channel J of [6, N], r and w of [N]: E's gradient is Σ J w r, its Gauss-Newton Hessian Σ w J Jᵀ."""
+    def linearize(self, x: Float[Array, " 6"]) -> Linearization:
+        """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
+
+        def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
+            r = self.objective.residuals(self.transform(x), reference)
+            gradient, hessian = _normal_equations(self._weighted_terms(x, reference, r))
+            return self.objective._sums(self.objective._cost_of(r)), gradient, hessian
+
+        return self._linearization(*self.objective.sum_over_points(part, LINEARIZED_CHUNK))
+
+    def examine(self, x: Float[Array, " 6"]) -> tuple[Linearization, Float[Array, "6 6"], Residuals]:
+        """E's derivatives, the covariance of its gradient, and the residuals.
+
+        The covariance comes from the gradient's spread over tiles of the target image: residuals of neighbouring
+        pixels are correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both
+        sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
+        """
+        objective, plane = self.objective, self.objective.plane
+        r = objective.residuals(self.transform(x))
+        terms = self._weighted_terms(x, objective.reference, r)
+        sums = objective._sums(objective._cost_of(r))
+        column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
+        row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
+        tile = jax.nn.one_hot((row * TILES[0] + column).reshape(-1), TILES[0] * TILES[1])
+        by_tile = jnp.asarray(sum((jacobian * (weight * residual)) @ tile for jacobian, residual, weight in terms))
+        by_tile *= 2.0 / objective._divisor(sums[1])
+        used = jnp.sum(jnp.any(by_tile != 0, axis=0))
+        scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
+        return self._linearization(sums, *_normal_equations(terms)), scatter, r
+
+    def _linearization(self, sums: jax.Array, gradient: jax.Array, hessian: jax.Array) -> Linearization:
+        error, overlap = self.objective._conclude(sums)
+        factor = 2.0 / self.objective._divisor(sums[1])
+        return Linearization(error, overlap, factor * gradient, factor * hessian)
+
+    def _weighted_terms(self, x: Float[Array, " 6"], reference: Reference, r: Residuals) -> list[Term]:
+        """For each channel J of [6, N], r and w of [N]: half of E's gradient is Σ J w r over the number of points, half
+        its Gauss-Newton Hessian Σ w J Jᵀ.
+        """
         objective = self.objective
         twist = self.basis @ x
         tangent = jnp.einsum("ij,jkm->ikm", self.transform(x), GENERATORS @ (right_jacobian(twist) @ self.basis))
-        r, scales, facing = objective.residuals(self.transform(x)), objective.scales, objective.reference.facing
+        scales, facing = objective.scales, reference.facing
         grey, depth = r.grey_sample, r.depth_sample
         one = jnp.float32(1.0)
         channels = [(r.grey, scales.grey, r.inside, one, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
@@ -337,42 +524,22 @@ class Problem:
             channels.append((r.depth, scales.depth, r.depth_valid, factor, *slopes))
         terms = []
         for residual, scale, mask, factor, along_u, along_v, along_q in channels:
-            jacobian = _jacobian(
-                along_u, along_v, along_q, r.warped, objective.reference.points, objective.camera, tangent
-            )
+            jacobian = _jacobian(along_u, along_v, along_q, r.warped, reference.points, objective.plane, tangent)
             jacobian = jnp.where(mask > 0, jacobian, 0.0)
             s = (residual / scale) ** 2
             _, slope = jax.jvp(objective.loss, (s,), (jnp.ones_like(s),))
-            weight = factor * jnp.where(mask > 0, slope, 0.0) * 2.0 / jnp.maximum(jnp.sum(mask), 1.0)
-            terms.append((jacobian, residual, weight))
-        return r, terms
+            weight = factor * jnp.where(mask > 0, slope, 0.0)
+            terms.append((jacobian.reshape(6, -1), residual.reshape(-1), weight.reshape(-1)))
+        return terms
 
-    def linearize(self, x: Float[Array, " 6"]) -> Linearization:
-        """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
-        error, overlap = self.objective.error(self.transform(x))
-        _, terms = self._weighted_terms(x)
-        gradient = jnp.asarray(sum(jacobian @ (weight * residual) for jacobian, residual, weight in terms))
-        hessian = jnp.asarray(sum((jacobian * weight) @ jacobian.T for jacobian, _, weight in terms))
-        return Linearization(error, overlap, gradient, hessian)
 
-    def gradient_scatter(self, x: Float[Array, " 6"]) -> Float[Array, "6 6"]:
-        """Covariance of E's gradient from its spread over the tiles of the target image.
-
-        Residuals of neighbouring pixels are correlated, so pixels are no independent witnesses; tiles nearly are.
-        With the Hessian on both sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
-        """
-        r, terms = self._weighted_terms(x)
-        camera = self.objective.camera
-        column = jnp.clip(r.warped.u * (TILES[0] / camera.width), 0, TILES[0] - 1).astype(jnp.int32)
-        row = jnp.clip(r.warped.v * (TILES[1] / camera.height), 0, TILES[1] - 1).astype(jnp.int32)
-        tile = jax.nn.one_hot(row * TILES[0] + column, TILES[0] * TILES[1])
-        sums = jnp.asarray(sum((jacobian * (weight * residual)) @ tile for jacobian, residual, weight in terms))
-        used = jnp.sum(jnp.any(sums != 0, axis=0))
-        return (sums @ sums.T) * used / jnp.maximum(used - 1, 1)
+def _normal_equations(terms: list[Term]) -> tuple[Float[Array, " 6"], Float[Array, "6 6"]]:
+    gradient = jnp.asarray(sum(jacobian @ (weight * residual) for jacobian, residual, weight in terms))
+    return gradient, jnp.asarray(sum((jacobian * weight) @ jacobian.T for jacobian, _, weight in terms))
 
 
 TILES = (8, 6)
-"""Tiles across and down the image, for `Problem.gradient_scatter`."""
+"""Tiles across and down the image, for `Problem.examine`."""
 
 
 def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
@@ -381,30 +548,21 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
     J is taken in a step on the reference's side, target_T_reference = origin · exp(ξ), where it does not depend on
     the origin. No target is needed, so A is known before the search.
     """
-    reference, camera, scales = objective.reference, objective.camera, objective.scales
-    points = reference.points
+    reference, plane, scales = objective.reference, objective.plane, objective.scales
+    points, facing = reference.points, reference.facing
     valid = (points.q > 0).astype(jnp.float32)
-    count = jnp.maximum(jnp.sum(valid), 1.0)
-    warped = Warped(points.x * camera.fx + camera.cx, points.y * camera.fy + camera.cy, points.q, valid)
-    tangent = jnp.asarray(GENERATORS)
-    zero = jnp.zeros_like(reference.grey)
-    grey = _jacobian(reference.grey_u, reference.grey_v, zero, warped, points, camera, tangent) * valid
-    curvature = grey @ grey.T / count
+    warped = Warped(points.x * plane.fx + plane.cx, points.y * plane.fy + plane.cy, points.q, valid)
+
+    def curvature(along_u: jax.Array, along_v: jax.Array, along_q: jax.Array) -> jax.Array:
+        jacobian = _jacobian(along_u, along_v, along_q, warped, points, plane, jnp.asarray(GENERATORS)) * valid
+        jacobian = jacobian.reshape(6, -1)
+        return jacobian @ jacobian.T / jnp.maximum(jnp.sum(valid), 1.0)
+
+    total = curvature(reference.grey_u, reference.grey_v, jnp.zeros_like(valid))
     if objective.use_depth:
-        depth = (
-            _jacobian(
-                reference.facing * reference.slope_u,
-                reference.facing * reference.slope_v,
-                -reference.facing,
-                warped,
-                points,
-                camera,
-                tangent,
-            )
-            * valid
-        )
-        curvature += scales.depth_weight * (scales.grey / scales.depth) ** 2 * (depth @ depth.T) / count
-    return curvature
+        depth = curvature(facing * reference.slope_u, facing * reference.slope_v, -facing)
+        total += scales.depth_weight * (scales.grey / scales.depth) ** 2 * depth
+    return total
 
 
 LARGEST_UNIT_STEP = 0.05
@@ -441,7 +599,9 @@ SMALLEST_DEPTH_SCALE = 5e-4
 """1/m: a tenth of the quantisation of a structured-light sensor."""
 
 
-def _independent_share(residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: int) -> jax.Array:
+def _independent_share(
+    residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: jax.Array | int
+) -> Float[Array, ""]:
     """Share of a channel's residuals that are independent witnesses, from their correlation between neighbours.
 
     n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ the correlation at lag one of the residuals as the
@@ -449,14 +609,15 @@ def _independent_share(residual: jax.Array, mask: jax.Array, scale: jax.Array, c
     surfaces err together: ρ is near 1 and the share falls to a few per cent.
     """
     weighted = mask * residual * 6.0 / (5.0 + (residual / scale) ** 2)
-    weighted, mask = weighted.reshape(-1, columns), mask.reshape(-1, columns)
+    place = jnp.arange(residual.shape[-1])
     share = jnp.float32(1.0)
-    for first, second, both in (
-        (weighted[:, :-1], weighted[:, 1:], mask[:, :-1] * mask[:, 1:]),
-        (weighted[:-1], weighted[1:], mask[:-1] * mask[1:]),
-    ):
-        product = jnp.sum(first * second)
-        power = 0.5 * jnp.sum(both * (first**2 + second**2))
+    for step, has_next in ((1, place % columns < columns - 1), (columns, True)):
+        following, following_mask = (
+            jnp.take(a, place + step, axis=-1, mode="fill", fill_value=0.0) for a in (weighted, mask)
+        )
+        both = mask * following_mask * has_next
+        product = jnp.sum(both * weighted * following)
+        power = 0.5 * jnp.sum(both * (weighted**2 + following**2))
         rho = jnp.clip(product / jnp.maximum(power, 1e-20), 0.0, 0.98)
         share *= (1.0 - rho) / (1.0 + rho)
     return share
@@ -513,9 +674,9 @@ GAIN_PRIOR = 100.0
 """Squared grey levels: the image contrast at which the estimated gain is half-way between 1 and the regression's."""
 
 
-def explained_variance(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Float[Array, ""]:
+def explained_variance(objective: Objective, residuals: Residuals) -> Float[Array, ""]:
     """Share of the reference's grey variance that the target explains, 1 at best; points in view only."""
-    r = objective.residuals(target_T_reference)
+    r = residuals
     count = jnp.maximum(jnp.sum(r.inside), 1.0)
     grey = objective.reference.grey
     mean = jnp.sum(r.inside * grey) / count

@@ -21,15 +21,17 @@ from gavo_jax.alignment import (
     AlignmentOptions,
     AlignmentStatus,
     View,
-    align_pyramids,
+    align_views,
     on_host,
+    prepare_reference,
+    prepare_target,
 )
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
-from gavo_jax.objective import make_reference, share_in_view
-from gavo_jax.presets import OdometryOptions, get_preset
+from gavo_jax.objective import Reference, share_in_view
+from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
 from gavo_jax.warp import exp, synchronise_depth
@@ -38,8 +40,8 @@ from gavo_jax.warp import exp, synchronise_depth
 class TrackerState(NamedTuple):
     """What stays on the device from frame to frame."""
 
-    previous: Pyramid
-    keyframe: Pyramid
+    previous: Reference
+    keyframe: Reference
     previous_T_keyframe: Float[Array, "4 4"]
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
@@ -91,24 +93,27 @@ def _track(
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
-    result = align_pyramids(views, target, camera, solver, alignment, key, guesses)
+    packed = prepare_target(target, solver)
+    result = align_views(views, packed, camera, solver, alignment, key, guesses)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
+    newest = prepare_reference(target, camera, solver, alignment)
     target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
-    coarse = camera.level(LEVELS - 1)
-    share = share_in_view(make_reference(state.keyframe[LEVELS - 1], coarse), target_T_keyframe, coarse)
+    coarsest = jax.tree.map(lambda leaf: leaf[0], state.keyframe)
+    share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
     renew = share < options.keyframe_overlap
     keyframe, target_T_keyframe = jax.tree.map(
-        lambda new, old: jnp.where(renew, new, old), (target, jnp.eye(4)), (state.keyframe, target_T_keyframe)
+        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
-    return TrackerState(target, keyframe, target_T_keyframe, result.xi, clock.elapsed), result
+    return TrackerState(newest, keyframe, target_T_keyframe, result.xi, clock.elapsed), result
 
 
 @jax.jit
-def _first_state(grey: Array, depth: Array, camera: Camera) -> TrackerState:
+def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignment: AlignmentOptions) -> TrackerState:
     """State after the first frame: it is both references, and nothing is known of the motion."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
-    return TrackerState(pyramid, pyramid, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
+    reference = prepare_reference(pyramid, camera, solver, alignment)
+    return TrackerState(reference, reference, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
 @dataclass(frozen=True)
@@ -224,7 +229,7 @@ class Odometry:
         )
 
     def _start(self, frame: Frame) -> TrackerState:
-        return _first_state(frame.grey, frame.depth, self.camera)
+        return _first_state(frame.grey, frame.depth, self.camera, self.solver, self.alignment)
 
     def _restart(self, frame: Frame) -> None:
         """Make a frame the only reference, standing where the camera is recorded to be."""
@@ -251,13 +256,23 @@ class Odometry:
         state_after, result = self._run(state, frame, clock, key)
         if result.status == AlignmentStatus.OK or not self.options.recover:
             return state_after, result
-        wide = get_preset("ga", "wide")
+        wide = self._wide()
         state_wide, second = self._run(
             state, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
         if second.status == AlignmentStatus.OK:
             return state_wide, second
         return state_after, result
+
+    def _wide(self) -> Preset:
+        """The wide search on the points that the references hold."""
+        wide = get_preset("ga", "wide")
+        iterations = tuple(n if k in self.solver.levels else 0 for k, n in enumerate(wide.solver.iterations))
+        return replace(
+            wide,
+            solver=replace(wide.solver, iterations=iterations),
+            alignment=replace(wide.alignment, points=self.alignment.points),
+        )
 
     def _run(
         self,

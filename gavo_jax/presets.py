@@ -53,7 +53,7 @@ PAPER_OBJECTIVE = AlignmentOptions(
     brightness=False,
     robust_scale=False,
     precondition=False,
-    cells=(1, 1, 1, 1, 1),
+    points=None,
     min_overlap=0.5,
     bounds=(0.06, 0.06),
     bounds_factor=0.5,
@@ -61,8 +61,6 @@ PAPER_OBJECTIVE = AlignmentOptions(
 """The paper's (2) on every pixel, ξ searched as it is. Left open there and fixed here: the bounds, ±6 cm and ±0.06 rad
 (3.4°) a gene about the guess at level 4, halved from level to level about the last level's best; a candidate must keep
 half of the points in view."""
-
-FAST_CELLS = (4, 4, 2, 1, 1)
 
 
 def _paper_solver(method: str) -> Any:
@@ -95,7 +93,7 @@ def _paper_solver(method: str) -> Any:
 _DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": GaussNewton(), "adam": GradientDescent()}
 
 _FAST = {
-    "ga": GeneticAlgorithm(population=(0, 12, 14, 20, 48), iterations=(0, 6, 6, 8, 10)),
+    "ga": GeneticAlgorithm(population=(0, 16, 16, 24, 48), iterations=(0, 5, 5, 7, 10)),
     "pso": ParticleSwarm(population=(0, 12, 16, 20, 32), iterations=(0, 8, 10, 12, 16)),
     "gauss-newton": GaussNewton(iterations=(0, 6, 8, 10, 12), patience=2),
     "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),
@@ -147,7 +145,7 @@ def get_preset(method: str = "ga", name: str = "default") -> Preset:
     if name == "default":
         return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
     if name == "fast":
-        return Preset(_FAST[method], AlignmentOptions(cells=FAST_CELLS), OdometryOptions())
+        return Preset(_FAST[method], AlignmentOptions(), OdometryOptions())
     if name == "wide":
         return Preset(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
     raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")

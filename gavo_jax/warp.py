@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, Integer, UInt32
 
 from gavo_jax.camera import Camera
 
@@ -64,6 +64,35 @@ class Points(NamedTuple):
     """Inverse depth, 1/m; 0 marks a point without a reading."""
 
 
+class ImagePlane(NamedTuple):
+    """Intrinsics and place of a pyramid level as numbers that a program takes as input, so that one compiled program
+    serves every level.
+    """
+
+    fx: Float[Array, ""]
+    fy: Float[Array, ""]
+    cx: Float[Array, ""]
+    cy: Float[Array, ""]
+    width: Integer[Array, ""]
+    height: Integer[Array, ""]
+    offset: Integer[Array, ""]
+    """Of the level's first pixel in the packed target."""
+
+
+def image_planes(camera: Camera, levels: tuple[int, ...]) -> ImagePlane:
+    """Planes of some levels, [L], one after the other in the packed target."""
+    cameras = [camera.level(level) for level in levels]
+    sizes = [c.width * c.height for c in cameras]
+    offsets = [sum(sizes[:i]) for i in range(len(sizes))]
+    columns = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height, o) for c, o in zip(cameras, offsets, strict=True)]
+    return ImagePlane(*(jnp.stack([jnp.asarray(entry) for entry in column]) for column in zip(*columns, strict=True)))
+
+
+def image_plane(camera: Camera) -> ImagePlane:
+    """The plane of one image that is packed alone."""
+    return jax.tree.map(lambda leaf: leaf[0], image_planes(camera, (0,)))
+
+
 class Warped(NamedTuple):
     """Reference points seen by the target camera."""
 
@@ -108,15 +137,15 @@ def synchronise_depth(
 
 
 class Target(NamedTuple):
-    """A level of the target frame, packed for sampling with one gather a channel."""
+    """Levels of the target frame, packed for sampling with one gather a channel; flat, level after level."""
 
-    grey: UInt32[Array, "h w"]
+    grey: UInt32[Array, " m"]
     """Four 8-bit grey levels of the 2x2 block that starts at the pixel: (v, u), (v, u+1), (v+1, u), (v+1, u+1)."""
-    depth: UInt32[Array, "h w"]
+    depth: UInt32[Array, " m"]
     """16 bits of inverse depth (0 = no reading) and its slopes along u and v, 8 bits each."""
 
 
-def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera) -> Warped:
+def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera | ImagePlane) -> Warped:
     """ω(ξ, p) for every reference point, equations (4) to (8), for one motion."""
     r, t = target_T_reference[:3, :3], target_T_reference[:3, 3]
     x, y, q = points
@@ -171,35 +200,45 @@ def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
     return value | (slope(along_u) << 16) | (slope(along_v) << 24)
 
 
-def pack_target(grey: Float[Array, "h w"], inverse_depth: Float[Array, "h w"]) -> Target:
-    """Pack a pyramid level for sampling."""
-    return Target(pack_grey(grey), pack_depth(inverse_depth))
+def pack_target(*levels: tuple[Float[Array, "h w"], Float[Array, "h w"]]) -> Target:
+    """Pack levels of a frame, each its grey and inverse depth, for sampling."""
+    packed = [(pack_grey(grey).reshape(-1), pack_depth(inverse_depth).reshape(-1)) for grey, inverse_depth in levels]
+    return Target(*(jnp.concatenate(channel) for channel in zip(*packed, strict=True)))
+
+
+class Words(NamedTuple):
+    """What the target holds at the warped points' pixels: a packed word a channel, [*n]."""
+
+    grey: UInt32[Array, "*n"]
+    depth: UInt32[Array, "*n"]
+
+
+def look_up(target: Target, warped: Warped, plane: ImagePlane) -> Words:
+    """Read the target at the pixel left of and above each warped point; pixel 0 for those that land outside.
+
+    The barrier keeps XLA from reading a word anew for each of its bytes (`benchmarks/kernel.py`).
+    """
+    pixel = plane.offset + warped.v.astype(jnp.int32) * plane.width + warped.u.astype(jnp.int32)
+    pixel = jnp.where(warped.inside > 0, pixel, 0)
+    return jax.lax.optimization_barrier(Words(*(channel.at[pixel].get(mode="promise_in_bounds") for channel in target)))
+
+
+class GreySample(NamedTuple):
+    """Bilinear intensity at the warped points and its exact derivative along u and v (grey levels a pixel)."""
+
+    value: Float[Array, "*n"]
+    along_u: Float[Array, "*n"]
+    along_v: Float[Array, "*n"]
 
 
 def _byte(word: jax.Array, shift: int) -> jax.Array:
     return ((word >> shift) & 255).astype(jnp.int32).astype(jnp.float32)
 
 
-def _take(packed: UInt32[Array, "h w"], row: jax.Array, column: jax.Array, inside: jax.Array) -> jax.Array:
-    index = jnp.where(inside > 0, row * packed.shape[1] + column, 0)
-    return packed.reshape(-1).at[index].get(mode="promise_in_bounds")
-
-
-class GreySample(NamedTuple):
-    """Bilinear intensity at the warped points and its exact derivative along u and v (grey levels a pixel)."""
-
-    value: Float[Array, " n"]
-    along_u: Float[Array, " n"]
-    along_v: Float[Array, " n"]
-
-
-def sample_grey(packed: UInt32[Array, "h w"], warped: Warped) -> GreySample:
-    """I_{t+1}(ω(ξ, p)), bilinear; anything outside the image samples pixel 0 and must be masked by `inside`."""
-    u, v = warped.u, warped.v
-    column, row = u.astype(jnp.int32), v.astype(jnp.int32)
-    a, b = u - column.astype(jnp.float32), v - row.astype(jnp.float32)
-    word = _take(packed, row, column, warped.inside)
-    top_left, top_right, low_left, low_right = _byte(word, 0), _byte(word, 8), _byte(word, 16), _byte(word, 24)
+def sample_grey(words: Words, warped: Warped) -> GreySample:
+    """I_{t+1}(ω(ξ, p)), bilinear; what lies outside the image is meaningless and must be masked by `inside`."""
+    a, b = warped.u - jnp.floor(warped.u), warped.v - jnp.floor(warped.v)
+    top_left, top_right, low_left, low_right = (_byte(words.grey, shift) for shift in (0, 8, 16, 24))
     top = top_left + a * (top_right - top_left)
     low = low_left + a * (low_right - low_left)
     along_u = (top_right - top_left) + b * ((low_right - low_left) - (top_right - top_left))
@@ -209,18 +248,16 @@ def sample_grey(packed: UInt32[Array, "h w"], warped: Warped) -> GreySample:
 class DepthSample(NamedTuple):
     """Inverse depth at the warped points (1/m), its slopes (1/m a pixel), and whether there is a reading (0 or 1)."""
 
-    value: Float[Array, " n"]
-    along_u: Float[Array, " n"]
-    along_v: Float[Array, " n"]
-    valid: Float[Array, " n"]
+    value: Float[Array, "*n"]
+    along_u: Float[Array, "*n"]
+    along_v: Float[Array, "*n"]
+    valid: Float[Array, "*n"]
 
 
-def sample_depth(packed: UInt32[Array, "h w"], warped: Warped) -> DepthSample:
-    """Inverse depth of the target's surface at the warped points, from the nearest pixel's plane."""
-    column, row = (warped.u + 0.5).astype(jnp.int32), (warped.v + 0.5).astype(jnp.int32)
-    word = _take(packed, row, column, warped.inside)
-    value = (word & 65535).astype(jnp.int32).astype(jnp.float32) * INVERSE_DEPTH_STEP
-    along_u = (_byte(word, 16) - 128.0) * SLOPE_STEP
-    along_v = (_byte(word, 24) - 128.0) * SLOPE_STEP
-    plane = value + along_u * (warped.u - column.astype(jnp.float32)) + along_v * (warped.v - row.astype(jnp.float32))
-    return DepthSample(plane, along_u, along_v, (value > 0).astype(jnp.float32))
+def sample_depth(words: Words, warped: Warped) -> DepthSample:
+    """Inverse depth of the target's surface at the warped points, from the plane of the pixel that was looked up."""
+    value = (words.depth & 65535).astype(jnp.int32).astype(jnp.float32) * INVERSE_DEPTH_STEP
+    along_u = (_byte(words.depth, 16) - 128.0) * SLOPE_STEP
+    along_v = (_byte(words.depth, 24) - 128.0) * SLOPE_STEP
+    a, b = warped.u - jnp.floor(warped.u), warped.v - jnp.floor(warped.v)
+    return DepthSample(value + along_u * a + along_v * b, along_u, along_v, (value > 0).astype(jnp.float32))

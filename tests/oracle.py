@@ -69,8 +69,8 @@ class Terms(NamedTuple):
 def residuals(pair: Pair, target_T_reference: np.ndarray, gain: float = 1.0, bias: float = 0.0) -> Terms:
     """Equation (1) point by point, and the depth residual as `gavo_jax.objective` defines it.
 
-    The depth residual is the difference in inverse depth between the target's surface (the plane of the nearest pixel)
-    and the point, times the cosine of the reference surface's inclination.
+    The depth residual is the difference in inverse depth between the target's surface (the plane of the pixel left of
+    and above the point) and the point, times the cosine of the reference surface's inclination.
     """
     camera = pair.camera
     q_target = np.rint(pair.target_inverse_depth / INVERSE_DEPTH_STEP) * INVERSE_DEPTH_STEP
@@ -95,8 +95,7 @@ def residuals(pair: Pair, target_T_reference: np.ndarray, gain: float = 1.0, bia
         (top_left, top_right), (low_left, low_right) = pair.target_grey[row : row + 2, column : column + 2]
         top, low = (1 - a) * top_left + a * top_right, (1 - a) * low_left + a * low_right
         grey.append((1 - b) * top + b * low - (gain * pair.reference_grey[v, u] + bias))
-        column, row = int(u_t + 0.5), int(v_t + 0.5)
-        margins += [abs(u_t % 1 - 0.5), abs(v_t % 1 - 0.5)]
+        margins += [abs(u_t - round(u_t)), abs(v_t - round(v_t))]
         if q_target[row, column] > 0:
             surface = q_target[row, column]
             surface += slopes[0][row, column] * (u_t - column) + slopes[1][row, column] * (v_t - row)
@@ -106,9 +105,13 @@ def residuals(pair: Pair, target_T_reference: np.ndarray, gain: float = 1.0, bia
 
 
 def error(terms: Terms, loss: str, grey_scale: float, depth_scale: float, depth_weight: float) -> float:
-    """E: σ² times the mean of ρ((r/σ)²) over the points inside (2), plus the weighted mean over the depth residuals."""
+    """E: σ² times the mean cost of the points inside (2): ρ of the grey residual plus the weighted ρ of the depth
+    residual, which is ρ(1) where the target has no reading."""
     rho = LOSSES[loss]
-    result = grey_scale**2 * np.mean(rho((terms.grey / grey_scale) ** 2)) if len(terms.grey) else 0.0
-    if depth_weight and len(terms.depth):
-        result += grey_scale**2 * depth_weight * np.mean(rho((terms.depth / depth_scale) ** 2))
-    return float(result)
+    if not len(terms.grey):
+        return 0.0
+    total = np.sum(rho((terms.grey / grey_scale) ** 2))
+    if depth_weight:
+        missing = len(terms.grey) - len(terms.depth)
+        total += depth_weight * (np.sum(rho((terms.depth / depth_scale) ** 2)) + missing * rho(np.array(1.0)))
+    return float(grey_scale**2 * total / len(terms.grey))

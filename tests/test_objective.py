@@ -21,7 +21,6 @@ from gavo_jax.objective import (
     Problem,
     Reference,
     Scales,
-    concatenate_references,
     estimate_brightness,
     estimate_scales,
     explained_variance,
@@ -37,7 +36,7 @@ from gavo_jax.pyramid import PyramidLevel
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.particle_swarm import ParticleSwarm
-from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, exp, pack_target
+from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, exp, image_plane, pack_target
 
 SMALL = Camera(24.0, 23.0, 11.3, 8.8, 24, 18)
 CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)
@@ -66,7 +65,7 @@ def build(
     min_overlap: float = 0.0,
     gain: float = 1.0,
     bias: float = 0.0,
-    outside_cost: float | None = None,
+    outside_cost: float = 0.0,
 ) -> Objective:
     """The objective of a pair; scales are those of grey and depth, and the depth weight. Without them: (2)."""
     reference, target = prepare(pair.camera, *(image.astype(np.float32) for image in pair[1:]))
@@ -76,13 +75,13 @@ def build(
     return Objective(
         reference,
         target,
-        pair.camera,
+        image_plane(pair.camera),
         values,
         jnp.float32(min_overlap),
-        loss,
-        use_depth,
+        jnp.float32(outside_cost),
         columns=pair.camera.width,
-        outside_cost=None if outside_cost is None else jnp.float32(outside_cost),
+        loss=loss,
+        use_depth=use_depth,
     )
 
 
@@ -92,13 +91,14 @@ def prepare(
 ) -> tuple[Reference, Target]:
     """What the objective keeps of either frame."""
     reference = make_reference(PyramidLevel(grey, inverse_depth), camera)
-    return reference, pack_target(target_grey, target_inverse_depth)
+    return reference, pack_target((target_grey, target_inverse_depth))
 
 
 jit_error = jax.jit(lambda objective, motion: objective.error(motion))
 jit_score = jax.jit(lambda objective, motions: objective.score(motions))
 jit_problem_score = jax.jit(lambda problem, x: problem.score(x))
-jit_scales, jit_brightness, jit_explained = map(jax.jit, (estimate_scales, estimate_brightness, explained_variance))
+jit_scales, jit_brightness = map(jax.jit, (estimate_scales, estimate_brightness))
+jit_explained = jax.jit(lambda objective, motion: explained_variance(objective, objective.residuals(motion)))
 jit_linearize = jax.jit(lambda problem, x: problem.linearize(x))
 
 # metres and radians that move a point of SMALL by a few pixels
@@ -212,15 +212,54 @@ def test_a_population_scores_as_its_members() -> None:
     np.testing.assert_allclose(overlap, [o for _, o in members], rtol=1e-6)
 
 
-def test_candidate_after_candidate_or_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_way_to_score_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
     objective = build(random_pair(5), student_t, (20.0, 0.02, 0.3))
-    motions = random_motions(16)
-    results = []
-    for threshold in (0, 10**9):
-        monkeypatch.setattr(objective_module, "MAP_FROM_POINTS", threshold)
-        results.append(jax.jit(lambda objective, motions: objective.score(motions))(objective, motions))
-    np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-5)
-    np.testing.assert_allclose(results[0][1], results[1][1], rtol=1e-6)
+    motions = random_motions(21)
+    expected = objective_module._score_side_by_side(objective, motions, jnp.ones(21, bool))
+    # 432 points: all at once, in chunks that fit, and in chunks with a rest
+    for group, chunk in ((8, 432), (4, 108), (32, 100)):
+        monkeypatch.setattr(objective_module, "GROUP", group)
+        monkeypatch.setattr(objective_module, "CHUNK", chunk)
+        for result, value in zip(jax.jit(lambda o, m: o.score(m))(objective, motions), expected, strict=True):
+            np.testing.assert_allclose(result, value, rtol=1e-5)
+
+
+def test_only_what_counts_is_scored() -> None:
+    objective = build(random_pair(5), student_t, (20.0, 0.02, 0.3))
+    motions = random_motions(19)
+    counted = np.random.default_rng(0).random(19) < 0.4
+    every, _ = jit_score(objective, motions)
+    some, _ = jax.jit(lambda o, m, c: o.score(m, c))(objective, motions, counted)
+    np.testing.assert_allclose(some, np.where(counted, every, np.inf), rtol=1e-6)
+    none, _ = jax.jit(lambda o, m, c: o.score(m, c))(objective, motions, np.zeros(19, bool))
+    np.testing.assert_array_equal(none, np.inf)
+
+
+def test_points_beyond_the_count_are_left_out() -> None:
+    pair = random_pair(5)
+    objective = build(pair, student_t, (20.0, 0.02, 0.3))
+    shorter = jax.tree.map(lambda leaf: leaf[:240], objective.reference)
+    longer = jax.tree.map(lambda leaf: jnp.pad(leaf, (0, 200)), shorter)
+    motions = random_motions(9)
+    expected, _ = jit_score(replace(objective, reference=shorter), motions)
+    found, _ = jit_score(replace(objective, reference=longer, count=jnp.int32(240)), motions)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_populations_side_by_side_are_one() -> None:
+    objective = build(random_pair(5), student_t, (20.0, 0.02, 0.3))
+    motions = random_motions(24).reshape(4, 6, 4, 4)
+    expected = [jit_score(objective, population)[0] for population in motions]
+    together = jax.jit(jax.vmap(lambda o, m: o.score(m)[0], in_axes=(None, 0)))(objective, motions)
+    np.testing.assert_allclose(together, np.stack(expected), rtol=1e-5)
+    gains = jnp.array([0.9, 1.0, 1.1, 1.2])
+
+    def brighter(gain: jax.Array, motions: jax.Array) -> jax.Array:
+        reference = objective.reference._replace(grey=gain * objective.reference.grey)
+        return replace(objective, reference=reference).score(motions)[0]
+
+    several = jax.jit(jax.vmap(brighter))(gains, motions)
+    np.testing.assert_allclose(several, [brighter(g, m) for g, m in zip(gains, motions, strict=True)], rtol=1e-5)
 
 
 @pytest.mark.parametrize("cell", [2, 3])
@@ -273,7 +312,8 @@ def test_two_references_score_as_the_mean_over_both_their_points() -> None:
     pairs[1] = pairs[1]._replace(target_grey=pairs[0].target_grey)
     objectives = [build(pair) for pair in pairs]
     motion = random_motions(1)[0]
-    together = replace(objectives[0], reference=concatenate_references([o.reference for o in objectives]))
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(o.reference for o in objectives))
+    together = replace(objectives[0], reference=views)
     counts = [float(jnp.sum(o.residuals(motion).inside)) for o in objectives]
     expected = np.average([float(jit_error(o, motion)[0]) for o in objectives], weights=counts)
     assert float(jit_error(together, motion)[0]) == pytest.approx(expected, rel=1e-5)
@@ -470,7 +510,7 @@ def test_jit_explained() -> None:
 def test_gradient_scatter_is_a_covariance() -> None:
     noise = np.random.default_rng(4).normal(0, 3, (48, 64))
     problem = Problem(build(noisy_pair(noise), student_t, (3.0, 0.01, 0.3)), jnp.eye(4), jnp.eye(6))
-    scatter = np.asarray(problem.gradient_scatter(jnp.zeros(6)), float)
+    scatter = np.asarray(problem.examine(jnp.zeros(6))[1], float)
     np.testing.assert_allclose(scatter, scatter.T, rtol=1e-4, atol=1e-4 * np.abs(scatter).max())
     assert np.linalg.eigvalsh(scatter).min() > -1e-5 * np.linalg.eigvalsh(scatter).max()
     assert np.linalg.eigvalsh(scatter).max() > 0
@@ -531,6 +571,6 @@ def warped_back(target_T_reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def test_objective_is_a_value() -> None:
     objective = build(random_pair(0), partial(jnp.minimum, 4.0))
     leaves, structure = jax.tree.flatten(objective)
-    assert all(isinstance(leaf, jax.Array | float) for leaf in leaves)
+    assert all(isinstance(leaf, jax.Array | float | int) for leaf in leaves)
     again = jax.tree.unflatten(structure, leaves)
     assert isinstance(again.reference, Reference) and again.loss is objective.loss

@@ -16,12 +16,17 @@ from gavo_jax.warp import (
     GENERATORS,
     INVERSE_DEPTH_STEP,
     SLOPE_STEP,
+    DepthSample,
+    GreySample,
     Points,
+    Target,
     Warped,
+    Words,
     exp,
+    image_plane,
     inverse_depth_slopes,
     log,
-    pack_depth,
+    look_up,
     pack_grey,
     pack_target,
     right_jacobian,
@@ -50,7 +55,21 @@ def hat(xi: np.ndarray) -> np.ndarray:
 
 jit_exp, jit_log, jit_jacobian = jax.jit(exp), jax.jit(log), jax.jit(right_jacobian)
 jit_warp = jax.jit(warp)
-pack_and_sample = jax.jit(lambda image, warped: sample_grey(pack_grey(image), warped))
+
+
+def words_of(target: Target, warped: Warped, height: int, width: int) -> Words:
+    return look_up(target, warped, image_plane(Camera(1.0, 1.0, 0.0, 0.0, width, height)))
+
+
+@jax.jit
+def pack_and_sample(image: jax.Array, warped: Warped) -> GreySample:
+    return sample_grey(words_of(pack_target((image, jnp.zeros_like(image))), warped, *image.shape), warped)
+
+
+@jax.jit
+def pack_and_sample_depth(inverse_depth: jax.Array, warped: Warped) -> DepthSample:
+    target = pack_target((jnp.zeros_like(inverse_depth), inverse_depth))
+    return sample_depth(words_of(target, warped, *inverse_depth.shape), warped)
 
 
 @given(twists(1.7))
@@ -168,11 +187,11 @@ def test_packing_rounds_to_the_nearest_grey_level_and_saturates() -> None:
 
 
 def test_a_point_outside_samples_something_finite() -> None:
-    image = pack_target(jnp.full((48, 64), 9.0), jnp.full((48, 64), 0.5))
     far = jnp.array([-1e9, 1e9, 1e30, -5.0], jnp.float32)
     warped = Warped(far, far, jnp.ones(4), jnp.zeros(4))
-    assert np.isfinite(sample_grey(image.grey, warped).value).shape == (4,)
-    assert sample_depth(image.depth, warped).value.shape == (4,)
+    assert pack_and_sample(jnp.full((48, 64), 9.0), warped).value.shape == (4,)
+    words = words_of(pack_target((jnp.full((48, 64), 9.0), jnp.full((48, 64), 0.5))), warped, 48, 64)
+    assert np.unique(words.grey).size == 1 and np.unique(words.depth).size == 1
 
 
 def plane(a: float, b: float, c: float) -> np.ndarray:
@@ -208,7 +227,7 @@ def test_a_lonely_reading_has_no_slope() -> None:
 def test_packed_depth_samples_a_plane_between_its_pixels() -> None:
     inverse_depth = plane(0.5, 4 * SLOPE_STEP, -7 * SLOPE_STEP)
     u, v, warped = random_samples(3)
-    sample = sample_depth(pack_depth(jnp.asarray(inverse_depth)), warped)
+    sample = pack_and_sample_depth(jnp.asarray(inverse_depth), warped)
     exact = 0.5 + 4 * SLOPE_STEP * u - 7 * SLOPE_STEP * v
     np.testing.assert_allclose(sample.value, exact, atol=0.6 * INVERSE_DEPTH_STEP)
     np.testing.assert_allclose(sample.along_u, 4 * SLOPE_STEP)
@@ -220,8 +239,8 @@ def test_packed_depth_knows_missing_readings() -> None:
     inverse_depth = plane(0.5, 0, 0)
     inverse_depth[:, 20:40] = 0
     u, _, warped = random_samples(4)
-    valid = sample_depth(pack_depth(jnp.asarray(inverse_depth)), warped).valid
-    column = np.floor(u + 0.5)
+    valid = pack_and_sample_depth(jnp.asarray(inverse_depth), warped).valid
+    column = np.floor(u)
     np.testing.assert_array_equal(np.asarray(valid) == 0, (column >= 20) & (column < 40))
 
 

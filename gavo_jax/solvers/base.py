@@ -1,6 +1,6 @@
 """The solver protocol and the one loop that runs every solver on a pyramid level."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, Self
 
 import jax
@@ -16,7 +16,7 @@ def static(default: Any) -> Any:
 
 
 Schedule = Any
-"""A tuple with an entry a pyramid level, level 0 first; a plain number once `at_level` has picked a level's entry."""
+"""A tuple with an entry a pyramid level, level 0 first, or one number for all."""
 
 
 class Bounds(NamedTuple):
@@ -44,7 +44,9 @@ class Solver(Protocol):
     """A frozen dataclass pytree of hyperparameters.
 
     Sizes (population, iterations) are static, every rate is a leaf: a sweep over rates is one `vmap` and never
-    recompiles. A field that is a tuple holds one entry a pyramid level, level 0 first; `at_level` picks.
+    recompiles. A field that is a tuple holds one entry a pyramid level, level 0 first. One compiled program serves
+    every level, so arrays are made for the largest entry and what counts on a level is a number in the program:
+    `PerLevel` brings what that needs.
     """
 
     @property
@@ -57,8 +59,17 @@ class Solver(Protocol):
         """Iterations without a better candidate after which a level ends."""
         ...
 
-    def at_level(self, level: int) -> Self:
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """Levels with at least one iteration, coarsest first."""
+        ...
+
+    def at_level(self, level: Integer[Array, ""] | int) -> Self:
         """The solver of one pyramid level."""
+        ...
+
+    def here(self, schedule: Schedule) -> Any:
+        """Entry of a schedule for that level."""
         ...
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> Any:
@@ -81,20 +92,35 @@ class Solver(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PerLevel:
     """Base of the solvers: resolves fields that hold an entry a level."""
 
-    def at_level(self, level: int) -> Self:
-        """The same solver with every per-level tuple replaced by its entry for `level`."""
-        entries = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: v[level] for name, v in entries.items() if isinstance(v, tuple)})
+    level: Integer[Array, ""] | int = field(default=0, repr=False)
+    """The level that is being searched; an input of the compiled program."""
+
+    def at_level(self, level: Integer[Array, ""] | int) -> Self:
+        """The same solver on one level."""
+        return replace(self, level=level)
+
+    def here(self, schedule: Schedule) -> Any:
+        """Entry of a schedule for the present level."""
+        if not isinstance(schedule, tuple):
+            return schedule
+        if isinstance(self.level, int):
+            return schedule[self.level]
+        return jnp.stack([jnp.asarray(entry) for entry in schedule])[self.level]
 
     @property
     def levels(self) -> tuple[int, ...]:
         """Levels with at least one iteration, coarsest first."""
         iterations: tuple[int, ...] = self.iterations  # pyright: ignore[reportAttributeAccessIssue]
         return tuple(k for k in reversed(range(len(iterations))) if iterations[k] > 0)
+
+
+def largest(schedule: Schedule) -> int:
+    """Largest entry of a static schedule: the size of the arrays that serve every level."""
+    return max(schedule) if isinstance(schedule, tuple) else schedule
 
 
 class Solution(NamedTuple):
@@ -119,41 +145,23 @@ def solve(
     guess: Float[Array, "g 6"],
     bounds: Bounds,
 ) -> Solution:
-    """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen.
-
-    With `patience` of at least `iterations` the loop is a `lax.scan`; below, a `lax.while_loop` that really stops.
-    """
+    """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen."""
     init_key, loop_key = jax.random.split(key)
     state = solver.init(init_key, problem, guess, bounds)
-    iterations = solver.iterations
-    keys = jax.random.split(loop_key, iterations)
+    iterations = solver.here(solver.iterations)
 
-    def iterate(state: Any, best: Best, step_key: PRNGKeyArray) -> tuple[Any, Best, jax.Array]:
-        state = solver.step(step_key, state, problem)
+    def go_on(carry: tuple[Any, ...]) -> jax.Array:
+        return (carry[2] < iterations) & (carry[3] < solver.patience)
+
+    def iterate(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        state, best, count, stale, history = carry
+        state = solver.step(jax.random.fold_in(loop_key, count), state, problem)
         new = solver.best(state)
-        better = new.error < best.error
         progress = new.error < best.error * (1.0 - STAGNATION)
-        return state, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best), progress
+        best = jax.tree.map(lambda a, b: jnp.where(new.error < best.error, a, b), new, best)
+        return state, best, count + 1, jnp.where(progress, 0, stale + 1), history.at[count].set(best.error)
 
-    best = solver.best(state)
-    if solver.patience >= iterations:
-
-        def body(carry: tuple[Any, Best], step_key: PRNGKeyArray) -> tuple[tuple[Any, Best], jax.Array]:
-            state, best, _ = iterate(*carry, step_key)
-            return (state, best), best.error
-
-        (state, best), history = jax.lax.scan(body, (state, best), keys)
-        count = jnp.int32(iterations)
-    else:
-
-        def go_on(carry: tuple[Any, ...]) -> jax.Array:
-            return (carry[2] < iterations) & (carry[3] < solver.patience)
-
-        def turn(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            state, best, count, stale, history = carry
-            state, best, progress = iterate(state, best, keys[count])
-            return state, best, count + 1, jnp.where(progress, 0, stale + 1), history.at[count].set(best.error)
-
-        start = (state, best, jnp.int32(0), jnp.int32(0), jnp.full(iterations, jnp.nan))
-        state, best, count, _, history = jax.lax.while_loop(go_on, turn, start)
+    history = jnp.full(largest(solver.iterations), jnp.nan)
+    start = (state, solver.best(state), jnp.int32(0), jnp.int32(0), history)
+    state, best, count, _, history = jax.lax.while_loop(go_on, iterate, start)
     return Solution(best.x, best.error, history, count, solver.candidates(state))

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer, PRNGKeyArray
 
 from gavo_jax.objective import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
 
 
 class GeneticState(NamedTuple):
@@ -41,7 +41,7 @@ class GeneticAlgorithm(PerLevel):
         population: Chromosomes (static, an entry a level).
         iterations: Largest number of generations (static, an entry a level; 0 skips the level).
         patience: Generations without progress that end a level (static).
-        mutants: Share of the offspring that are mutants, 0.3 in the paper (static); the rest are crossed.
+        mutants: Share of the offspring that are mutants, 0.3 in the paper; the rest are crossed.
         surrogate: Whether one offspring is bred from a quadratic fit to the population (static).
         spread: Standard deviation of the first population about the guess, search units, an entry a level; None
             draws it uniformly within the bounds (9).
@@ -56,7 +56,7 @@ class GeneticAlgorithm(PerLevel):
     population: Schedule = static((0, 16, 20, 24, 64))
     iterations: Schedule = static((0, 8, 8, 10, 12))
     patience: int = static(1000)
-    mutants: float = static(0.3)
+    mutants: float = 0.3
     surrogate: bool = static(True)
     spread: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
     mutation_step: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
@@ -68,26 +68,35 @@ class GeneticAlgorithm(PerLevel):
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GeneticState:
         """First population (9)."""
         del problem
-        x = first_candidates(key, self.population, self.spread, guess, bounds)
+        places = largest(self.population)
+        x = first_candidates(key, places, self.here(self.spread), guess, bounds)
         step = self.mutation_rate * (bounds.upper - bounds.lower)
         if self.mutation_step is not None:
-            step = jnp.full(6, self.mutation_step)
-        return GeneticState(x, jnp.full(self.population, jnp.inf), x, step, bounds)
+            step = jnp.full(6, self.here(self.mutation_step))
+        return GeneticState(x, jnp.full(places, jnp.inf), x, step, bounds)
 
     def step(self, key: PRNGKeyArray, state: GeneticState, problem: Problem) -> GeneticState:
-        """One generation: evaluate the newcomers, keep the best (14), then select, cross and mutate."""
-        new_error, _ = problem.score(state.offspring)
+        """One generation: evaluate the newcomers, keep the best (14), then select, cross and mutate.
+
+        Places beyond the level's population stay empty: their error is +inf, and the wheel never draws them.
+        """
+        places, population = state.error.shape[0], self.here(self.population)
+        present = jnp.arange(places) < population
+        new_error, _ = problem.score(state.offspring, present)
         x = jnp.concatenate([state.population, state.offspring])
         error = jnp.concatenate([state.error, new_error])
-        keep = jnp.argsort(error)[: self.population]
-        state = state._replace(population=x[keep], error=error[keep])
+        keep = jnp.argsort(error)[:places]
+        state = state._replace(population=x[keep], error=jnp.where(present, error[keep], jnp.inf))
         cross_key, mutate_key = jax.random.split(key)
-        mutants = round(self.mutants * self.population)
-        crossed = self.population - mutants - self.surrogate
-        offspring = [self._cross(cross_key, state, crossed), self._mutate(mutate_key, state, mutants)]
+        last = population - 1
+        mutants = jnp.round(self.mutants * jnp.float32(population)).astype(jnp.int32)
+        own = jnp.arange(places)[:, None]
+        offspring = jnp.where(
+            own > last - int(self.surrogate) - mutants, self._mutate(mutate_key, state), self._cross(cross_key, state)
+        )
         if self.surrogate:
-            offspring.append(surrogate_minimum(state.population, state.error)[None])
-        new = jnp.clip(jnp.concatenate(offspring), state.bounds.lower, state.bounds.upper)
+            offspring = jnp.where(own == last, surrogate_minimum(state.population, state.error), offspring)
+        new = jnp.clip(offspring, state.bounds.lower, state.bounds.upper)
         return state._replace(offspring=new, mutation_step=state.mutation_step * self.mutation_decay)
 
     def best(self, state: GeneticState) -> Best:
@@ -105,26 +114,27 @@ class GeneticAlgorithm(PerLevel):
         draws = jax.random.uniform(key, (count,)) * wheel[-1]
         return jnp.minimum(jnp.searchsorted(wheel, draws), error.shape[0] - 1)
 
-    def _cross(self, key: PRNGKeyArray, state: GeneticState, count: int) -> Float[Array, "n 6"]:
+    def _cross(self, key: PRNGKeyArray, state: GeneticState) -> Float[Array, "p 6"]:
         """Intermediate crossover with an extra range (13): a + α (b − a), α drawn for every gene."""
+        places = state.error.shape[0]
         select_key, alpha_key = jax.random.split(key)
-        parents = state.population[self._select(select_key, state.error, 2 * count)]
-        first, second = parents[:count], parents[count:]
+        parents = state.population[self._select(select_key, state.error, 2 * places)]
+        first, second = parents[:places], parents[places:]
         width = self.crossover_range
         alpha = -width + (1.0 + 2.0 * width) * jax.random.uniform(alpha_key, first.shape)
         return first + alpha * (second - first)
 
-    def _mutate(self, key: PRNGKeyArray, state: GeneticState, count: int) -> Float[Array, "n 6"]:
+    def _mutate(self, key: PRNGKeyArray, state: GeneticState) -> Float[Array, "p 6"]:
         """Mutation (12): ξ' = ξ + δ randn, of chromosomes drawn by the wheel."""
         select_key, noise_key = jax.random.split(key)
-        chosen = state.population[self._select(select_key, state.error, count)]
+        chosen = state.population[self._select(select_key, state.error, state.error.shape[0])]
         return chosen + state.mutation_step * jax.random.normal(noise_key, chosen.shape)
 
 
 def first_candidates(
     key: PRNGKeyArray,
     count: int,
-    spread: float | tuple[float, ...] | None,
+    spread: Float[Array, ""] | float | None,
     guess: Float[Array, "g 6"],
     bounds: Bounds,
 ) -> Float[Array, "p 6"]:
@@ -133,7 +143,7 @@ def first_candidates(
     if spread is None:
         x = bounds.lower + (bounds.upper - bounds.lower) * jax.random.uniform(key, (count, 6))
     else:
-        x = about + jnp.asarray(spread) * jax.random.normal(key, (count, 6))
+        x = about + spread * jax.random.normal(key, (count, 6))
     kept = jnp.arange(count)[:, None] < guess.shape[0]
     return jnp.clip(jnp.where(kept, about, x), bounds.lower, bounds.upper)
 

@@ -49,7 +49,9 @@ class GradientDescent(PerLevel):
         """The first guess."""
         del key, problem
         x, unknown = guess[0], jnp.float32(jnp.inf)
-        return GradientState(x, unknown, x, self.optimizer(1.0).init(x), jnp.float32(self.learning_rate), bounds)
+        return GradientState(
+            x, unknown, x, self.optimizer(1.0).init(x), jnp.float32(self.here(self.learning_rate)), bounds
+        )
 
     def step(self, key: PRNGKeyArray, state: GradientState, problem: Problem) -> GradientState:
         """Evaluate the iterate and take one step of the optimiser, scaled by the decaying rate."""

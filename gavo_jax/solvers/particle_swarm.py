@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
 from gavo_jax.solvers.genetic import first_candidates
 
 
@@ -52,14 +52,19 @@ class ParticleSwarm(PerLevel):
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> SwarmState:
         """Particles about the guesses, at rest."""
         del problem
-        x = first_candidates(key, self.population, self.spread, guess, bounds)
-        width = bounds.upper - bounds.lower if self.spread is None else jnp.full(6, 6.0 * self.spread)
-        unknown = jnp.full(self.population, jnp.inf)
+        places, spread = largest(self.population), self.here(self.spread)
+        x = first_candidates(key, places, spread, guess, bounds)
+        width = bounds.upper - bounds.lower if spread is None else jnp.full(6, 6.0 * spread)
+        unknown = jnp.full(places, jnp.inf)
         return SwarmState(x, jnp.zeros_like(x), x, unknown, bounds, self.velocity_clamp * width)
 
     def step(self, key: PRNGKeyArray, state: SwarmState, problem: Problem) -> SwarmState:
-        """Evaluate the particles, then move each once; one that meets a bound stops there."""
-        error, _ = problem.score(state.x)
+        """Evaluate the particles, then move each once; one that meets a bound stops there.
+
+        Places beyond the level's population stay empty: their error is +inf.
+        """
+        present = jnp.arange(state.x.shape[0]) < self.here(self.population)
+        error, _ = problem.score(state.x, present)
         better = error < state.memory_error
         memory = jnp.where(better[:, None], state.x, state.memory)
         memory_error = jnp.where(better, error, state.memory_error)

@@ -36,13 +36,13 @@ class Quadratic:
     box: Bounds = cube(math.inf)
     blind_below: float = -math.inf
 
-    def score(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Errors and overlaps of [p, 6]."""
+    def score(self, x: jax.Array, counted: jax.Array | bool = True) -> tuple[jax.Array, jax.Array]:
+        """Errors and overlaps of [p, 6]; those that are not counted have an error of +inf."""
         offset = x - self.centre[None]
         error = self.floor + jnp.sum((offset @ self.curvature) * offset, axis=1)
         outside = jnp.any((x < self.box.lower[None]) | (x > self.box.upper[None]), axis=1)
         error = jnp.where(x[:, 0] < self.blind_below, jnp.inf, jnp.where(outside, -1e6, error))
-        return error, jnp.ones_like(error)
+        return jnp.where(counted, error, jnp.inf), jnp.ones_like(error)
 
     def linearize(self, x: jax.Array) -> Linearization:
         """E, its gradient and Hessian at [6]."""
@@ -57,10 +57,10 @@ class Given:
 
     errors: jax.Array
 
-    def score(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Errors and overlaps of [p, 6]."""
+    def score(self, x: jax.Array, counted: jax.Array | bool = True) -> tuple[jax.Array, jax.Array]:
+        """Errors and overlaps of [p, 6]; those that are not counted have an error of +inf."""
         error = self.errors[jnp.clip(jnp.round(x[:, 0]), 0, self.errors.shape[0] - 1).astype(jnp.int32)]
-        return error, jnp.ones_like(error)
+        return jnp.where(counted, error, jnp.inf), jnp.ones_like(error)
 
 
 def bowl(seed: int = 0, spread: float = 3.0, reach: float = 1.5) -> Quadratic:

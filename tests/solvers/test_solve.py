@@ -146,7 +146,8 @@ def test_rates_are_inputs_of_one_program(name: str) -> None:
 
     solver, problem = SOLVERS[name].at_level(0), bowl()
     for factor in (1.0, 0.9, 0.8):
-        assert np.isfinite(program(jax.tree.map(lambda leaf, factor=factor: leaf * factor, solver)))
+        scaled = jax.tree.map(lambda leaf, factor=factor: leaf * factor, solver)
+        assert np.isfinite(program(replace(scaled, level=0)))
     assert len(jax.tree.leaves(solver)) > 0
     assert len(traces) == 1
 
@@ -162,7 +163,7 @@ RATES = {
 @pytest.mark.parametrize("name", RATES)
 def test_a_sweep_over_a_rate_is_one_vmap(name: str) -> None:
     solver, problem = SOLVERS[name].at_level(0), bowl(seed=6, spread=4.0)
-    own = getattr(solver, RATES[name])
+    own = solver.here(getattr(solver, RATES[name]))
     rates = own * jnp.array([0.5, 0.8, 1.0])
 
     def final(rate: jax.Array) -> jax.Array:
@@ -198,5 +199,12 @@ def test_levels_pick_their_entries() -> None:
     solver = GeneticAlgorithm(population=(2, 4, 8), iterations=(0, 5, 6), spread=(1.0, 2.0, 3.0), mutation_step=None)
     assert solver.levels == (2, 1)
     at = solver.at_level(1)
-    assert (at.population, at.iterations, at.spread, at.mutation_step) == (4, 5, 2.0, None)
+    assert [at.here(entry) for entry in (at.population, at.iterations, at.spread, at.mutation_step)] == [
+        4,
+        5,
+        2.0,
+        None,
+    ]
+    traced = jax.jit(lambda level: solver.at_level(level).here(solver.spread))
+    assert [float(traced(level)) for level in range(3)] == [1.0, 2.0, 3.0]
     assert GaussNewton(iterations=(1, 0, 3)).levels == (2, 0)
