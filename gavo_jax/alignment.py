@@ -36,7 +36,7 @@ from gavo_jax.objective import (
     student_t,
 )
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
-from gavo_jax.solvers.base import Bounds, solve, static
+from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.warp import exp, log, pack_target
 
@@ -222,6 +222,18 @@ def _best_guess(
     return guesses[best], jax.tree.map(lambda leaf: leaf[best], objectives)
 
 
+class Population(NamedTuple):
+    """The candidates of one level's search, iteration after iteration, for people to look at."""
+
+    xi: Float[Array, "iterations p 6"]
+    """Twists of target_T_reference (m, rad); those of all islands. NaN from the iteration that stagnation left out."""
+    error: Float[Array, "iterations p"]
+    """E, squared grey levels; +inf where a candidate is worthless."""
+    centre: Float[Array, " 6"]
+    """Twist that the search is held about, and `half_widths` of the box it is held in."""
+    half_widths: Float[Array, " 6"]
+
+
 def align_pyramids(
     views: tuple[View, ...],
     target: Pyramid,
@@ -230,7 +242,8 @@ def align_pyramids(
     options: AlignmentOptions,
     key: PRNGKeyArray,
     guesses: Float[Array, "g 4 4"],
-) -> Alignment:
+    record: bool = False,
+) -> tuple[Alignment, tuple[Population, ...]]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
     Args:
@@ -241,10 +254,15 @@ def align_pyramids(
         options: What is minimised.
         key: Random key.
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
+        record: Whether the candidates are kept (static).
+
+    Returns:
+        The alignment and, where they were recorded, the candidates of each level of `solver.levels`.
     """
     box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
     islands, centre, objective = guesses, guesses[0], None
     histories: list[jax.Array] = []
+    populations: list[Population] = []
     for level in solver.levels:
         first, count = not histories, options.islands[level]
         make_objective = partial(
@@ -261,17 +279,26 @@ def align_pyramids(
             origins = jnp.repeat(leader[None], count, axis=0)
         centre = leader if first else centre
         search = partial(
-            _search_island, Problem(objective, leader, basis, centre), solver.at_level(level), options, box
+            _search_island, Problem(objective, leader, basis, centre), solver.at_level(level), options, box, record
         )
         if count == 1:
-            islands, errors, history = jax.tree.map(lambda a: a[None], search(level_key, origins[0]))
+            found = jax.tree.map(lambda a: a[None], search(level_key, origins[0]))
         else:
-            islands, errors, history = jax.vmap(search)(jax.random.split(level_key, count), origins)
+            found = jax.vmap(search)(jax.random.split(level_key, count), origins)
+        islands, errors, history, trail = found
+        if trail is not None:
+            populations.append(_population(trail, centre if options.precondition else leader, box))
         histories.append(history[jnp.argmin(errors)])
         islands = islands[_best_distinct(islands, errors, count)]
         box = box * options.bounds_factor
     assert objective is not None, "the solver has no level with an iteration"
-    return _conclude(objective, islands[0], options, jnp.concatenate(histories))
+    return _conclude(objective, islands[0], options, jnp.concatenate(histories)), tuple(populations)
+
+
+def _population(trail: Candidates, centre: Float[Array, "4 4"], box: Float[Array, " 6"]) -> Population:
+    """Candidates of all islands, [islands, iterations, P, …], side by side, as twists."""
+    motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
+    return Population(log(motions), error, log(centre), box)
 
 
 def _search_island(
@@ -279,10 +306,11 @@ def _search_island(
     solver: Any,
     options: AlignmentOptions,
     box: Float[Array, " 6"],
+    record: bool,
     key: PRNGKeyArray,
     origin: Float[Array, "4 4"],
-) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"]]:
-    """Search one level from one origin."""
+) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
+    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]))
         reach = jnp.abs(jnp.linalg.inv(problem.basis)) @ box
@@ -292,8 +320,11 @@ def _search_island(
         problem = replace(problem, origin=jnp.eye(4))
         bounds = Bounds(log(origin) - box, log(origin) + box)
         guess = log(origin)[None]
-    solution = solve(key, solver, problem, guess, bounds)
-    return problem.transform(solution.x), solution.error, solution.history
+    solution = solve(key, solver, problem, guess, bounds, record)
+    trail = solution.trail
+    if trail is not None:
+        trail = trail._replace(x=problem.transform(trail.x))
+    return problem.transform(solution.x), solution.error, solution.history, trail
 
 
 NICHE = (0.08, 0.08)
@@ -383,7 +414,7 @@ def _align_images(
 ) -> Alignment:
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale, LEVELS) for image in (reference, target)]
     view = View(pyramids[0], jnp.eye(4))
-    return align_pyramids((view,), pyramids[1], camera, solver, options, key, guess[None])
+    return align_pyramids((view,), pyramids[1], camera, solver, options, key, guess[None])[0]
 
 
 @jax.jit

@@ -20,6 +20,7 @@ from gavo_jax.alignment import (
     Alignment,
     AlignmentOptions,
     AlignmentStatus,
+    Population,
     View,
     align_pyramids,
     on_host,
@@ -67,7 +68,7 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
     return tuple(levels)
 
 
-@partial(jax.jit, static_argnames=("options",))
+@partial(jax.jit, static_argnames=("options", "record"))
 def _track(
     state: TrackerState,
     grey: Array,
@@ -78,7 +79,8 @@ def _track(
     solver: Any,
     alignment: AlignmentOptions,
     options: OdometryOptions,
-) -> tuple[TrackerState, Alignment]:
+    record: bool,
+) -> tuple[TrackerState, Alignment, tuple[Population, ...]]:
     """One frame: pyramid, alignment with the references, and the state for the next frame."""
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     predicted = state.motion * (clock.elapsed / state.seconds)
@@ -91,7 +93,7 @@ def _track(
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
-    result = align_pyramids(views, target, camera, solver, alignment, key, guesses)
+    result, populations = align_pyramids(views, target, camera, solver, alignment, key, guesses, record)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
     target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
@@ -101,7 +103,7 @@ def _track(
     keyframe, target_T_keyframe = jax.tree.map(
         lambda new, old: jnp.where(renew, new, old), (target, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
-    return TrackerState(target, keyframe, target_T_keyframe, result.xi, clock.elapsed), result
+    return TrackerState(target, keyframe, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
 
 @jax.jit
@@ -156,6 +158,7 @@ class Odometry:
         alignment: What is minimised.
         options: How the driver uses it.
         seed: Every random number follows from it.
+        record: Whether every frame's candidates are kept until the next frame, for people to look at.
     """
 
     def __init__(
@@ -165,12 +168,16 @@ class Odometry:
         alignment: AlignmentOptions | None = None,
         options: OdometryOptions | None = None,
         seed: int = 0,
+        record: bool = False,
     ):
         preset = get_preset()
         self.camera = camera
         self.solver = preset.solver if solver is None else solver
         self.alignment = preset.alignment if alignment is None else alignment
         self.options = preset.odometry if options is None else options
+        self.record = record
+        self.populations: tuple[Population, ...] = ()
+        """Candidates of the last frame's search, an entry a level, coarsest first; empty unless they are recorded."""
         self._key = jax.random.key(seed)
         self._state: TrackerState | None = None
         self._index = -1
@@ -201,6 +208,7 @@ class Odometry:
             FrameError: There is no first frame to start from.
         """
         self._index += 1
+        self.populations = ()
         if self._state is None:
             if frame is None:
                 raise FrameError("the first frame could not be read")
@@ -271,8 +279,8 @@ class Odometry:
     ) -> tuple[TrackerState, Alignment]:
         solver, alignment = solver or self.solver, alignment or self.alignment
         options = options or self.options
-        state, result = _track(
-            state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options)
+        state, result, self.populations = _track(
+            state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options), self.record
         )
         return state, on_host(result)
 
@@ -291,6 +299,10 @@ def _rigid(transform: Float[Array | np.ndarray, "4 4"]) -> Float64[np.ndarray, "
     return result
 
 
+def _unwatched(frame: Frame | None, step: Step | None) -> None:
+    """Nobody looks."""
+
+
 def track(
     sequence: Sequence,
     solver: Any = None,
@@ -298,11 +310,13 @@ def track(
     options: OdometryOptions | None = None,
     seed: int = 0,
     odometry: Odometry | None = None,
+    watch: Callable[[Frame | None, Step | None], None] = _unwatched,
 ) -> Iterator[Step]:
     """Stream a sequence: a step for every frame after the first, as it is done.
 
     The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
-    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one. `watch` is shown
+    every frame (None: it could not be read) with its step (None: it is the first).
 
     Raises:
         FrameError: The first frame cannot be read.
@@ -325,7 +339,9 @@ def track(
             if isinstance(frame, FrameError) and index == 0:
                 raise frame
             stamp = float(sequence.timestamps[index])
-            step = odometry.register(None if isinstance(frame, FrameError) else frame, stamp)
+            readable = None if isinstance(frame, FrameError) else frame
+            step = odometry.register(readable, stamp)
+            watch(readable, step)
             if step is not None:
                 yield step
                 if step.lost and odometry.options.on_lost == "stop":

@@ -106,6 +106,9 @@ class Solution(NamedTuple):
     """Best error after each iteration; NaN from the one that the stagnation stop left out."""
     iterations: Integer[Array, ""]
     candidates: Candidates
+    trail: Candidates | None = None
+    """All candidates after each iteration, where they were recorded: x [iterations, P, 6], error [iterations, P]; NaN
+    like `history`."""
 
 
 STAGNATION = 1e-4
@@ -118,10 +121,12 @@ def solve(
     problem: Problem,
     guess: Float[Array, "g 6"],
     bounds: Bounds,
+    record: bool = False,
 ) -> Solution:
     """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen.
 
     With `patience` of at least `iterations` the loop is a `lax.scan`; below, a `lax.while_loop` that really stops.
+    With `record` (static) the candidates of every iteration are kept for people to look at.
     """
     init_key, loop_key = jax.random.split(key)
     state = solver.init(init_key, problem, guess, bounds)
@@ -138,11 +143,11 @@ def solve(
     best = solver.best(state)
     if solver.patience >= iterations:
 
-        def body(carry: tuple[Any, Best], step_key: PRNGKeyArray) -> tuple[tuple[Any, Best], jax.Array]:
+        def body(carry: tuple[Any, Best], step_key: PRNGKeyArray) -> tuple[tuple[Any, Best], Any]:
             state, best, _ = iterate(*carry, step_key)
-            return (state, best), best.error
+            return (state, best), (best.error, solver.candidates(state) if record else None)
 
-        (state, best), history = jax.lax.scan(body, (state, best), keys)
+        (state, best), (history, trail) = jax.lax.scan(body, (state, best), keys)
         count = jnp.int32(iterations)
     else:
 
@@ -150,10 +155,16 @@ def solve(
             return (carry[2] < iterations) & (carry[3] < solver.patience)
 
         def turn(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            state, best, count, stale, history = carry
+            state, best, count, stale, logs = carry
             state, best, progress = iterate(state, best, keys[count])
-            return state, best, count + 1, jnp.where(progress, 0, stale + 1), history.at[count].set(best.error)
+            entries = (best.error, solver.candidates(state) if record else None)
+            logs = jax.tree.map(lambda log, entry: log.at[count].set(entry), logs, entries)
+            return state, best, count + 1, jnp.where(progress, 0, stale + 1), logs
 
-        start = (state, best, jnp.int32(0), jnp.int32(0), jnp.full(iterations, jnp.nan))
-        state, best, count, _, history = jax.lax.while_loop(go_on, turn, start)
-    return Solution(best.x, best.error, history, count, solver.candidates(state))
+        def empty(entry: jax.Array) -> jax.Array:
+            return jnp.full((iterations, *entry.shape), jnp.nan)
+
+        logs = jax.tree.map(empty, (best.error, solver.candidates(state) if record else None))
+        start = (state, best, jnp.int32(0), jnp.int32(0), logs)
+        state, best, count, _, (history, trail) = jax.lax.while_loop(go_on, turn, start)
+    return Solution(best.x, best.error, history, count, solver.candidates(state), trail)
