@@ -68,7 +68,7 @@ def final_errors(
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale) for image in (reference, target)]
     views = (View(pyramids[0], jnp.eye(4)),)
     found, descended = (
-        align_pyramids(views, pyramids[1], camera, solver, options, key, jnp.eye(4)[None]).target_T_reference
+        align_pyramids(views, pyramids[1], camera, solver, options, key, jnp.eye(4)[None])[0].target_T_reference
         for solver in (genetic, gauss_newton)
     )
     objective = level_objective(views, pyramids[1], camera, min(genetic.levels), found, options, options.brightness)

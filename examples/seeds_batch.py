@@ -29,7 +29,7 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     def final_error(key: jax.Array, decay: jax.Array, reference: Pyramid, target: Pyramid) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
         views = (View(reference, still),)
-        return align_pyramids(views, target, camera, solver, gavo.AlignmentOptions(), key, still[None]).error
+        return align_pyramids(views, target, camera, solver, gavo.AlignmentOptions(), key, still[None])[0].error
 
     over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
     over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))

@@ -225,6 +225,7 @@ def _best_guess(
 class Population(NamedTuple):
     """The candidates of one level's search, iteration after iteration, for people to look at."""
 
+    level: Integer[Array, ""]
     xi: Float[Array, "iterations p 6"]
     """Twists of target_T_reference (m, rad); those of all islands. NaN from the iteration that stagnation left out."""
     error: Float[Array, "iterations p"]
@@ -287,7 +288,7 @@ def align_pyramids(
             found = jax.vmap(search)(jax.random.split(level_key, count), origins)
         islands, errors, history, trail = found
         if trail is not None:
-            populations.append(_population(trail, centre if options.precondition else leader, box))
+            populations.append(_population(level, trail, centre if options.precondition else leader, box))
         histories.append(history[jnp.argmin(errors)])
         islands = islands[_best_distinct(islands, errors, count)]
         box = box * options.bounds_factor
@@ -295,10 +296,10 @@ def align_pyramids(
     return _conclude(objective, islands[0], options, jnp.concatenate(histories)), tuple(populations)
 
 
-def _population(trail: Candidates, centre: Float[Array, "4 4"], box: Float[Array, " 6"]) -> Population:
+def _population(level: int, trail: Candidates, centre: Float[Array, "4 4"], box: Float[Array, " 6"]) -> Population:
     """Candidates of all islands, [islands, iterations, P, …], side by side, as twists."""
     motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
-    return Population(log(motions), error, log(centre), box)
+    return Population(jnp.int32(level), log(motions), error, log(centre), box)
 
 
 def _search_island(

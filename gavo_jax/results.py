@@ -23,6 +23,8 @@ from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row, write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+RECORDING = "run.rrd"
+"""What `--viewer save` writes."""
 TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
 
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
@@ -59,7 +61,7 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES)
+        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES, RECORDING)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
         try:

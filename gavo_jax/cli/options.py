@@ -50,6 +50,8 @@ class Run(Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    viewer: Literal["none", "spawn", "web", "save"] = "none"
+    """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 

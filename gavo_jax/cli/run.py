@@ -15,7 +15,8 @@ from gavo_jax.cli.tracking import INTERRUPTED, draw, track_visibly
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry import Odometry
 from gavo_jax.presets import Preset, get_preset
-from gavo_jax.results import RunFolder, environment
+from gavo_jax.results import RECORDING, RunFolder, environment
+from gavo_jax.viewer import make_viewer
 
 LOST = 3
 """Exit status where a pair was lost and `--strict` asked to know."""
@@ -41,11 +42,21 @@ def run(options: Run) -> int:
     preset = _effective_preset(options)
     sequence = open_sequence(options)
     name = f"{sequence.name}-{options.method}-{options.preset}"
+    path = options.output or Path("runs") / name
+    viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
-    with RunFolder(options.output or Path("runs") / name) as folder:
+    with RunFolder(path) as folder, viewer:
         folder.start(_config(options, preset, sequence), float(sequence.timestamps[0]))
-        odometry = Odometry(sequence.camera, preset.solver, preset.alignment, preset.odometry, options.seed)
-        tracked = track_visibly(name, sequence, odometry, folder.add)
+        viewer.open(name, sequence)
+        odometry = Odometry(
+            sequence.camera,
+            preset.solver,
+            preset.alignment,
+            preset.odometry,
+            options.seed,
+            record=viewer.wants_populations,
+        )
+        tracked = track_visibly(name, sequence, odometry, folder.add, viewer)
         metrics = {
             "sequence": sequence.name,
             "method": options.method,
@@ -57,6 +68,7 @@ def run(options: Run) -> int:
         draw(folder.path, {options.method: tracked.trajectory}, sequence.ground_truth)
         folder.finish(metrics)
     _report(name, metrics, folder.path)
+    viewer.stay()
     if tracked.interrupted:
         return INTERRUPTED
     return LOST if options.strict and metrics["lost_pairs"] else 0

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 
 from gavo_jax import plots
 from gavo_jax.cli.screen import pair_progress
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import distance_error
 from gavo_jax.odometry import Odometry, Step, compute_metrics, track, trajectory_of
 from gavo_jax.results import DISTANCE_FIGURE, TRAJECTORY_FIGURE
 from gavo_jax.trajectory import Trajectory
+from gavo_jax.viewer import NO_VIEWER, Viewer
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -30,9 +31,13 @@ class Tracked(NamedTuple):
 
 
 def track_visibly(
-    label: str, sequence: Sequence, odometry: Odometry, on_step: Callable[[Step], None] | None = None
+    label: str,
+    sequence: Sequence,
+    odometry: Odometry,
+    on_step: Callable[[Step], None] | None = None,
+    viewer: Viewer = NO_VIEWER,
 ) -> Tracked:
-    """Compile, then track every frame under a progress bar.
+    """Compile, then track every frame under a progress bar and before a viewer's eyes.
 
     Raises:
         KeyboardInterrupt: the user stopped it before the first pair was done.
@@ -40,11 +45,15 @@ def track_visibly(
     pairs = len(sequence) - 1
     steps: list[Step] = []
     interrupted = False
+
+    def watch(frame: Frame | None, step: Step | None) -> None:
+        viewer.watch(frame, step, odometry.populations)
+
     with pair_progress(label, pairs) as bar:
         compile_seconds = odometry.warm_up()
         start = time.perf_counter()
         try:
-            for step in track(sequence, odometry=odometry):
+            for step in track(sequence, odometry=odometry, watch=watch):
                 if on_step is not None:
                     on_step(step)
                 steps.append(step)
