@@ -24,10 +24,10 @@ from jaxtyping import Bool, Float, Float64, UInt8
 
 from gavo_jax.alignment import Population
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Step
-from gavo_jax.trajectory import inverse
+from gavo_jax.trajectory import Trajectory, inverse
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -63,8 +63,15 @@ class Viewer:
     wants_populations: bool = False
     """Whether `watch` makes anything of the candidates."""
 
-    def open(self, title: str, sequence: Sequence) -> None:
-        """Begin to show the run of a sequence."""
+    def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
+        """Begin to show a run.
+
+        Args:
+            title: its name.
+            camera: of the frames, without distortion.
+            stamps: of all frames, seconds.
+            truth: the true trajectory, where it is known.
+        """
 
     def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
         """Show one more frame.
@@ -123,7 +130,7 @@ class RerunViewer(Viewer):
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
 
-    def open(self, title: str, sequence: Sequence) -> None:
+    def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         """Open window, server or file, send the layout, and start the thread.
 
         Raises:
@@ -138,7 +145,7 @@ class RerunViewer(Viewer):
         stream.send_recording_name(title)
         stream.send_blueprint(make_blueprint())
         self._stream = stream
-        self._thread = threading.Thread(target=self._work, args=(Scene(stream, sequence),), daemon=True)
+        self._thread = threading.Thread(target=self._work, args=(Scene(stream, camera, stamps, truth),), daemon=True)
         self._thread.start()
 
     def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
@@ -266,15 +273,17 @@ def make_blueprint() -> Blueprint:
 class Scene:
     """Turns frames, steps and populations into what Rerun shows; remembers what a segment or a warp starts from."""
 
-    def __init__(self, stream: RecordingStream, sequence: Sequence) -> None:
+    def __init__(
+        self, stream: RecordingStream, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None
+    ) -> None:
         import rerun
 
         self._rr, self._stream = rerun, stream
-        self._camera = shown_camera(sequence.camera)
-        self._shrink = sequence.camera.width // self._camera.width
-        self._depth_scale = sequence.camera.depth_scale
+        self._camera = shown_camera(camera)
+        self._shrink = camera.width // self._camera.width
+        self._depth_scale = camera.depth_scale
         self._rays = rays(self._camera)
-        self._truth = Truth(sequence)
+        self._truth = Truth(stamps, truth)
         self._frame, self._generation = 0, 0
         self._world_T_camera = np.eye(4)
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
@@ -433,12 +442,12 @@ class Shown(NamedTuple):
 class Truth:
     """Where the camera was, in the estimate's world: the first pose that is known is laid on the estimate's."""
 
-    def __init__(self, sequence: Sequence) -> None:
-        self._stamps = sequence.timestamps
+    def __init__(self, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
+        self._stamps = stamps
         self._truth_T_camera = np.zeros((len(self._stamps), 4, 4))
         self._known = np.zeros(len(self._stamps), bool)
-        if sequence.ground_truth is not None:
-            self._truth_T_camera, self._known = sequence.ground_truth.interpolate(self._stamps)
+        if truth is not None:
+            self._truth_T_camera, self._known = truth.interpolate(stamps)
         self._world_T_truth: Float64[np.ndarray, "4 4"] | None = None
 
     def at(self, index: int, world_T_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:

@@ -73,6 +73,16 @@ class Compare(Source):
 
 
 @dataclass(frozen=True)
+class View:
+    """Look at a finished run: its trajectory, curves and, where the sequence is still there, images and truth."""
+
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The output folder of `gavo run`."""
+    viewer: Literal["spawn", "web", "save"] = "web"
+    """As in `gavo run`; save writes view.rrd into DIR."""
+
+
+@dataclass(frozen=True)
 class Align:
     """Align one pair of RGB-D images and print the motion as JSON."""
 
@@ -111,6 +121,7 @@ class Evaluate:
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Align, subcommand("align")]
     | Annotated[Evaluate, subcommand("evaluate")]
 )

@@ -47,7 +47,7 @@ def run(options: Run) -> int:
     enable_compilation_cache()
     with RunFolder(path) as folder, viewer:
         folder.start(_config(options, preset, sequence), float(sequence.timestamps[0]))
-        viewer.open(name, sequence)
+        viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
         odometry = Odometry(
             sequence.camera,
             preset.solver,
