@@ -1,4 +1,4 @@
-"""A report that is one file: tables, figures, configuration and versions as HTML that needs neither network nor script."""
+"""A report that is one file: tables, figures, configuration and versions as HTML, without network or script."""
 
 import base64
 import html

@@ -19,6 +19,7 @@ import numpy as np
 from gavo_jax.alignment import AlignmentStatus
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry import Step, no_alignment
+from gavo_jax.plots import CAPTIONS as FIGURES
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
 from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines
 from gavo_jax.version import __version__
@@ -26,7 +27,8 @@ from gavo_jax.version import __version__
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""
-TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
+VIEW = "view.rrd"
+"""What `gavo view --viewer save` writes."""
 
 STAMP_TOLERANCE = 1e-6
 """Seconds: stamps of the files are rounded to microseconds."""
@@ -65,7 +67,7 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES, RECORDING)
+        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
         try:
@@ -257,8 +259,7 @@ def remove_figures(folder: Path) -> None:
     Raises:
         GavoError: one cannot be removed.
     """
-    stems = (TRAJECTORY_FIGURE, DISTANCE_FIGURE)
-    remove_files(folder, *(f"{stem}.{suffix}" for stem in stems for suffix in FIGURE_FORMATS))
+    remove_files(folder, *(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -53,7 +53,8 @@ MEMORY = "512MiB"
 GRPC_PORT, WEB_PORT = 9876, 9090
 """Where the web viewer is found, unless something else is there."""
 
-BLUE, WHITE, VERMILION, GREEN, DARK = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115), (24, 26, 32)
+BLUE, WHITE, VERMILION, GREEN = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115)
+GREY, DARK = (120, 120, 120), (24, 26, 32)
 """Okabe and Ito's colours; blue is best, or below."""
 
 
@@ -329,7 +330,9 @@ class Scene:
             ("curves/distance_error", VERMILION, "distance error"),
         ):
             log(path, rr.SeriesLines(colors=[color], widths=[2], names=[name]), static=True)
-        last = rr.Points3D([[0, 0, 0]], radii=[rr.Radius.ui_points(5)], colors=[WHITE], labels=["last camera"], show_labels=False)
+        last = rr.Points3D(
+            [[0, 0, 0]], radii=[rr.Radius.ui_points(5)], colors=[WHITE], labels=["last camera"], show_labels=False
+        )
         log("search/last_camera", last, static=True)
 
     def _shrunk(self, frame: Frame) -> Shown:
@@ -379,14 +382,13 @@ class Scene:
         reference = next((s for s in reversed(self._shown) if s.timestamp == step.reference_timestamp), None)
         if shown is None or reference is None:
             return
-        warped, seen = warp_target(reference, shown, step.alignment.target_T_reference, self._camera, self._rays)
+        motion = np.asarray(step.alignment.target_T_reference)
+        warped, seen = warp_target(reference, shown, motion, self._camera, self._rays)
         log("images/reference", self._image(reference.grey))
         log("images/warped", self._image(warped))
         log("images/residual", self._image(color_residual(warped, reference.grey, seen)))
 
-    def _send_search(
-        self, populations: tuple[Population, ...], motion: Float64[np.ndarray, "4 4"] | None
-    ) -> int:
+    def _send_search(self, populations: tuple[Population, ...], motion: Float64[np.ndarray, "4 4"] | None) -> int:
         """Send every generation of a frame, each entity's in one call; return how many there are."""
         generations = [g for population in populations for g in generations_of(population)]
         if not generations:
@@ -408,7 +410,7 @@ class Scene:
         boxes = rr.Boxes3D.columns(
             centers=[g.centre for g in generations],
             half_sizes=[g.half_sizes for g in generations],
-            colors=np.tile(np.uint8([(120, 120, 120)]), (count, 1)),
+            colors=[GREY] * count,
         )
         send("search/bounds", boxes)
         if motion is None:
@@ -419,7 +421,7 @@ class Scene:
         arrows = rr.Arrows3D.columns(
             origins=best,
             vectors=true - best,
-            colors=np.tile(np.uint8([VERMILION]), (count, 1)),
+            colors=[VERMILION] * count,
             radii=np.full(count, -1.5),
             labels=[f"error {error:.1f} mm" for error in errors],
         )
@@ -467,8 +469,8 @@ class Truth:
 
 
 KEY = (
-    "Particles: blue is best. White: the last camera. Green star: the true next one. Arrow: error of the best particle. "
-    "Step through a search on the time line `generation`."
+    "Particles: blue is best. White: the last camera. Green star: the true next one. Arrow: error of the best "
+    "particle. Step through a search on the time line `generation`."
 )
 
 
@@ -507,7 +509,8 @@ def generations_of(population: Population) -> list[Generation]:
         for i in range(iterations)
     ]
     return [
-        Generation(*each, centre, half_sizes, text) for *each, text in zip(positions, colors, texts, strict=True)
+        Generation(place, color, centre, half_sizes, text)
+        for place, color, text in zip(positions, colors, texts, strict=True)
     ]
 
 

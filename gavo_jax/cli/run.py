@@ -11,7 +11,7 @@ from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, open_sequence
-from gavo_jax.cli.tracking import INTERRUPTED, draw, track_visibly
+from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry import Odometry
 from gavo_jax.presets import Preset, get_preset
@@ -66,6 +66,7 @@ def run(options: Run) -> int:
             **tracked.metrics,
         }
         draw(folder.path, {options.method: tracked.trajectory}, sequence.ground_truth)
+        draw_search(folder.path, sequence, odometry, tracked.steps)
         folder.finish(metrics)
     _report(name, metrics, folder.path)
     viewer.stay()
@@ -85,9 +86,14 @@ def _effective_preset(options: Run) -> Preset:
 
 
 def _config(options: Run, preset: Preset, sequence: Sequence) -> dict[str, Any]:
-    """Return what config.json says: enough to repeat the run and to know what it did."""
+    """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
+    places = {
+        name: str(Path(place).resolve())
+        for name, place in (("sequence", options.sequence), ("camera", options.camera))
+        if Path(place).exists()
+    }
     return {
-        "options": options,
+        "options": replace(options, **places),
         "sequence": {
             "name": sequence.name,
             "frames": len(sequence),

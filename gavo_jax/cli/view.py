@@ -11,11 +11,8 @@ from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.results import CONFIG, STAMP_TOLERANCE, RecordedRun, read_run
+from gavo_jax.results import CONFIG, STAMP_TOLERANCE, VIEW, RecordedRun, read_run
 from gavo_jax.viewer import make_viewer
-
-VIEW = "view.rrd"
-"""What `--viewer save` writes: beside the recording of the run itself, which holds the populations, too."""
 
 
 def view(options: View) -> int:
@@ -51,9 +48,7 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
         except (KeyError, TypeError) as error:
             raise GavoError(f"{folder / CONFIG}: does not name the sequence: {error}") from None
         stamps = run.trajectory.timestamps
-        if len(sequence) < len(stamps) or np.any(
-            np.abs(sequence.timestamps[: len(stamps)] - stamps) > STAMP_TOLERANCE
-        ):
+        if len(sequence) < len(stamps) or np.any(np.abs(sequence.timestamps[: len(stamps)] - stamps) > STAMP_TOLERANCE):
             raise GavoError(f"{source.sequence}: holds other frames than those of the run")
         return sequence
     except GavoError as error:
