@@ -17,6 +17,7 @@ from collections import deque
 from pathlib import Path
 from queue import Queue
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -193,7 +194,7 @@ class RerunViewer(Viewer):
                 address = stream.serve_grpc(grpc_port=_free_port(GRPC_PORT), server_memory_limit=MEMORY)
                 port = _free_port(WEB_PORT)
                 rerun.serve_web_viewer(web_port=port, open_browser=True, connect_to=address)
-                self.url = f"http://127.0.0.1:{port}/?url={address.replace(':', '%3A').replace('/', '%2F')}"
+                self.url = f"http://127.0.0.1:{port}/?url={quote(address, safe='')}"
                 print(f"viewer at {self.url}", file=sys.stderr, flush=True)
         except (OSError, RuntimeError) as error:
             where = f"{self.recording}: cannot be written" if self.mode == "save" else f"--viewer {self.mode}"
@@ -225,7 +226,10 @@ def _free_port(wanted: int) -> int:
 
 
 def make_blueprint() -> Blueprint:
-    """Return the layout: search space, trajectories, state and curves above, the four images below."""
+    """Return the layout: search space, trajectories, state and curves above, the four images below.
+
+    On the time line `frame` the particles of all generations of a frame are shown at once, on `generation` one's.
+    """
     import rerun.blueprint as layout
 
     everything = [
@@ -234,11 +238,20 @@ def make_blueprint() -> Blueprint:
         )
         for timeline in ("frame", "generation")
     ]
+    now = [
+        layout.VisibleTimeRange(
+            timeline,
+            start=layout.TimeRangeBoundary.cursor_relative(seq=0),
+            end=layout.TimeRangeBoundary.cursor_relative(seq=0),
+        )
+        for timeline in ("frame", "generation")
+    ]
     search = layout.Spatial3DView(
         origin="search",
         name="Search space (mm)",
         background=DARK,
         eye_controls=layout.EyeControls3D(position=(30, -30, -50), look_target=(0, 0, 0), eye_up=(0, -1, 0)),
+        overrides={"search/particles": layout.VisibleTimeRanges(now)},
     )
     world = layout.Spatial3DView(
         origin="world",
@@ -426,7 +439,7 @@ class Scene:
             labels=[f"error {error:.1f} mm" for error in errors],
         )
         send("search/error", arrows)
-        size = max(0.1 * float(np.linalg.norm(true)), 1.0)
+        size = max(0.05 * float(np.linalg.norm(true)), 0.5)
         star = rr.LineStrips3D(star_strips(true, size), colors=[GREEN], radii=rr.Radius.ui_points(2))
         self._stream.log("search/truth", star)
         return count
