@@ -7,12 +7,16 @@ from frame to frame, for the evolution of the populations inside a frame.
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
+import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
+import webbrowser
 from collections import deque
 from pathlib import Path
 from queue import Queue
@@ -51,8 +55,10 @@ WAITING_FRAMES = 4
 """Frames that wait to be shown before the run waits for them."""
 MEMORY = "512MiB"
 """What the server of the web viewer keeps for browsers that come later."""
-GRPC_PORT, WEB_PORT = 9876, 9090
-"""Where the web viewer is found, unless something else is there."""
+HOST, GRPC_PORT, WEB_PORT = "127.0.0.1", 9876, 9090
+"""Where the web viewer is found: on this machine only; at other ports where something else is at these."""
+PATIENCE = 60.0
+"""Seconds for the server to start, and for the last frames to arrive."""
 
 BLUE, WHITE, VERMILION, GREEN = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115)
 GREY, DARK = (120, 120, 120), (24, 26, 32)
@@ -114,7 +120,7 @@ def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
         return NO_VIEWER
     if importlib.util.find_spec("rerun") is None:
         raise GavoError(f"--viewer {mode}: rerun is not installed: pip install 'gavo-jax[viewer]'")
-    if mode == "spawn" and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+    if mode == "spawn" and not _has_screen():
         raise GavoError("--viewer spawn: no screen here: use --viewer web or --viewer save")
     return RerunViewer(mode, recording)
 
@@ -166,7 +172,10 @@ class RerunViewer(Viewer):
         self._queue.put(None)
         self._thread.join()
         self._thread = None
-        self._stream.flush()
+        try:
+            self._stream.flush(timeout_sec=PATIENCE)
+        except Exception as fault:
+            self._fault = self._fault or fault
         if self.mode == "save":
             self._stream.disconnect()
         self._raise_fault()
@@ -183,22 +192,34 @@ class RerunViewer(Viewer):
             return
 
     def _connect(self, stream: RecordingStream) -> None:
-        import rerun
-
         try:
             if self.mode == "save":
                 stream.save(self.recording)
             elif self.mode == "spawn":
                 stream.spawn(hide_welcome_screen=True)
             else:
-                address = stream.serve_grpc(grpc_port=_free_port(GRPC_PORT), server_memory_limit=MEMORY)
-                port = _free_port(WEB_PORT)
-                rerun.serve_web_viewer(web_port=port, open_browser=True, connect_to=address)
-                self.url = f"http://127.0.0.1:{port}/?url={quote(address, safe='')}"
-                print(f"viewer at {self.url}", file=sys.stderr, flush=True)
+                self._serve(stream)
         except (OSError, RuntimeError) as error:
             where = f"{self.recording}: cannot be written" if self.mode == "save" else f"--viewer {self.mode}"
             raise GavoError(f"{where}: {error}") from None
+
+    def _serve(self, stream: RecordingStream) -> None:
+        """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
+        port, page = _free_port(GRPC_PORT), _free_port(WEB_PORT)
+        options = {"bind": HOST, "port": port, "web-viewer-port": page, "server-memory-limit": MEMORY}
+        command = [sys.executable, "-m", "rerun", "--serve-web"]
+        command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        quiet = subprocess.DEVNULL
+        server = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        atexit.register(_end_group, server)
+        for served in (port, page):
+            _await_port(served, server)
+        address = f"rerun+http://{HOST}:{port}/proxy"
+        stream.connect_grpc(address)
+        self.url = f"http://{HOST}:{page}/?url={quote(address, safe='')}"
+        print(f"viewer at {self.url}", file=sys.stderr, flush=True)
+        if _has_screen():
+            webbrowser.open(self.url)
 
     def _work(self, scene: Scene) -> None:
         while (item := self._queue.get()) is not None:
@@ -213,12 +234,39 @@ class RerunViewer(Viewer):
             raise GavoError(f"--viewer {self.mode}: {self._fault}") from self._fault
 
 
+def _has_screen() -> bool:
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
+
+
+def _end_group(server: subprocess.Popen[bytes]) -> None:
+    """End a process that leads a group, and what it has started."""
+    try:
+        os.killpg(server.pid, signal.SIGTERM)
+    except (AttributeError, OSError):
+        server.terminate()
+
+
+def _await_port(port: int, server: subprocess.Popen[bytes]) -> None:
+    """Wait until something answers at a port.
+
+    Raises:
+        GavoError: the server has ended, or says nothing for `PATIENCE` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE
+    while server.poll() is None and time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return
+        time.sleep(0.05)
+    raise GavoError("--viewer web: Rerun's server does not start")
+
+
 def _free_port(wanted: int) -> int:
     """Return the port, or one that is free where that one is taken."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:
-                probe.bind(("127.0.0.1", port))
+                probe.bind((HOST, port))
             except OSError:
                 continue
             return int(probe.getsockname()[1])

@@ -75,7 +75,15 @@ def test_report_draws_without_a_network(photograph, tmp_path):
 def test_web_viewer_draws_a_run(photograph, tmp_path):
     command = [sys.executable, "-m", "gavo_jax", "run", "--viewer", "web", "--frames", "6", "--method", "gauss-newton"]
     with (tmp_path / "log").open("w") as log:
-        run = subprocess.Popen(command, cwd=tmp_path, stdout=log, stderr=log, env={**os.environ, "BROWSER": "true"})
+        run = subprocess.Popen(
+            command,
+            cwd=tmp_path,
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "BROWSER": "true"},
+            # a process started in the background of a shell ignores Ctrl-C, and so would its children
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
         try:
             deadline = time.monotonic() + 300
             while "Ctrl-C ends it" not in (text := (tmp_path / "log").read_text()):

@@ -69,9 +69,9 @@ def run(options: Run) -> int:
         draw_search(folder.path, sequence, odometry, tracked.steps)
         folder.finish(metrics)
     _report(name, metrics, folder.path)
-    viewer.stay()
     if tracked.interrupted:
         return INTERRUPTED
+    viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
 
 
