@@ -7,10 +7,8 @@ from frame to frame, for the evolution of the populations inside a frame.
 
 from __future__ import annotations
 
-import atexit
 import importlib.util
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -59,6 +57,13 @@ HOST, GRPC_PORT, WEB_PORT = "127.0.0.1", 9876, 9090
 """Where the web viewer is found: on this machine only; at other ports where something else is at these."""
 PATIENCE = 60.0
 """Seconds for the server to start, and for the last frames to arrive."""
+GUARD = """
+import os, signal, subprocess, sys
+subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
+sys.stdin.read()
+os.killpg(0, signal.SIGTERM)
+"""
+"""Serves until its standard input closes, which it does however the run ends; Ctrl-C does not reach it."""
 
 BLUE, WHITE, VERMILION, GREEN = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115)
 GREY, DARK = (120, 120, 120), (24, 26, 32)
@@ -137,6 +142,7 @@ class RerunViewer(Viewer):
         self._queue: Queue[Any] = Queue(WAITING_FRAMES)
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
+        self._server: subprocess.Popen[bytes] | None = None
 
     def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         """Open window, server or file, send the layout, and start the thread.
@@ -207,13 +213,14 @@ class RerunViewer(Viewer):
         """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
         port, page = _free_port(GRPC_PORT), _free_port(WEB_PORT)
         options = {"bind": HOST, "port": port, "web-viewer-port": page, "server-memory-limit": MEMORY}
-        command = [sys.executable, "-m", "rerun", "--serve-web"]
+        command = [sys.executable, "-c", GUARD]
         command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
         quiet = subprocess.DEVNULL
-        server = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
-        atexit.register(_end_group, server)
+        self._server = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
+        )
         for served in (port, page):
-            _await_port(served, server)
+            _await_port(served)
         address = f"rerun+http://{HOST}:{port}/proxy"
         stream.connect_grpc(address)
         self.url = f"http://{HOST}:{page}/?url={quote(address, safe='')}"
@@ -238,22 +245,14 @@ def _has_screen() -> bool:
     return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
 
 
-def _end_group(server: subprocess.Popen[bytes]) -> None:
-    """End a process that leads a group, and what it has started."""
-    try:
-        os.killpg(server.pid, signal.SIGTERM)
-    except (AttributeError, OSError):
-        server.terminate()
-
-
-def _await_port(port: int, server: subprocess.Popen[bytes]) -> None:
+def _await_port(port: int) -> None:
     """Wait until something answers at a port.
 
     Raises:
-        GavoError: the server has ended, or says nothing for `PATIENCE` seconds.
+        GavoError: nothing does for `PATIENCE` seconds.
     """
     deadline = time.monotonic() + PATIENCE
-    while server.poll() is None and time.monotonic() < deadline:
+    while time.monotonic() < deadline:
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)) == 0:
                 return
