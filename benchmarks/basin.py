@@ -8,6 +8,7 @@ the milliseconds a pair. A peer's status is the flag that it returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
+    python benchmarks/basin.py --figure docs
 
 On 2 cores the defaults take about 5 minutes.
 """
@@ -21,6 +22,7 @@ import common
 import jax
 import numpy as np
 
+from gavo_jax import plots
 from gavo_jax.alignment import AlignmentStatus, align
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
@@ -179,6 +181,7 @@ def main(
     step: int = 4,
     seeds: int = 1,
     json: Path | None = None,
+    figure: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, print and return the figures.
 
@@ -189,6 +192,7 @@ def main(
         step: frames from a pair to the next one.
         seeds: tries of each of our methods.
         json: file for every attempt and the rates.
+        figure: folder for basin.png and basin.svg.
     """
     sequence = common.open_clip(clip)
     sequence.check()
@@ -215,6 +219,10 @@ def main(
     )
     results = {"clip": clip, "success": rates, "status": agreement, "attempts": records}
     common.record(json, "basin", results)
+    if figure is not None:
+        motion = np.array([row["motion_deg"] for row in rates])
+        success = {name: np.array([row["success"][name] for row in rates]) for name in aligners}
+        common.save_figure(plots.plot_basin(motion, success, clip), figure, "basin")
     return results
 
 

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import tyro
 
+from gavo_jax import plots
 from gavo_jax.camera import Camera
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.screen import number
@@ -24,7 +25,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Odometry
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import Preset, get_preset
-from gavo_jax.results import environment, write_json
+from gavo_jax.results import environment, prepare_folder, write_json
 
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
@@ -216,6 +217,11 @@ def record(path: Path | None, benchmark: str, results: dict[str, Any]) -> None:
     """Write the results as JSON beside what they depend on: date, machine, versions; nothing where path is None."""
     if path is not None:
         write_json(path, {"benchmark": benchmark, **machine(), **results})
+
+
+def save_figure(figure: Any, folder: Path, name: str) -> None:
+    """Write a figure of `plots` into a folder, which is made where it is missing, as PNG and SVG."""
+    plots.save(figure, prepare_folder(folder), name)
 
 
 def machine() -> dict[str, Any]:

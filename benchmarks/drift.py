@@ -7,6 +7,7 @@ which need not be the same one) and of the GA to Gauss-Newton, clip by clip, wit
 
     python benchmarks/drift.py
     python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
+    python benchmarks/drift.py --figure docs
 
 Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
 METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
@@ -17,7 +18,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
+import numpy as np
 
+from gavo_jax import plots
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.peers import PEERS
 
@@ -63,7 +66,23 @@ def ratios(summaries: list[common.Summary]) -> list[Ratio]:
     return found
 
 
-def main(clips: str = common.CLIPS, methods: str = METHODS, seeds: int = 5, json: Path | None = None) -> dict[str, Any]:
+def drifts(runs: list[dict[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
+    """Translation (m/s) and rotation (deg/s) of every run, [runs, 2], by clip and method."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for run in runs:
+        clip = found.setdefault(run["clip"], {})
+        row = np.array([[run[common.TRANSLATION], run[common.ROTATION]]])
+        clip[run["name"]] = np.concatenate([clip[run["name"]], row]) if run["name"] in clip else row
+    return found
+
+
+def main(
+    clips: str = common.CLIPS,
+    methods: str = METHODS,
+    seeds: int = 5,
+    json: Path | None = None,
+    figure: Path | None = None,
+) -> dict[str, Any]:
     """Measure, print and return the figures.
 
     Args:
@@ -71,6 +90,7 @@ def main(clips: str = common.CLIPS, methods: str = METHODS, seeds: int = 5, json
         methods: names with commas between.
         seeds: runs of each of our methods.
         json: file for all runs and the summary.
+        figure: folder for drift.png and drift.svg.
     """
     runs = common.measure_drift(common.names(clips), common.parse_methods(methods), seeds)
     summaries = common.summarise(runs)
@@ -90,6 +110,9 @@ def main(clips: str = common.CLIPS, methods: str = METHODS, seeds: int = 5, json
         "ratios": [{**r._asdict(), "geometric_mean": r.mean, "worst": r.worst} for r in compared],
     }
     common.record(json, "drift", results)
+    if figure is not None:
+        ours = [contender for contender in common.names(methods) if contender not in PEERS]
+        common.save_figure(plots.plot_drift(drifts(runs), ours), figure, "drift")
     return results
 
 

@@ -38,8 +38,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import Objective, l2
-from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
-from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.pyramid import Pyramid, build_pyramid
 from gavo_jax.warp import exp
 
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
@@ -134,13 +133,12 @@ def make_objective(
     pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, options: AlignmentOptions
 ) -> Objective:
     """E of a level of a pair, every pixel a point."""
-    solver = GaussNewton(iterations=tuple(int(k == level) for k in range(LEVELS)))
 
     @jax.jit
     def make() -> Objective:
-        view = View(prepare_reference(pyramids[0], camera, solver, options), jnp.eye(4))
-        only = jax.tree.map(lambda leaf: leaf[0], stack_levels((view,), camera, solver, options))
-        return fit_objective(only, prepare_target(pyramids[1], solver), options, jnp.eye(4))[0]
+        view = View(prepare_reference(pyramids[0], camera, (level,), options), jnp.eye(4))
+        only = jax.tree.map(lambda leaf: leaf[0], stack_levels((view,), camera, (level,), options))
+        return fit_objective(only, prepare_target(pyramids[1], (level,)), options, jnp.eye(4))[0]
 
     return make()
 

@@ -75,13 +75,13 @@ def final_errors(
 ) -> FinalErrors:
     """E of one pair, everything by the same objective (see the module)."""
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale) for image in (reference, target)]
-    views = (View(prepare_reference(pyramids[0], camera, genetic, options), jnp.eye(4)),)
-    packed = prepare_target(pyramids[1], genetic)
+    views = (View(prepare_reference(pyramids[0], camera, genetic.levels, options), jnp.eye(4)),)
+    packed = prepare_target(pyramids[1], genetic.levels)
     found, descended = (
-        align_views(views, packed, camera, solver, options, key, jnp.eye(4)[None]).target_T_reference
+        align_views(views, packed, camera, solver, options, key, jnp.eye(4)[None])[0].target_T_reference
         for solver in (genetic, gauss_newton)
     )
-    finest = jax.tree.map(lambda leaf: leaf[-1], stack_levels(views, camera, genetic, options))
+    finest = jax.tree.map(lambda leaf: leaf[-1], stack_levels(views, camera, genetic.levels, options))
     objective, _ = fit_objective(finest, packed, options, found)
     return FinalErrors(
         objective.error(found)[0],

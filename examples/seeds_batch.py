@@ -27,12 +27,13 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     camera, still = sequence.camera, jnp.eye(4)
     options = gavo.AlignmentOptions()
     pyramids = [build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence]
-    reference, target = prepare_reference(pyramids[0], camera, SOLVER, options), prepare_target(pyramids[1], SOLVER)
+    reference = prepare_reference(pyramids[0], camera, SOLVER.levels, options)
+    target = prepare_target(pyramids[1], SOLVER.levels)
 
     def final_error(key: jax.Array, decay: jax.Array, reference: Reference, target: Target) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
         views = (View(reference, still),)
-        return align_views(views, target, camera, solver, options, key, still[None]).error
+        return align_views(views, target, camera, solver, options, key, still[None])[0].error
 
     over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
     over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))

@@ -36,7 +36,7 @@ from gavo_jax.objective import (
     reference_curvature,
 )
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
-from gavo_jax.solvers.base import Bounds, solve, static
+from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target
 
@@ -157,14 +157,16 @@ class View(NamedTuple):
     """Maps the view's points into the camera that the result is relative to."""
 
 
-def prepare_reference(pyramid: Pyramid, camera: Camera, solver: Any, options: AlignmentOptions) -> Reference:
-    """What a search needs of a reference frame: points of the solver's levels, [L, N], coarsest first."""
-    return make_references(pyramid, camera, solver.levels, options.points)
+def prepare_reference(
+    pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
+) -> Reference:
+    """What a search needs of a reference frame: points of a solver's levels, [L, N], coarsest first."""
+    return make_references(pyramid, camera, levels, options.points)
 
 
-def prepare_target(pyramid: Pyramid, solver: Any) -> Target:
-    """What a search needs of a target frame: the solver's levels packed for sampling, coarsest first."""
-    return pack_target(*(pyramid[level] for level in solver.levels))
+def prepare_target(pyramid: Pyramid, levels: tuple[int, ...]) -> Target:
+    """What a search needs of a target frame: a solver's levels packed for sampling, coarsest first."""
+    return pack_target(*(pyramid[level] for level in levels))
 
 
 class Level(NamedTuple):
@@ -184,9 +186,8 @@ class Level(NamedTuple):
     """Independent populations."""
 
 
-def stack_levels(views: tuple[View, ...], camera: Camera, solver: Any, options: AlignmentOptions) -> Level:
+def stack_levels(views: tuple[View, ...], camera: Camera, levels: tuple[int, ...], options: AlignmentOptions) -> Level:
     """The levels of a search, [L], coarsest first."""
-    levels = solver.levels
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
     cells = [cell_of(c, options.points) for c in cameras]
@@ -273,6 +274,20 @@ def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[A
     return guesses[jnp.argmin(jax.vmap(lambda guess: plain.error(guess)[0])(guesses))]
 
 
+class Population(NamedTuple):
+    """The candidates of the levels' searches, [L], iteration after iteration, for people to look at."""
+
+    level: Integer[Array, "..."]
+    xi: Float[Array, "... iterations p 6"]
+    """Twists of target_T_reference (m, rad); those of all islands. NaN from the iteration that stagnation, or a level's
+    smaller number of iterations, left out."""
+    error: Float[Array, "... iterations p"]
+    """E, squared grey levels; +inf where a candidate is worthless."""
+    centre: Float[Array, "... 6"]
+    """Twist that the search is held about, and `half_widths` of the box it is held in."""
+    half_widths: Float[Array, "... 6"]
+
+
 class Search(NamedTuple):
     """What one level hands on to the next."""
 
@@ -291,7 +306,8 @@ def align_views(
     options: AlignmentOptions,
     key: PRNGKeyArray,
     guesses: Float[Array, "g 4 4"],
-) -> Alignment:
+    record: bool = False,
+) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
     The levels are one `lax.scan`: what a level does is compiled once and serves all of them.
@@ -304,8 +320,12 @@ def align_views(
         options: What is minimised.
         key: Random key.
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
+        record: Whether the candidates are kept (static).
+
+    Returns:
+        The alignment and, where they were recorded, the candidates of each level of `solver.levels`.
     """
-    levels = stack_levels(views, camera, solver, options)
+    levels = stack_levels(views, camera, solver.levels, options)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
     start_key, key = jax.random.split(key)
     origins = _origins(first, target, options, guesses, start_key)
@@ -315,28 +335,32 @@ def align_views(
         unchanged_brightness(first),
     )
 
-    def search_level(search: Search, level: Level) -> tuple[Search, jax.Array]:
+    def search_level(search: Search, level: Level) -> tuple[Search, tuple[jax.Array, Population | None]]:
         objective, brightness = fit_objective(level, target, options, search.islands[0])
         basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
         problem = Problem(objective, search.islands[0], basis, origins[0])
         places = search.islands.shape[0]
         keys = jax.random.split(jax.random.fold_in(key, level.number), places)
-        island = partial(_search_island, problem, solver.at_level(level.number), options, search.box)
+        island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
         if places == 1:
-            found, errors, history = jax.tree.map(
-                lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0])
-            )
+            results = jax.tree.map(lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0]))
         else:
-            found, errors, history = jax.vmap(island)(keys, search.islands, inhabited)
+            results = jax.vmap(island)(keys, search.islands, inhabited)
+        found, errors, history, trail = results
+        population = None
+        if trail is not None:
+            centre = origins[0] if options.precondition else search.islands[0]
+            motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
+            population = Population(level.number, log(motions), error, log(centre), search.box)
         order = _best_distinct(found, errors, places)
-        return Search(found[order], search.box * options.bounds_factor, brightness), history[order[0]]
+        return Search(found[order], search.box * options.bounds_factor, brightness), (history[order[0]], population)
 
-    search, histories = jax.lax.scan(search_level, start, levels)
+    search, (histories, populations) = jax.lax.scan(search_level, start, levels)
     iterations = [solver.iterations[level] for level in solver.levels]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness)
-    return _conclude(objective, search.islands[0], options, history)
+    return _conclude(objective, search.islands[0], options, history), populations
 
 
 def _search_island(
@@ -344,11 +368,12 @@ def _search_island(
     solver: Any,
     options: AlignmentOptions,
     box: Float[Array, " 6"],
+    record: bool,
     key: PRNGKeyArray,
     origin: Float[Array, "4 4"],
     inhabited: Bool[Array, ""],
-) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"]]:
-    """Search one level from one origin."""
+) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
+    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]), searched=inhabited)
         reach = jnp.abs(jnp.linalg.inv(problem.basis)) @ box
@@ -358,8 +383,11 @@ def _search_island(
         problem = replace(problem, origin=jnp.eye(4), searched=inhabited)
         bounds = Bounds(log(origin) - box, log(origin) + box)
         guess = log(origin)[None]
-    solution = solve(key, solver, problem, guess, bounds)
-    return problem.transform(solution.x), solution.error, solution.history
+    solution = solve(key, solver, problem, guess, bounds, record)
+    trail = solution.trail
+    if trail is not None:
+        trail = trail._replace(x=problem.transform(trail.x))
+    return problem.transform(solution.x), solution.error, solution.history, trail
 
 
 def _origins(
@@ -458,8 +486,9 @@ def _align_images(
     guess: Float[Array, "4 4"],
 ) -> Alignment:
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale, LEVELS) for image in (reference, target)]
-    view = View(prepare_reference(pyramids[0], camera, solver, options), jnp.eye(4))
-    return align_views((view,), prepare_target(pyramids[1], solver), camera, solver, options, key, guess[None])
+    view = View(prepare_reference(pyramids[0], camera, solver.levels, options), jnp.eye(4))
+    target_levels = prepare_target(pyramids[1], solver.levels)
+    return align_views((view,), target_levels, camera, solver, options, key, guess[None])[0]
 
 
 @jax.jit

@@ -20,6 +20,7 @@ from gavo_jax.alignment import (
     Alignment,
     AlignmentOptions,
     AlignmentStatus,
+    Population,
     View,
     align_views,
     on_host,
@@ -69,7 +70,7 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
     return tuple(levels)
 
 
-@partial(jax.jit, static_argnames=("options",))
+@partial(jax.jit, static_argnames=("options", "record"))
 def _track(
     state: TrackerState,
     grey: Array,
@@ -80,7 +81,8 @@ def _track(
     solver: Any,
     alignment: AlignmentOptions,
     options: OdometryOptions,
-) -> tuple[TrackerState, Alignment]:
+    record: bool,
+) -> tuple[TrackerState, Alignment, Population | None]:
     """One frame: pyramid, alignment with the references, and the state for the next frame."""
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     predicted = state.motion * (clock.elapsed / state.seconds)
@@ -93,11 +95,11 @@ def _track(
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
-    packed = prepare_target(target, solver)
-    result = align_views(views, packed, camera, solver, alignment, key, guesses)
+    packed = prepare_target(target, solver.levels)
+    result, populations = align_views(views, packed, camera, solver, alignment, key, guesses, record)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
-    newest = prepare_reference(target, camera, solver, alignment)
+    newest = prepare_reference(target, camera, solver.levels, alignment)
     target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
     coarsest = jax.tree.map(lambda leaf: leaf[0], state.keyframe)
     share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
@@ -105,14 +107,14 @@ def _track(
     keyframe, target_T_keyframe = jax.tree.map(
         lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
-    return TrackerState(newest, keyframe, target_T_keyframe, result.xi, clock.elapsed), result
+    return TrackerState(newest, keyframe, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
 
 @jax.jit
 def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignment: AlignmentOptions) -> TrackerState:
     """State after the first frame: it is both references, and nothing is known of the motion."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
-    reference = prepare_reference(pyramid, camera, solver, alignment)
+    reference = prepare_reference(pyramid, camera, solver.levels, alignment)
     return TrackerState(reference, reference, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
@@ -161,6 +163,7 @@ class Odometry:
         alignment: What is minimised.
         options: How the driver uses it.
         seed: Every random number follows from it.
+        record: Whether every frame's candidates are kept until the next frame, for people to look at.
     """
 
     def __init__(
@@ -170,12 +173,16 @@ class Odometry:
         alignment: AlignmentOptions | None = None,
         options: OdometryOptions | None = None,
         seed: int = 0,
+        record: bool = False,
     ):
         preset = get_preset()
         self.camera = camera
         self.solver = preset.solver if solver is None else solver
         self.alignment = preset.alignment if alignment is None else alignment
         self.options = preset.odometry if options is None else options
+        self.record = record
+        self.populations: tuple[Population, ...] = ()
+        """Candidates of the last frame's search, an entry a level, coarsest first; empty unless they are recorded."""
         self._key = jax.random.key(seed)
         self._state: TrackerState | None = None
         self._index = -1
@@ -206,6 +213,7 @@ class Odometry:
             FrameError: There is no first frame to start from.
         """
         self._index += 1
+        self.populations = ()
         if self._state is None:
             if frame is None:
                 raise FrameError("the first frame could not be read")
@@ -286,9 +294,12 @@ class Odometry:
     ) -> tuple[TrackerState, Alignment]:
         solver, alignment = solver or self.solver, alignment or self.alignment
         options = options or self.options
-        state, result = _track(
-            state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options)
+        state, result, populations = _track(
+            state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options), self.record
         )
+        if populations is not None:
+            levels = range(len(solver.levels))
+            self.populations = tuple(jax.tree.map(lambda leaf, k=k: leaf[k], populations) for k in levels)
         return state, on_host(result)
 
 
@@ -306,6 +317,10 @@ def _rigid(transform: Float[Array | np.ndarray, "4 4"]) -> Float64[np.ndarray, "
     return result
 
 
+def _unwatched(frame: Frame | None, step: Step | None) -> None:
+    """Nobody looks."""
+
+
 def track(
     sequence: Sequence,
     solver: Any = None,
@@ -313,11 +328,13 @@ def track(
     options: OdometryOptions | None = None,
     seed: int = 0,
     odometry: Odometry | None = None,
+    watch: Callable[[Frame | None, Step | None], None] = _unwatched,
 ) -> Iterator[Step]:
     """Stream a sequence: a step for every frame after the first, as it is done.
 
     The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
-    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one. `watch` is shown
+    every frame (None: it could not be read) with its step (None: it is the first).
 
     Raises:
         FrameError: The first frame cannot be read.
@@ -340,7 +357,9 @@ def track(
             if isinstance(frame, FrameError) and index == 0:
                 raise frame
             stamp = float(sequence.timestamps[index])
-            step = odometry.register(None if isinstance(frame, FrameError) else frame, stamp)
+            readable = None if isinstance(frame, FrameError) else frame
+            step = odometry.register(readable, stamp)
+            watch(readable, step)
             if step is not None:
                 yield step
                 if step.lost and odometry.options.on_lost == "stop":

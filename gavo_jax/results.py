@@ -10,20 +10,28 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import cv2
 import jax
 import numpy as np
 
-from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Step
+from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.odometry import Step, no_alignment
+from gavo_jax.plots import CAPTIONS as FIGURES
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
-from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row, write_lines
+from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
-TRAJECTORY_FIGURE, DISTANCE_FIGURE = "trajectory", "distance_error"
+RECORDING = "run.rrd"
+"""What `--viewer save` writes."""
+VIEW = "view.rrd"
+"""What `gavo view --viewer save` writes."""
+
+STAMP_TOLERANCE = 1e-6
+"""Seconds: stamps of the files are rounded to microseconds."""
 
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
@@ -59,7 +67,7 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES)
+        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
         try:
@@ -119,6 +127,68 @@ def frame_row(step: Step) -> list[Any]:
         *map(_digits, deviations),
         f"{step.milliseconds:.3f}",
     ]
+
+
+class RecordedRun(NamedTuple):
+    """What a run folder tells of its run."""
+
+    config: dict[str, Any]
+    trajectory: Trajectory
+    steps: list[Step]
+    """Of each frame after the first; covariance, history and twist are not on disk and left unknown."""
+
+
+def read_run(folder: str | Path) -> RecordedRun:
+    """Read the files of a run, whether it came to its end or not.
+
+    Raises:
+        GavoError: a file is missing or damaged, or trajectory.txt and frames.csv are not of the same run.
+    """
+    folder = Path(folder)
+    config = read_json(folder / CONFIG)
+    if not isinstance(config, dict):
+        raise GavoError(f"{folder / CONFIG}: not a configuration")
+    trajectory = Trajectory.read_tum(folder / TRAJECTORY)
+    rows = list(csv.DictReader(read_text(folder / FRAMES).splitlines()))[: len(trajectory) - 1]
+    try:
+        steps = [_read_step(row, trajectory) for row in rows]
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise GavoError(f"{folder / FRAMES}: not the frames of {TRAJECTORY}: {error}") from None
+    return RecordedRun(config, trajectory, steps)
+
+
+def _read_step(row: Mapping[str, str], trajectory: Trajectory) -> Step:
+    index = int(row["index"])
+    reference_timestamp, timestamp = float(row["reference_timestamp"]), float(row["timestamp"])
+    reference = int(np.argmin(np.abs(trajectory.timestamps - reference_timestamp)))
+    if abs(trajectory.timestamps[index] - timestamp) > STAMP_TOLERANCE:
+        raise ValueError(f"its row {index} is of another time")
+    world_T_camera = trajectory.world_T_camera[index]
+    target_T_reference = inverse(world_T_camera) @ trajectory.world_T_camera[reference]
+    alignment = no_alignment(AlignmentStatus[row["status"].upper()])._replace(
+        target_T_reference=target_T_reference, error=float(row["error"]), overlap=float(row["overlap"])
+    )
+    return Step(
+        index,
+        reference_timestamp,
+        timestamp,
+        alignment,
+        world_T_camera,
+        float(row["milliseconds"]),
+        bool(int(row["lost"])),
+    )
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        GavoError: it is missing, unreadable or no JSON.
+    """
+    try:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise error if isinstance(error, GavoError) else GavoError(f"{path}: not JSON: {error}") from None
 
 
 def environment() -> dict[str, str]:
@@ -189,8 +259,7 @@ def remove_figures(folder: Path) -> None:
     Raises:
         GavoError: one cannot be removed.
     """
-    stems = (TRAJECTORY_FIGURE, DISTANCE_FIGURE)
-    remove_files(folder, *(f"{stem}.{suffix}" for stem in stems for suffix in FIGURE_FORMATS))
+    remove_files(folder, *(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -33,7 +33,7 @@ def read(path: Path) -> dict[str, Any]:
 
 def test_drift_compares_methods_with_peers(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drift: ModuleType = load("drift")
-    drift.main(clips=CLIP, methods="ga,gauss-newton,opencv-rgb", seeds=2, json=tmp_path / "drift.json")
+    drift.main(clips=CLIP, methods="ga,gauss-newton,opencv-rgb", seeds=2, json=tmp_path / "drift.json", figure=tmp_path)
     record = read(tmp_path / "drift.json")
     assert [(run["name"], run["seed"]) for run in record["runs"]] == [
         ("ga", 0),
@@ -50,6 +50,7 @@ def test_drift_compares_methods_with_peers(load, tmp_path: Path, capsys: pytest.
     assert ratios["ga / best peer, rotation"] == pytest.approx(genetic["rotation"] / peer["rotation"])
     assert ratios["ga / gauss-newton, translation"] == pytest.approx(genetic["translation"] / newton["translation"])
     assert "ratios of the medians" in capsys.readouterr().out
+    assert drift.drifts(record["runs"])[CLIP]["ga"].shape == (2, 2) and (tmp_path / "drift.svg").exists()
 
 
 def test_drift_refuses_unknown_methods(load) -> None:
@@ -74,10 +75,13 @@ def test_ablation_switches_off_what_it_says(load) -> None:
 
 def test_basin_counts_successes_and_flags(load, tmp_path: Path) -> None:
     basin: ModuleType = load("basin")
-    basin.main(clip=CLIP, gaps="1,3", methods="gauss-newton,opencv-rgb", step=2, json=tmp_path / "basin.json")
+    basin.main(
+        clip=CLIP, gaps="1,3", methods="gauss-newton,opencv-rgb", step=2, json=tmp_path / "basin.json", figure=tmp_path
+    )
     record = read(tmp_path / "basin.json")
     assert [(row["gap"], row["pairs"]) for row in record["success"]] == [(1, 4), (3, 3)]
     assert record["success"][0]["success"] == {"gauss-newton": 1.0, "opencv-rgb": 1.0}
+    assert (tmp_path / "basin.svg").exists()
     assert record["success"][1]["motion_deg"] > record["success"][0]["motion_deg"]
     attempts = [dict(found=True, flagged=True), dict(found=False, flagged=True), dict(found=False, flagged=False)]
     [agreement] = basin.status_agreement([dict(method="x", milliseconds=1.0, **attempt) for attempt in attempts])

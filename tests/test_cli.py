@@ -113,7 +113,8 @@ def test_run_writes_its_files(gavo, pristine, tmp_path):
     config = read_json(out / "config.json")
     assert config["solver"]["type"] == "GaussNewton" and config["options"]["seed"] == 3
     assert {"gavo-jax", "jax", "numpy", "opencv", "python"} <= set(config["versions"])
-    assert (out / "trajectory.png").stat().st_size and (out / "distance_error.svg").stat().st_size
+    for name in ("trajectory", "distance_error", "convergence", "landscape"):
+        assert (out / f"{name}.png").stat().st_size and (out / f"{name}.svg").stat().st_size
 
     evaluated = gavo("evaluate", out / "trajectory.txt", pristine / "groundtruth.txt")
     assert evaluated.status == 0 and f"{metrics['rpe_translation_rmse_m_per_s']:.6f}" in evaluated.out
@@ -317,12 +318,44 @@ def test_compare(gavo, pristine, tmp_path):
     assert [row["method"] for row in table] == ["gauss-newton", "opencv-rgb"]
     assert all(set(METRICS) <= set(row) and row["frames"] == 34 for row in table)
     assert table[0]["rpe_translation_rmse_m_per_s"] < 0.1 and table[1]["rpe_translation_rmse_m_per_s"] < 0.5
+    figures = ("trajectory", "distance_error", "drift")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "comparison.json",
+        "report.html",
         "gauss-newton.txt",
         "opencv-rgb.txt",
-        *(f"{name}.{suffix}" for name in ("trajectory", "distance_error") for suffix in ("png", "svg")),
+        *(f"{name}.{suffix}" for name in figures for suffix in ("png", "svg")),
     }
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert f"<td>{table[1]['rpe_translation_rmse_m_per_s']:.4f}</td>" in report and report.count("<img") == 3
+
+
+def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ("run", "clip", "--camera", "clip/camera.toml", *FAST, "--output", "out", "--viewer", "save")
+    done = gavo(*arguments)
+    assert done.status == 0, done.err
+    assert (tmp_path / "out" / "run.rrd").stat().st_size and (tmp_path / "out" / "population.svg").exists()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    done = gavo("view", "../out", "--viewer", "save")
+    assert done.status == 0 and not done.err, done
+    whole = (tmp_path / "out" / "view.rrd").stat().st_size
+    shutil.rmtree(clip)
+    done = gavo("view", "../out", "--viewer", "save")
+    assert done.status == 0 and done.err.count("\n") == 1 and "no such folder" in done.err
+    assert 0 < (tmp_path / "out" / "view.rrd").stat().st_size < whole / 2
+
+
+@pytest.mark.parametrize("fault", ["frames.csv", "trajectory.txt", "config.json"])
+def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
+    assert gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", "out").status == 0
+    path = tmp_path / "out" / fault
+    path.write_text("index\n7\n" if fault == "frames.csv" else "{")
+    assert is_refused(gavo("view", "out", "--viewer", "save"), fault)
+    path.unlink()
+    assert is_refused(gavo("view", "out", "--viewer", "save"), fault, "no such file")
+    assert not (tmp_path / "out" / "view.rrd").exists()
 
 
 @pytest.mark.parametrize("methods", ["nonsense", "", "ga,,pso", "ga,ga"])

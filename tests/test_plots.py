@@ -54,3 +54,67 @@ def test_save(tmp_path):
     assert paths[0].read_bytes().startswith(b"\x89PNG") and "<svg" in paths[1].read_text()
     with pytest.raises(GavoError, match="nowhere"):
         plots.save(figure, tmp_path / "nowhere", "trajectory")
+
+
+def labels(axes) -> list[str]:
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_every_figure_carries_its_definition_and_units():
+    truth = straight(1.0)
+    history = np.array([[4.0, 2.0, 1.0], [9.0, 2.0, np.nan]])
+    landscape = plots.Landscape(np.linspace(-0.1, 0.1, 5), np.eye(6)[:2], {1: np.full((2, 5), 4.0)})
+    drifts = {"clip": {"ga": np.array([[0.01, 1.0], [0.03, 2.0]]), "opencv-rgb": np.array([[0.02, 3.0]])}}
+    figures = {
+        "trajectory": plots.plot_trajectories({"ga": truth}, None),
+        "distance_error": plots.plot_distance_error({"ga": distance_error(truth, truth)}),
+        "convergence": plots.plot_convergence({4: history}),
+        "population": plots.plot_population({4: history}),
+        "landscape": plots.plot_landscape(landscape),
+        "drift": plots.plot_drift(drifts, ["ga"]),
+        "basin": plots.plot_basin(np.array([7.0, 14.0]), {"ga": np.array([1.0, 0.5])}, "clip"),
+    }
+    assert set(figures) == set(plots.CAPTIONS)
+    for name, figure in figures.items():
+        caption = " ".join(str(figure.get_supxlabel()).split())
+        assert caption == plots.CAPTIONS[name]
+        for axes in figure.axes:
+            assert axes.get_xlabel(), name
+
+
+def test_convergence_carries_the_last_error_on_and_counts_from_it():
+    figure = plots.plot_convergence({4: np.array([[4.0, 2.0, 1.0]] * 3), 1: np.array([[3.0, np.nan, np.nan]] * 3)})
+    coarse, fine = figure.axes
+    assert np.asarray(coarse.get_lines()[0].get_ydata()).tolist() == pytest.approx([300.0, 100.0])
+    assert np.asarray(fine.get_lines()[0].get_ydata()).tolist() == [plots.SMALLEST_EXCESS] * 2
+    assert coarse.get_title() == "level 4" and fine.get_title() == "level 1"
+
+
+def test_population_shows_best_median_and_spread_of_what_was_searched():
+    error = np.array([[100.0, 16.0, np.inf], [9.0, 4.0, 1.0], [np.nan] * 3])
+    (axes,) = plots.plot_population({3: error}).axes
+    lines = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in axes.get_lines()}
+    assert lines["best"] == [4.0, 1.0] and lines["median"] == [7.0, 2.0]
+    assert labels(axes) == ["middle 80 %", "median", "best"]
+
+
+def test_landscape_leaves_gaps_where_a_motion_is_worthless():
+    errors = {4: np.array([[np.inf, 4.0, 9.0], [1.0, 4.0, np.inf]])}
+    worst, best = plots.plot_landscape(plots.Landscape(np.array([-0.1, 0.0, 0.1]), np.eye(6)[:2], errors)).axes
+    assert np.array_equal(worst.get_lines()[0].get_ydata(), [np.nan, 2.0, 3.0], equal_nan=True)
+    assert np.asarray(best.get_lines()[0].get_xdata()).tolist() == [-100.0, 0.0, 100.0]
+
+
+def test_drift_bars_are_medians_and_others_are_hatched():
+    runs = np.array([[0.01, 1.0], [0.05, 3.0], [0.02, 2.0]])
+    figure = plots.plot_drift({"clip": {"ga": runs, "opencv-rgb": runs[:1]}}, ["ga"])
+    translation, rotation = figure.axes
+    for axes, medians in ((translation, [0.02, 0.01]), (rotation, [2.0, 1.0])):
+        assert [bar.get_patch_transform().transform((1.0, 0.0))[0] for bar in axes.patches] == medians
+    assert [bool(bar.get_hatch()) for bar in translation.patches] == [False, True]
+
+
+def test_basin_curves_run_from_small_to_large_motions():
+    (axes,) = plots.plot_basin(np.array([20.0, 7.0]), {"ga": np.array([0.5, 1.0])}, "clip").axes
+    assert np.asarray(axes.get_lines()[0].get_xdata()).tolist() == [7.0, 20.0]
+    assert np.asarray(axes.get_lines()[0].get_ydata()).tolist() == [1.0, 0.5]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from gavo_jax.cli.options import Align, Command, Compare, Evaluate, Run
+from gavo_jax.cli.options import Align, Command, Compare, Evaluate, Run, View
 from gavo_jax.errors import GavoError
 from gavo_jax.version import __version__
 
@@ -56,6 +56,10 @@ def _execute(command: Command) -> int:
             from gavo_jax.cli.compare import compare
 
             return compare(command)
+        case View():
+            from gavo_jax.cli.view import view
+
+            return view(command)
         case Align():
             from gavo_jax.cli.align import align
 
@@ -96,7 +100,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = ("run", "compare", "align", "evaluate")
+    known = ("run", "compare", "view", "align", "evaluate")
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 

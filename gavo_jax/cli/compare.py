@@ -3,26 +3,31 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax import plots
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
-from gavo_jax.cli.tracking import INTERRUPTED, draw, track_visibly
+from gavo_jax.cli.tracking import INTERRUPTED, draw, save_figure, track_visibly
 from gavo_jax.comparison import PeerOdometry
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Odometry
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import METHODS, get_preset
+from gavo_jax.report import REPORT, Table, write_report
 from gavo_jax.results import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.trajectory import Trajectory
 
 COMPARISON = "comparison.json"
-DRIFT = "rpe_translation_rmse_m_per_s"
+DRIFT, ROTATION_DRIFT = "rpe_translation_rmse_m_per_s", "rpe_rotation_rmse_deg_per_s"
 
 COLUMNS = (
     ("drift m/s", DRIFT, 4),
-    ("deg/s", "rpe_rotation_rmse_deg_per_s", 3),
+    ("deg/s", ROTATION_DRIFT, 3),
     ("ATE m", "ate_translation_rmse_m", 4),
     ("distance m", "distance_error_final_m", 4),
     ("lost", "lost_pairs", 0),
@@ -30,6 +35,13 @@ COLUMNS = (
     ("frames/s", "frames_per_second", 1),
 )
 """Columns of the table: heading, key in comparison.json, decimals."""
+HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "drift from", "to")
+TABLE_CAPTION = (
+    "Each method's run of median drift. Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, "
+    "fixed delta), translation in m/s and rotation in deg/s. ATE: root mean square distance of associated positions "
+    "after the best rigid alignment. Distance: from the true position at the end, both relative to the first pose. "
+    "Times: from decoded images to the result on the host (median a pair), and end to end with decoding (frames/s)."
+)
 
 
 class Entry(NamedTuple):
@@ -49,7 +61,7 @@ def compare(options: Compare) -> int:
     enable_compilation_cache()
     peers = {name: PeerOdometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
-    remove_files(folder, COMPARISON)
+    remove_files(folder, COMPARISON, REPORT)
     remove_figures(folder)
     entries: list[Entry] = []
     status = 0
@@ -65,9 +77,25 @@ def compare(options: Compare) -> int:
         if not entries:
             raise
     typical = _typical_runs(entries)
-    draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    drifts = _drifts(entries)
+    if plots.available() and drifts:
+        figure = plots.plot_drift({sequence.name: drifts}, METHODS)
+        pictures.append(save_figure(figure, folder, "drift"))
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
-    _report(f"{sequence.name}, {len(sequence)} frames, preset {options.preset}", entries, typical)
+    title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
+    rows = _rows(entries, typical)
+    print_table(title, HEADINGS, rows)
+    write_report(
+        folder / REPORT,
+        f"gavo compare: {title}",
+        [Table(TABLE_CAPTION, HEADINGS, rows)],
+        pictures,
+        {"options": options, "camera": sequence.camera},
+        _versions(entries),
+        f"First frame at {sequence.timestamps[0]:.6f} s, last at {sequence.timestamps[-1]:.6f} s; "
+        f"device {entries[0].metrics['device']}.",
+    )
     print(f"files in {folder}")
     return status
 
@@ -127,8 +155,21 @@ def _median(runs: list[Entry]) -> Entry:
     return sorted(runs, key=lambda run: run.metrics[DRIFT])[(len(runs) - 1) // 2]
 
 
-def _report(title: str, entries: list[Entry], typical: list[Entry]) -> None:
-    headings = ["method", *(heading for heading, _, _ in COLUMNS), "seeds", "drift from", "to"]
+def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
+    """Return translation (m/s) and rotation (deg/s) of every run, by method; empty where there is no truth."""
+    if any(entry.metrics[DRIFT] is None for entry in entries):
+        return {}
+    runs: dict[str, list[list[float]]] = {}
+    for entry in entries:
+        runs.setdefault(entry.method, []).append([entry.metrics[DRIFT], entry.metrics[ROTATION_DRIFT]])
+    return {method: np.array(values) for method, values in runs.items()}
+
+
+def _versions(entries: list[Entry]) -> dict[str, str]:
+    return {name: version for entry in entries for name, version in entry.metrics["versions"].items()}
+
+
+def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
     rows = []
     for run in typical:
         drifts = [entry.metrics[DRIFT] for entry in entries if entry.method == run.method]
@@ -136,4 +177,4 @@ def _report(title: str, entries: list[Entry], typical: list[Entry]) -> None:
         cells = [number(run.metrics[key], digits) for _, key, digits in COLUMNS]
         span = [number(extreme(known, default=None)) for extreme in (min, max)]
         rows.append([run.method, *cells, len(drifts), *span])
-    print_table(title, headings, rows)
+    return rows

@@ -50,6 +50,8 @@ class Run(Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    viewer: Literal["none", "spawn", "web", "save"] = "none"
+    """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 
@@ -68,6 +70,16 @@ class Compare(Source):
         None
     )
     """Folder for comparison.json, the trajectories and the figures."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a finished run: its trajectory, curves and, where the sequence is still there, images and truth."""
+
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The output folder of `gavo run`."""
+    viewer: Literal["spawn", "web", "save"] = "web"
+    """As in `gavo run`; save writes view.rrd into DIR."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +121,7 @@ class Evaluate:
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Align, subcommand("align")]
     | Annotated[Evaluate, subcommand("evaluate")]
 )

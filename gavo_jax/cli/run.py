@@ -11,11 +11,12 @@ from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, open_sequence
-from gavo_jax.cli.tracking import INTERRUPTED, draw, track_visibly
+from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry import Odometry
 from gavo_jax.presets import Preset, get_preset
-from gavo_jax.results import RunFolder, environment
+from gavo_jax.results import RECORDING, RunFolder, environment
+from gavo_jax.viewer import make_viewer
 
 LOST = 3
 """Exit status where a pair was lost and `--strict` asked to know."""
@@ -41,11 +42,21 @@ def run(options: Run) -> int:
     preset = _effective_preset(options)
     sequence = open_sequence(options)
     name = f"{sequence.name}-{options.method}-{options.preset}"
+    path = options.output or Path("runs") / name
+    viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
-    with RunFolder(options.output or Path("runs") / name) as folder:
+    with RunFolder(path) as folder, viewer:
         folder.start(_config(options, preset, sequence), float(sequence.timestamps[0]))
-        odometry = Odometry(sequence.camera, preset.solver, preset.alignment, preset.odometry, options.seed)
-        tracked = track_visibly(name, sequence, odometry, folder.add)
+        viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
+        odometry = Odometry(
+            sequence.camera,
+            preset.solver,
+            preset.alignment,
+            preset.odometry,
+            options.seed,
+            record=viewer.wants_populations,
+        )
+        tracked = track_visibly(name, sequence, odometry, folder.add, viewer)
         metrics = {
             "sequence": sequence.name,
             "method": options.method,
@@ -55,10 +66,12 @@ def run(options: Run) -> int:
             **tracked.metrics,
         }
         draw(folder.path, {options.method: tracked.trajectory}, sequence.ground_truth)
+        draw_search(folder.path, sequence, odometry, tracked.steps)
         folder.finish(metrics)
     _report(name, metrics, folder.path)
     if tracked.interrupted:
         return INTERRUPTED
+    viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
 
 
@@ -73,9 +86,14 @@ def _effective_preset(options: Run) -> Preset:
 
 
 def _config(options: Run, preset: Preset, sequence: Sequence) -> dict[str, Any]:
-    """Return what config.json says: enough to repeat the run and to know what it did."""
+    """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
+    places = {
+        name: str(Path(place).resolve())
+        for name, place in (("sequence", options.sequence), ("camera", options.camera))
+        if Path(place).exists()
+    }
     return {
-        "options": options,
+        "options": replace(options, **places),
         "sequence": {
             "name": sequence.name,
             "frames": len(sequence),

@@ -132,6 +132,9 @@ class Solution(NamedTuple):
     """Best error after each iteration; NaN from the one that the stagnation stop left out."""
     iterations: Integer[Array, ""]
     candidates: Candidates
+    trail: Candidates | None = None
+    """All candidates after each iteration, where they were recorded: x [iterations, P, 6], error [iterations, P]; NaN
+    like `history`."""
 
 
 STAGNATION = 1e-4
@@ -144,24 +147,34 @@ def solve(
     problem: Problem,
     guess: Float[Array, "g 6"],
     bounds: Bounds,
+    record: bool = False,
 ) -> Solution:
-    """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen."""
+    """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen.
+
+    With `record` (static) the candidates of every iteration are kept for people to look at.
+    """
     init_key, loop_key = jax.random.split(key)
     state = solver.init(init_key, problem, guess, bounds)
     iterations = solver.here(solver.iterations)
+
+    def entry(state: Any, best: Best) -> tuple[jax.Array, Candidates | None]:
+        return best.error, solver.candidates(state) if record else None
 
     def go_on(carry: tuple[Any, ...]) -> jax.Array:
         return (carry[2] < iterations) & (carry[3] < solver.patience)
 
     def iterate(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        state, best, count, stale, history = carry
+        state, best, count, stale, log = carry
         state = solver.step(jax.random.fold_in(loop_key, count), state, problem)
         new = solver.best(state)
         progress = new.error < best.error * (1.0 - STAGNATION)
         best = jax.tree.map(lambda a, b: jnp.where(new.error < best.error, a, b), new, best)
-        return state, best, count + 1, jnp.where(progress, 0, stale + 1), history.at[count].set(best.error)
+        log = jax.tree.map(lambda rows, row: rows.at[count].set(row), log, entry(state, best))
+        return state, best, count + 1, jnp.where(progress, 0, stale + 1), log
 
-    history = jnp.full(largest(solver.iterations), jnp.nan)
-    start = (state, solver.best(state), jnp.int32(0), jnp.int32(0), history)
-    state, best, count, _, history = jax.lax.while_loop(go_on, iterate, start)
-    return Solution(best.x, best.error, history, count, solver.candidates(state))
+    best = solver.best(state)
+    longest = largest(solver.iterations)
+    log = jax.tree.map(lambda row: jnp.full((longest, *row.shape), jnp.nan), entry(state, best))
+    start = (state, best, jnp.int32(0), jnp.int32(0), log)
+    state, best, count, _, (history, trail) = jax.lax.while_loop(go_on, iterate, start)
+    return Solution(best.x, best.error, history, count, solver.candidates(state), trail)

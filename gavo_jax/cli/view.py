@@ -1,0 +1,72 @@
+"""`gavo view`: a finished run in the viewer."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.cli.options import Source, View
+from gavo_jax.cli.selection import open_sequence
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.results import CONFIG, STAMP_TOLERANCE, VIEW, RecordedRun, read_run
+from gavo_jax.viewer import make_viewer
+
+
+def view(options: View) -> int:
+    """Show the run of a folder; without its frames where the sequence is no longer there."""
+    run = read_run(options.folder)
+    viewer = make_viewer(options.viewer, options.folder / VIEW)
+    sequence = _find_sequence(run, options.folder)
+    if sequence is None:
+        camera, stamps, truth = _recorded_camera(run, options.folder), run.trajectory.timestamps, None
+    else:
+        camera, stamps, truth = sequence.camera, sequence.timestamps, sequence.ground_truth
+    with viewer:
+        viewer.open(options.folder.resolve().name, camera, stamps, truth)
+        viewer.watch(_read(sequence, 0), None)
+        for step in run.steps:
+            viewer.watch(_read(sequence, step.index), step)
+    if options.viewer == "save":
+        print(f"written {options.folder / VIEW}")
+    viewer.stay()
+    return 0
+
+
+def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
+    """Return the frames of the run, or None, with a line that says why, where they are not to be had."""
+    settings = run.config.get("options")
+    try:
+        if not isinstance(settings, dict):
+            raise GavoError(f"{folder / CONFIG}: does not name the sequence")
+        names = ("sequence", "camera", "start", "frames", "stride")
+        try:
+            source = Source(**{name: settings[name] for name in names})
+            sequence = open_sequence(source)
+        except (KeyError, TypeError) as error:
+            raise GavoError(f"{folder / CONFIG}: does not name the sequence: {error}") from None
+        stamps = run.trajectory.timestamps
+        if len(sequence) < len(stamps) or np.any(np.abs(sequence.timestamps[: len(stamps)] - stamps) > STAMP_TOLERANCE):
+            raise GavoError(f"{source.sequence}: holds other frames than those of the run")
+        return sequence
+    except GavoError as error:
+        print(f"gavo: without images and truth: {error}", file=sys.stderr)
+        return None
+
+
+def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:
+    entry: Any = run.config.get("sequence")
+    try:
+        values = {name: value for name, value in entry["camera"].items() if name != "type"}
+        return Camera(**{**values, "distortion": tuple(values["distortion"])})
+    except (AttributeError, KeyError, TypeError) as error:
+        raise GavoError(f"{folder / CONFIG}: does not tell the camera: {error}") from None
+
+
+def _read(sequence: Sequence | None, index: int) -> Frame | None:
+    try:
+        return None if sequence is None else sequence[index]
+    except FrameError:
+        return None

@@ -1,0 +1,76 @@
+"""The error around a motion that was found: E along the directions that the images hold worst and best."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gavo_jax.alignment import (
+    Alignment,
+    AlignmentOptions,
+    View,
+    fit_objective,
+    prepare_reference,
+    prepare_target,
+    stack_levels,
+)
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.plots import Landscape
+from gavo_jax.pyramid import LEVELS, build_pyramid
+from gavo_jax.warp import exp
+
+REACH, STEPS = 0.1, 81
+"""Metres or radians to either side, and the number of motions scored along a direction."""
+
+
+def error_landscape(
+    reference: Frame,
+    target: Frame,
+    camera: Camera,
+    alignment: Alignment,
+    options: AlignmentOptions,
+    levels: Sequence[int],
+) -> Landscape:
+    """Score motions around an alignment, along the eigenvectors of largest and smallest variance of its covariance.
+
+    Args:
+        reference: frame t.
+        target: frame t + 1.
+        camera: their camera, without distortion.
+        alignment: the motion between them, on the host.
+        options: what is minimised.
+        levels: pyramid levels to score.
+    """
+    _, vectors = np.linalg.eigh(np.asarray(alignment.covariance, np.float64))
+    directions = vectors.T[[-1, 0]]
+    steps = np.linspace(-REACH, REACH, STEPS)
+    images = (reference.grey, reference.depth, target.grey, target.depth)
+    motion = jnp.asarray(alignment.target_T_reference, jnp.float32)
+    errors = _score(images, camera, motion, jnp.float32(directions), jnp.float32(steps), options, tuple(levels))
+    return Landscape(steps, directions, {k: np.asarray(e) for k, e in zip(levels, errors, strict=True)})
+
+
+@partial(jax.jit, static_argnames=("levels",))
+def _score(
+    images: tuple[Array, ...],
+    camera: Camera,
+    target_T_reference: Float[Array, "4 4"],
+    directions: Float[Array, "2 6"],
+    steps: Float[Array, " n"],
+    options: AlignmentOptions,
+    levels: tuple[int, ...],
+) -> list[Float[Array, "2 n"]]:
+    reference, target = (build_pyramid(images[i], images[i + 1], camera.depth_scale, LEVELS) for i in (0, 2))
+    motions = target_T_reference @ exp(steps[:, None] * directions[:, None, :])
+    view = View(prepare_reference(reference, camera, levels, options), jnp.eye(4))
+    stacked, packed = stack_levels((view,), camera, levels, options), prepare_target(target, levels)
+    errors = []
+    for place in range(len(levels)):
+        level = jax.tree.map(lambda leaf, place=place: leaf[place], stacked)
+        objective, _ = fit_objective(level, packed, options, target_T_reference)
+        errors.append(objective.score(motions.reshape(-1, 4, 4))[0].reshape(len(directions), -1))
+    return errors
