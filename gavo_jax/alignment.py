@@ -52,6 +52,14 @@ class AlignmentStatus(enum.IntEnum):
     NO_DEPTH = 5
     NOT_FINITE = 6
     UNREADABLE = 7
+    BLANK = 8
+    NOISE = 9
+    FROZEN = 10
+    DEPTH_UNITS = 11
+    PARTIAL_DEPTH = 12
+    BAD_TIMESTAMP = 13
+    GAP = 14
+    NO_REFERENCE = 15
 
     @property
     def sentence(self) -> str:
@@ -65,9 +73,17 @@ _SENTENCES = {
     AlignmentStatus.LOW_TEXTURE: "The images leave at least one direction of the motion undetermined.",
     AlignmentStatus.AMBIGUOUS: "Distinct motions explain the images about equally well.",
     AlignmentStatus.HIGH_ERROR: "The best motion found does not explain the target image.",
-    AlignmentStatus.NO_DEPTH: "The reference has too few depth readings.",
+    AlignmentStatus.NO_DEPTH: "A frame has too few depth readings.",
     AlignmentStatus.NOT_FINITE: "The error is not a finite number.",
     AlignmentStatus.UNREADABLE: "The frame could not be read.",
+    AlignmentStatus.BLANK: "The image is black, white or saturated.",
+    AlignmentStatus.NOISE: "The image is noise.",
+    AlignmentStatus.FROZEN: "The image is the last one once more.",
+    AlignmentStatus.DEPTH_UNITS: "The depth's range is unlikely: its units may not be the camera's.",
+    AlignmentStatus.PARTIAL_DEPTH: "Much of the usual depth is missing.",
+    AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
+    AlignmentStatus.GAP: "Frames are missing before this one.",
+    AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
 }
 
 
