@@ -5,6 +5,7 @@ and makes it the next reference; the images stay on the device, and a thread dec
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -451,7 +452,8 @@ def run_odometry(
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
-    """Trajectory of a run: the first camera at the origin, then a pose a step."""
+    """Trajectory of a run: the first camera at the origin, then a pose a step; none where the stamp is in doubt."""
+    steps = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     stamps = np.array([first_timestamp] + [step.timestamp for step in steps])
     return Trajectory(stamps, np.stack([np.eye(4)] + [step.world_T_camera for step in steps]))
 
@@ -488,6 +490,7 @@ def compute_metrics(
         "frames": len(steps) + 1,
         "pairs": len(steps),
         "lost_pairs": sum(step.lost for step in steps),
+        "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
         "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
         "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
         "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),

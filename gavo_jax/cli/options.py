@@ -50,6 +50,8 @@ class Run(Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    resume: bool = False
+    """Go on with the run in the folder where it was cut short; the options have to be the same."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 

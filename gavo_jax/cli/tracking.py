@@ -32,15 +32,15 @@ class Tracked(NamedTuple):
 def track_visibly(
     label: str, sequence: Sequence, odometry: Odometry, on_step: Callable[[Step], None] | None = None
 ) -> Tracked:
-    """Compile, then track every frame under a progress bar.
+    """Compile, then track every frame, from where the driver stands, under a progress bar.
 
     Raises:
         KeyboardInterrupt: the user stopped it before the first pair was done.
     """
-    pairs = len(sequence) - 1
+    pairs, done = len(sequence) - 1, max(odometry.progress.last_index, 0)
     steps: list[Step] = []
     interrupted = False
-    with pair_progress(label, pairs) as bar:
+    with pair_progress(label, pairs, done) as bar:
         compile_seconds = odometry.warm_up()
         start = time.perf_counter()
         try:
@@ -55,7 +55,7 @@ def track_visibly(
             interrupted = True
         seconds = time.perf_counter() - start
     if interrupted:
-        print(f"gavo: {label}: interrupted after {len(steps)} of {pairs} pairs", file=sys.stderr)
+        print(f"gavo: {label}: interrupted after {done + len(steps)} of {pairs} pairs", file=sys.stderr)
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
     return Tracked(trajectory, steps, metrics, interrupted)

@@ -92,8 +92,8 @@ class TumSequence:
         self._recorded = camera if isinstance(camera, Camera) else load_camera(camera)
         self._undistort, self._color = undistort, color
         self.camera = self._recorded.rectified() if undistort else self._recorded
-        lists = [_read_list(resolved, self.folder / name) for name in ("rgb.txt", "depth.txt")]
-        entries = _associate_lists(*lists, max_difference)
+        color_rows, depth_rows = (_read_list(resolved, self.folder / name) for name in ("rgb.txt", "depth.txt"))
+        entries = _associate_lists(color_rows, depth_rows, max_difference)
         if not entries:
             raise GavoError(
                 f"{self.folder}: no stamps of rgb.txt and depth.txt within {max_difference:g} s of each other"
