@@ -53,16 +53,17 @@ class _GrowingFile:
     """A text file that grows by whole lines: each is in the file, or the file ends where it did before."""
 
     def __init__(self, path: Path, size: int) -> None:
-        """Open it and cut it to `size` bytes; raise GavoError where it cannot be, or where it is shorter."""
-        self.path, self.size = path, size
+        """Open it and cut it to `size` bytes; raise GavoError where that cannot be, or where it is shorter."""
+        self.path = path
         try:
             self._file = path.open("r+b" if size else "wb", buffering=0)
-            if self._file.seek(0, os.SEEK_END) < size:
-                raise GavoError(f"{path}: shorter than it was at the checkpoint: run again without --resume")
-            self._file.truncate(size)
-            self._file.seek(size)
+            short = self._file.seek(0, os.SEEK_END) < size
+            self.cut(size)
         except OSError as error:
             raise self._fault(error) from None
+        if short:
+            self._file.close()
+            raise GavoError(f"{path}: shorter than it was at the checkpoint: run again without --resume")
 
     def append(self, line: str) -> None:
         data = (line + "\n").encode("utf-8")

@@ -73,12 +73,14 @@ def _track(
 
     Errors are computed from the files, so that a run that was resumed ends with the same ones as a run in one go.
     """
-    saved = time.monotonic()
+    saved: float | None = None
 
     def on_step(step: Step) -> None:
         nonlocal saved
         folder.add(step, odometry.progress)
-        if time.monotonic() - saved > CHECKPOINT_SECONDS:
+        if saved is None:
+            saved = time.monotonic()
+        elif time.monotonic() - saved > CHECKPOINT_SECONDS:
             folder.save_checkpoint()
             saved = time.monotonic()
 
