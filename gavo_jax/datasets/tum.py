@@ -28,6 +28,9 @@ MAX_DIFFERENCE = 0.02
 MAX_LIST_BYTES = 16 * 2**20
 """Hours of frames; what is larger is no list of them."""
 
+MAX_PATH = 1000
+"""Characters of a path in a list."""
+
 MAX_STAMP = 1e15
 """Seconds; beyond, microseconds are lost in double precision anyway."""
 
@@ -223,6 +226,8 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
             raise GavoError(f"{place}: not a time stamp: {fields[0][:60]!r}")
         try:
             image = (root / fields[1]).resolve()
+            if len(fields[1]) > MAX_PATH:
+                raise ValueError("too long")
         except (OSError, RuntimeError, ValueError):
             raise GavoError(f"{place}: not a usable path: {fields[1][:60]!r}") from None
         if not image.is_relative_to(root):
