@@ -71,8 +71,9 @@ MIN_COVERAGE_RATIO = 0.7
 MAX_RANGE_RATIO = 2.5
 """A median depth that grows or shrinks by more than this from a frame to the next is in other units; handheld motion
 stays within 1.4 a frame."""
-DEPTH_RANGE = (0.3, 15.0)
-"""Metres: a median depth outside is hardly that of an RGB-D camera. Millimetres read as fifths of one are at 0.2."""
+DEPTH_RANGE = (0.4, 15.0)
+"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer). Millimetres that are
+read as fifths of one put a scene nearer than 2 m there."""
 MAX_INTERVAL_RATIO = 2.5
 """An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
 MIN_INTERVALS = 3
