@@ -116,7 +116,9 @@ def fuzz(reader: str, folder: Path, examples: int) -> int:
     contents, read = READERS[reader]
     taken = 0
 
-    @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=examples, database=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
+    )
     @given(content=contents)
     def feed(content: Any) -> None:
         nonlocal taken
