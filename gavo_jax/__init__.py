@@ -10,6 +10,7 @@ from gavo_jax.camera import load_camera as load_camera
 from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence
+from gavo_jax.datasets.base import TimestampError as TimestampError
 from gavo_jax.datasets.synthetic import SensorNoise as SensorNoise
 from gavo_jax.datasets.synthetic import SyntheticSequence as SyntheticSequence
 from gavo_jax.datasets.synthetic import write_tum as write_tum

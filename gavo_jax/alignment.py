@@ -52,6 +52,14 @@ class AlignmentStatus(enum.IntEnum):
     NO_DEPTH = 5
     NOT_FINITE = 6
     UNREADABLE = 7
+    BLANK = 8
+    NOISE = 9
+    FROZEN = 10
+    DEPTH_UNITS = 11
+    PARTIAL_DEPTH = 12
+    BAD_TIMESTAMP = 13
+    GAP = 14
+    NO_REFERENCE = 15
 
     @property
     def sentence(self) -> str:
@@ -65,9 +73,17 @@ _SENTENCES = {
     AlignmentStatus.LOW_TEXTURE: "The images leave at least one direction of the motion undetermined.",
     AlignmentStatus.AMBIGUOUS: "Distinct motions explain the images about equally well.",
     AlignmentStatus.HIGH_ERROR: "The best motion found does not explain the target image.",
-    AlignmentStatus.NO_DEPTH: "The reference has too few depth readings.",
+    AlignmentStatus.NO_DEPTH: "A frame has too few depth readings.",
     AlignmentStatus.NOT_FINITE: "The error is not a finite number.",
     AlignmentStatus.UNREADABLE: "The frame could not be read.",
+    AlignmentStatus.BLANK: "The image is black, white or saturated.",
+    AlignmentStatus.NOISE: "The image is noise.",
+    AlignmentStatus.FROZEN: "The image is the last one once more.",
+    AlignmentStatus.DEPTH_UNITS: "The depth's range is unlikely: its units may not be the camera's.",
+    AlignmentStatus.PARTIAL_DEPTH: "Much of the usual depth is missing.",
+    AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
+    AlignmentStatus.GAP: "Frames are missing before this one.",
+    AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
 }
 
 
@@ -286,6 +302,12 @@ class Population(NamedTuple):
     centre: Float[Array, "... 6"]
     """Twist that the search is held about, and `half_widths` of the box it is held in."""
     half_widths: Float[Array, "... 6"]
+
+    def trimmed(self) -> "Population":
+        """One level's candidates on the host, without the places and iterations that the level left empty."""
+        host = jax.device_get(self)
+        rows, places = ~np.isnan(host.error).all(axis=1), ~np.isnan(host.xi[..., 0]).all(axis=0)
+        return host._replace(xi=host.xi[rows][:, places], error=host.error[rows][:, places])
 
 
 class Search(NamedTuple):

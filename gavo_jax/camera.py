@@ -215,7 +215,7 @@ def _parse_toml(path: Path, text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: not TOML: {' '.join(str(error).split())}") from None
+        raise GavoError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
 
 
 def _parse_flat_yaml(path: Path, text: str) -> dict[str, Any]:
@@ -226,14 +226,18 @@ def _parse_flat_yaml(path: Path, text: str) -> dict[str, Any]:
             continue
         key, colon, value = (part.strip() for part in line.partition(":"))
         if not colon or key in values:
-            raise GavoError(f"{path}:{number}: {'key given twice' if colon else 'not a `key: value` line'}: {line!r}")
+            raise GavoError(
+                f"{path}:{number}: {'key given twice' if colon else 'not a `key: value` line'}: {line[:60]!r}"
+            )
         try:
             if value.startswith("[") and value.endswith("]"):
                 values[key] = [_number(item) for item in value[1:-1].split(",") if item.strip()]
             else:
                 values[key] = _number(value)
         except ValueError:
-            raise GavoError(f"{path}:{number}: {key}: neither a number nor a list of numbers: {value!r}") from None
+            raise GavoError(
+                f"{path}:{number}: {key[:60]}: neither a number nor a list of numbers: {value[:60]!r}"
+            ) from None
     return values
 
 
@@ -250,7 +254,7 @@ def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
     required = [name for name in names if name not in ("distortion", "depth_scale")]
     for key in values:
         if key not in names:
-            raise GavoError(f"{path}: {key!r}: unknown key (known: {', '.join(names)})")
+            raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(names)})")
     for key in required:
         if key not in values:
             raise GavoError(f"{path}: {key}: missing")

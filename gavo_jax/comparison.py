@@ -5,7 +5,7 @@ from typing import Any
 from gavo_jax.alignment import Alignment, AlignmentStatus
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry import Odometry, no_alignment
+from gavo_jax.odometry import Odometry, Progress, no_alignment
 from gavo_jax.peers import make_peer
 from gavo_jax.presets import OdometryOptions
 
@@ -33,8 +33,8 @@ class PeerOdometry(Odometry):
     def _start(self, frame: Frame) -> Any:
         return self.peer.prepare(frame)
 
-    def _align(self, state: Any, frame: Frame) -> tuple[Any, Alignment]:
+    def _align(self, before: Progress, frame: Frame) -> tuple[Any, Alignment]:
         prepared = self.peer.prepare(frame)
-        found = self.peer.align(state, prepared)
+        found = self.peer.align(before.tracker, prepared)
         status = AlignmentStatus.OK if found.success else AlignmentStatus.NOT_FINITE
         return prepared, no_alignment(status)._replace(target_T_reference=found.target_T_reference)

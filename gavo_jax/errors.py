@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-MAX_TEXT_BYTES = 256 * 2**20
+MAX_TEXT_BYTES = 128 * 2**20
 
 
 class GavoError(ValueError):
@@ -34,7 +34,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise GavoError(f"{str(path)!r}: not a usable path: {error}") from None
 
 
-def data_rows(path: str | Path) -> list[tuple[str, list[str]]]:
+def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[str, list[str]]]:
     """Split a TUM text file into rows of fields; blank lines and `#` comments are skipped, commas count as blanks.
 
     Returns:
@@ -44,7 +44,7 @@ def data_rows(path: str | Path) -> list[tuple[str, list[str]]]:
         GavoError: as `read_text`.
     """
     rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, max_bytes).splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if fields and not fields[0].startswith("#"):
             rows.append((f"{path}:{number}", fields))

@@ -5,11 +5,12 @@ and makes it the next reference; the images stay on the device, and a thread dec
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
+from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.objective import Reference, share_in_view
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
@@ -128,12 +130,16 @@ class Step:
     """Colour stamp of the reference, the last frame that was not lost, seconds."""
     timestamp: float
     alignment: Alignment
-    """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded."""
+    """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded. Its status may be
+    a warning about the frame (a gap before it, depth in part missing) that had a usable motion all the same."""
     world_T_camera: Float64[np.ndarray, "4 4"]
     """Recorded; the world is the first camera."""
     milliseconds: float
     """From the decoded images to the result on the host."""
     lost: bool
+    """Whether there is no usable motion."""
+    policy: Literal["", "hold", "predict", "stop"] = ""
+    """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
 
 
 def no_alignment(status: AlignmentStatus) -> Alignment:
@@ -151,7 +157,23 @@ def no_alignment(status: AlignmentStatus) -> Alignment:
 
 
 MAX_HELD = 3
-"""Lost frames in a row after which the newest readable one becomes the reference: the old one is out of reach."""
+"""Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
+
+
+class Progress(NamedTuple):
+    """Where a driver stands between two frames: all that decides what it makes of the next ones."""
+
+    tracker: TrackerState | None = None
+    """On the device; None while no usable frame was seen."""
+    last_index: int = -1
+    """Of the last frame."""
+    reference_timestamp: float = 0.0
+    world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
+    world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
+    """As recorded last."""
+    held: int = 0
+    """Frames since the reference was renewed."""
+    history: History = History()
 
 
 class Odometry:
@@ -164,6 +186,9 @@ class Odometry:
         options: How the driver uses it.
         seed: Every random number follows from it.
         record: Whether every frame's candidates are kept until the next frame, for people to look at.
+
+    Attributes:
+        progress: Where it stands; a driver of the same settings that is given it goes on from there.
     """
 
     def __init__(
@@ -183,28 +208,27 @@ class Odometry:
         self.record = record
         self.populations: tuple[Population, ...] = ()
         """Candidates of the last frame's search, an entry a level, coarsest first; empty unless they are recorded."""
+        self.progress = Progress()
         self._key = jax.random.key(seed)
-        self._state: TrackerState | None = None
-        self._index = -1
-        self._reference_timestamp = 0.0
-        self._world_T_reference = np.eye(4)
-        self._world_T_camera = np.eye(4)
-        self._held = 0
 
     def warm_up(self) -> float:
         """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
         start = time.perf_counter()
-        size = (self.camera.height, self.camera.width)
-        blank = Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
-        self._run(self._start(blank), blank, Clock(jnp.float32(1.0), jnp.float32(0.0)), self._key)
+        self._run(self.blank_state(), self._blank(), Clock(jnp.float32(1.0), jnp.float32(0.0)), self._key)
         return time.perf_counter() - start
 
-    def register(self, frame: Frame | None, timestamp: float) -> Step | None:
+    def blank_state(self) -> TrackerState:
+        """A state with the shapes and types of every state of this driver."""
+        return self._start(self._blank())
+
+    def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
         """Track one more frame.
 
+        A frame that is not fit for it (`frame_checks`) is flagged and never becomes a reference.
+
         Args:
-            frame: The next frame, or None for one that could not be read: it is lost, and the run goes on.
-            timestamp: Its colour stamp, seconds; later than the last one's.
+            frame: The next frame; for one that could not be read the error, or None: it is lost, and the run goes on.
+            timestamp: Its colour stamp, seconds; later than the last one's, or the frame is lost.
 
         Returns:
             The step, or None for the first frame, which is the world's origin.
@@ -212,61 +236,103 @@ class Odometry:
         Raises:
             FrameError: There is no first frame to start from.
         """
-        self._index += 1
         self.populations = ()
-        if self._state is None:
-            if frame is None:
-                raise FrameError("the first frame could not be read")
-            self._restart(frame)
-            return None
+        if self.progress.last_index < 0 and not isinstance(frame, Frame):
+            raise frame or FrameError("the first frame could not be read")
         start = time.perf_counter()
-        state, result = (None, no_alignment(AlignmentStatus.UNREADABLE))
-        if frame is not None:
-            state, result = self._align(self._state, frame)
-        lost = result.status != AlignmentStatus.OK
-        reference_timestamp = self._reference_timestamp
-        if state is not None and not lost:
-            self._state, self._held, self._reference_timestamp = state, 0, timestamp
-            self._world_T_reference = self._world_T_reference @ inverse(_rigid(result.target_T_reference))
-            self._world_T_camera = self._world_T_reference
+        finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
+        usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
+        if before.tracker is None:
+            fit = usable if finding.use is Use.ALL else None
+            after = before if fit is None else self._restart(before, fit)
+            result, lost = no_alignment(AlignmentStatus.NO_REFERENCE if fit else finding.status), True
+        elif usable is None:
+            after, result, lost = self._lose(before, None, timestamp), no_alignment(finding.status), True
         else:
-            self._lose(frame, timestamp)
+            after, result, lost = self._advance(before, usable, finding)
+        self.progress = after
+        if before.last_index == 0:
+            return None
         milliseconds = (time.perf_counter() - start) * 1e3
         return Step(
-            self._index, reference_timestamp, timestamp, result, self._world_T_camera.copy(), milliseconds, lost
+            before.last_index,
+            before.reference_timestamp,
+            timestamp,
+            result,
+            after.world_T_camera.copy(),
+            milliseconds,
+            lost,
+            self.options.on_lost if lost else "",
         )
+
+    def _blank(self) -> Frame:
+        size = (self.camera.height, self.camera.width)
+        return Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
 
     def _start(self, frame: Frame) -> TrackerState:
         return _first_state(frame.grey, frame.depth, self.camera, self.solver, self.alignment)
 
-    def _restart(self, frame: Frame) -> None:
+    def _restart(self, before: Progress, frame: Frame) -> Progress:
         """Make a frame the only reference, standing where the camera is recorded to be."""
-        self._state, self._held, self._reference_timestamp = self._start(frame), 0, frame.timestamp
-        self._world_T_reference = self._world_T_camera
+        return before._replace(
+            tracker=self._start(frame),
+            reference_timestamp=frame.timestamp,
+            world_T_reference=before.world_T_camera,
+            held=0,
+        )
 
-    def _lose(self, frame: Frame | None, timestamp: float) -> None:
-        """Record a lost pair by the policy, and give the old reference up once it is out of reach."""
-        assert self._state is not None
-        self._held += 1
-        if self.options.on_lost == "predict":
-            elapsed = (timestamp - self._reference_timestamp) / float(self._state.seconds)
-            motion = _rigid(np.asarray(exp(self._state.motion * elapsed)))
-            self._world_T_camera = self._world_T_reference @ inverse(motion)
-        if frame is not None and self._held >= MAX_HELD:
-            self._restart(frame)
+    def _advance(self, before: Progress, frame: Frame, finding: Finding) -> tuple[Progress, Alignment, bool]:
+        """Align a usable frame; where that succeeds and it is fit for it, it becomes the reference.
 
-    def _align(self, state: TrackerState, frame: Frame) -> tuple[TrackerState, Alignment]:
+        Returns:
+            Where the driver stands now, the result, and whether the pair is lost.
+        """
+        state, result = self._align(before, frame)
+        if result.status != AlignmentStatus.OK:
+            fit = frame if finding.use is Use.ALL else None
+            return self._lose(before, fit, frame.timestamp), result, True
+        result = result._replace(status=finding.status)
+        world_T_camera = before.world_T_reference @ inverse(_rigid(result.target_T_reference))
+        after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
+        overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
+        if finding.use is Use.ALL or overdue:
+            after = after._replace(
+                tracker=state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0
+            )
+        return after, result, False
+
+    def _lose(self, before: Progress, frame: Frame | None, timestamp: float) -> Progress:
+        """Record a lost pair by the policy, and give the old reference up once it is out of reach.
+
+        Args:
+            before: Where the driver stood.
+            frame: The new frame if it is fit to be a reference.
+            timestamp: Its stamp.
+        """
+        after = before._replace(held=before.held + 1)
+        if self.options.on_lost == "predict" and timestamp > before.reference_timestamp:
+            assert before.tracker is not None
+            elapsed = (timestamp - before.reference_timestamp) / float(before.tracker.seconds)
+            motion = _rigid(np.asarray(exp(before.tracker.motion * elapsed)))
+            after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
+        return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
+
+    def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment]:
         """Align with the references; a result that looks wrong is tried again by the wide search."""
-        elapsed = frame.timestamp - self._reference_timestamp
+        assert before.tracker is not None
+        elapsed = frame.timestamp - before.reference_timestamp
+        if elapsed <= 0:
+            elapsed = float(before.tracker.seconds)
         delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
         clock = Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay))
-        key = jax.random.fold_in(self._key, self._index)
-        state_after, result = self._run(state, frame, clock, key)
+        key = jax.random.fold_in(self._key, before.last_index)
+        state_after, result = self._run(before.tracker, frame, clock, key)
         if result.status == AlignmentStatus.OK or not self.options.recover:
             return state_after, result
         wide = self._wide()
         state_wide, second = self._run(
-            state, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
+            before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
         if second.status == AlignmentStatus.OK:
             return state_wide, second
@@ -333,8 +399,9 @@ def track(
     """Stream a sequence: a step for every frame after the first, as it is done.
 
     The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
-    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one. `watch` is shown
-    every frame (None: it could not be read) with its step (None: it is the first).
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one. An odometry that
+    has seen frames already goes on with the next one. `watch` is shown every frame (None: it could not be read) with
+    its step (None: it is the first).
 
     Raises:
         FrameError: The first frame cannot be read.
@@ -348,18 +415,17 @@ def track(
         except FrameError as error:
             return error
 
+    first = odometry.progress.last_index + 1
+    if first >= len(sequence):
+        return
     with ThreadPoolExecutor(max_workers=1) as decoder:
-        coming = decoder.submit(read, 0)
-        for index in range(len(sequence)):
+        coming = decoder.submit(read, first)
+        for index in range(first, len(sequence)):
             frame = coming.result()
             if index + 1 < len(sequence):
                 coming = decoder.submit(read, index + 1)
-            if isinstance(frame, FrameError) and index == 0:
-                raise frame
-            stamp = float(sequence.timestamps[index])
-            readable = None if isinstance(frame, FrameError) else frame
-            step = odometry.register(readable, stamp)
-            watch(readable, step)
+            step = odometry.register(frame, float(sequence.timestamps[index]))
+            watch(frame if isinstance(frame, Frame) else None, step)
             if step is not None:
                 yield step
                 if step.lost and odometry.options.on_lost == "stop":
@@ -419,7 +485,8 @@ def run_odometry(
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
-    """Trajectory of a run: the first camera at the origin, then a pose a step."""
+    """Trajectory of a run: the first camera at the origin, then a pose a step; none where the stamp is in doubt."""
+    steps = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     stamps = np.array([first_timestamp] + [step.timestamp for step in steps])
     return Trajectory(stamps, np.stack([np.eye(4)] + [step.world_T_camera for step in steps]))
 
@@ -456,6 +523,7 @@ def compute_metrics(
         "frames": len(steps) + 1,
         "pairs": len(steps),
         "lost_pairs": sum(step.lost for step in steps),
+        "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
         "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
         "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
         "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),

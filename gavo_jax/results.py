@@ -1,14 +1,18 @@
-"""The files of one run: trajectory.txt and frames.csv grow with it, config.json opens and metrics.json closes it."""
+"""The files of one run: trajectory.txt and frames.csv grow with it, config.json opens and metrics.json closes it.
+
+A checkpoint beside them lets a run that was cut short go on where it was.
+"""
 
 import csv
 import dataclasses
 import enum
+import io
 import json
 import math
+import os
 import platform
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -17,35 +21,82 @@ import jax
 import numpy as np
 
 from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.checkpoint import load_checkpoint, save_checkpoint
 from gavo_jax.errors import GavoError, read_text
-from gavo_jax.odometry import Step, no_alignment
+from gavo_jax.odometry import Progress, Step, TrackerState, no_alignment
 from gavo_jax.plots import CAPTIONS as FIGURES
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
-from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines
+from gavo_jax.trajectory import PARTIAL, TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+CHECKPOINT = "checkpoint.npz"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""
 VIEW = "view.rrd"
 """What `gavo view --viewer save` writes."""
 
-STAMP_TOLERANCE = 1e-6
-"""Seconds: stamps of the files are rounded to microseconds."""
-
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
-    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "lost") + DEVIATIONS + ("milliseconds",)
+    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "lost", "on_lost")
+    + DEVIATIONS
+    + ("milliseconds",)
 )
-"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, deviations of the
-motion's translation (m) and rotation (rad) along the axes of the reference camera."""
+"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, what was recorded
+for a lost pair (`OdometryOptions.on_lost`), deviations of the motion's translation (m) and rotation (rad) along the
+axes of the reference camera."""
+
+
+IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
+IDENTITY_OPTIONS = ("method", "preset", "seed")
+IDENTITY_VERSIONS = ("gavo-jax", "jax", "numpy", "opencv")
+"""What has to be the same in config.json for a run to go on to the same end."""
+
+
+class _GrowingFile:
+    """A text file that grows by whole lines: each is in the file, or the file ends where it did before."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        """Open it and cut it to `size` bytes; raise GavoError where that cannot be, or where it is shorter."""
+        self.path = path
+        try:
+            self._file = path.open("r+b" if size else "wb", buffering=0)
+            short = self._file.seek(0, os.SEEK_END) < size
+            self.cut(size)
+        except OSError as error:
+            raise self._fault(error) from None
+        if short:
+            self._file.close()
+            raise GavoError(f"{path}: shorter than it was at the checkpoint: run again without --resume")
+
+    def append(self, line: str) -> None:
+        data = (line + "\n").encode("utf-8")
+        try:
+            written = self._file.write(data)
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.cut(self.size)
+            raise self._fault(error) from None
+        self.size += len(data)
+
+    def cut(self, size: int) -> None:
+        self._file.truncate(size)
+        self._file.seek(size)
+        self.size = size
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _fault(self, error: OSError) -> GavoError:
+        return GavoError(f"{self.path}: cannot be written to: {error.strerror or error}")
 
 
 class RunFolder:
     """A folder that receives the files of one run; use it in a `with` block.
 
     Every frame's row is on disk as soon as it is added, so that a run that is cut short leaves what it had; only a run
-    that came to its end has a metrics.json.
+    that came to its end has a metrics.json and no checkpoint.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -55,7 +106,9 @@ class RunFolder:
             GavoError: it is no folder or cannot be written to.
         """
         self.path = prepare_folder(folder)
-        self._files = ExitStack()
+        self._files: dict[str, _GrowingFile] = {}
+        self._whole: tuple[dict[str, int], Progress | None] = ({}, None)
+        """Sizes of the growing files after the last frame that is in both, and the driver's progress then."""
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
@@ -67,49 +120,195 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
+        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
-        try:
-            self._trajectory = self._files.enter_context((self.path / TRAJECTORY).open("w", encoding="utf-8"))
-            self._frames = self._files.enter_context((self.path / FRAMES).open("w", encoding="utf-8", newline=""))
-        except OSError as error:
-            raise GavoError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
-        self._rows = csv.writer(self._frames, lineterminator="\n")
-        self._rows.writerow(FRAME_COLUMNS)
-        self._trajectory.write(f"{TRAJECTORY_HEADER}\n{format_tum_row(timestamp, np.eye(4))}\n")
-        self._flush()
+        self._open({TRAJECTORY: 0, FRAMES: 0})
+        self._files[FRAMES].append(",".join(FRAME_COLUMNS))
+        self._files[TRAJECTORY].append(TRAJECTORY_HEADER)
+        self._files[TRAJECTORY].append(format_tum_row(timestamp, np.eye(4)))
+        self._whole = (self._sizes(), None)
 
-    def add(self, step: Step) -> None:
-        """Append one frame: its pose and its pair's row.
+    def resume(self, config: Mapping[str, Any], blank: TrackerState) -> Progress | None:
+        """Open the files of a run that was cut short, without what came after its last checkpoint.
+
+        Args:
+            config: the effective configuration, which has to be the earlier run's.
+            blank: a tracker's state of the shapes to expect.
+
+        Returns:
+            Where the run stood; None where there is nothing to go on from: then `start`.
 
         Raises:
-            GavoError: the disk is full, or the like.
+            GavoError: the earlier run is another one, or its files are damaged.
         """
-        self._rows.writerow(frame_row(step))
-        self._trajectory.write(format_tum_row(step.timestamp, step.world_T_camera) + "\n")
-        self._flush()
+        if (self.path / CONFIG).exists():
+            _refuse_another(self.path / CONFIG, config)
+        if not (self.path / CHECKPOINT).exists():
+            return None
+        progress, sizes = load_checkpoint(self.path / CHECKPOINT, blank)
+        if set(sizes) != {TRAJECTORY, FRAMES} or not all(isinstance(size, int) and size > 0 for size in sizes.values()):
+            raise GavoError(f"{self.path / CHECKPOINT}: not a whole checkpoint: run again without --resume")
+        remove_files(self.path, METRICS)
+        remove_figures(self.path)
+        self._open(sizes)
+        self._whole = (sizes, progress)
+        return progress
 
-    def finish(self, metrics: Mapping[str, Any]) -> None:
-        """Write metrics.json, whole or not at all.
+    def finished(self) -> dict[str, Any] | None:
+        """The metrics of an earlier run in this folder that came to its end; None where there is none.
+
+        Raises:
+            GavoError: they cannot be read.
+        """
+        path = self.path / METRICS
+        if not path.exists() or (self.path / CHECKPOINT).exists():
+            return None
+        return read_json(path)
+
+    def add(self, step: Step, progress: Progress | None = None) -> None:
+        """Append one frame: its pair's row, and its pose unless its stamp is in doubt.
+
+        Args:
+            step: what the driver says of it.
+            progress: where the driver stands now, for a checkpoint.
+
+        Raises:
+            GavoError: the disk is full, or the like; the files then end with the last whole row.
+        """
+        row = io.StringIO()
+        csv.writer(row, lineterminator="").writerow(frame_row(step))
+        self._files[FRAMES].append(row.getvalue())
+        if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
+            self._files[TRAJECTORY].append(format_tum_row(step.timestamp, step.world_T_camera))
+        self._whole = (self._sizes(), progress)
+
+    def save_checkpoint(self) -> None:
+        """Write where the run stands, so that it can be resumed from here.
+
+        Raises:
+            GavoError: it cannot be written.
+        """
+        sizes, progress = self._whole
+        if progress is not None:
+            save_checkpoint(self.path / CHECKPOINT, progress, sizes)
+
+    def steps(self) -> list[Step]:
+        """The steps of the run so far, as the files tell them; see `read_steps`."""
+        self._cut()
+        return read_steps(self.path)
+
+    def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
+        """Write metrics.json, whole or not at all; after it a run that is complete needs no checkpoint any more.
 
         Raises:
             GavoError: it cannot be written.
         """
         write_json(self.path / METRICS, metrics)
+        if complete:
+            remove_files(self.path, CHECKPOINT)
 
-    def _flush(self) -> None:
-        try:
-            self._trajectory.flush()
-            self._frames.flush()
-        except OSError as error:
-            raise GavoError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
+    def _open(self, sizes: Mapping[str, int]) -> None:
+        for name, size in sizes.items():
+            self._files[name] = _GrowingFile(self.path / name, size)
+
+    def _sizes(self) -> dict[str, int]:
+        return {name: file.size for name, file in self._files.items()}
+
+    def _cut(self) -> None:
+        """Take away the part of a frame that an interruption left."""
+        for name, size in self._whole[0].items():
+            if self._files[name].size != size:
+                self._files[name].cut(size)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._files.close()
+        self._cut()
+        for file in self._files.values():
+            file.close()
+
+
+def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:
+    """Raise GavoError where a config.json is not of the run that `config` describes; it names the first difference."""
+    earlier = read_json(path)
+    now = json.loads(json.dumps(describe(config), allow_nan=False))
+    for name, before, after in _differences(_identity(earlier), _identity(now), ""):
+        raise GavoError(
+            f"{path}: is of another run, which --resume cannot go on with: {name} {before} there, {after} now"
+        )
+
+
+def _identity(config: dict[str, Any]) -> dict[str, Any]:
+    def part(name: str, keys: tuple[str, ...]) -> dict[str, Any]:
+        values = config.get(name)
+        return {key: values.get(key) for key in keys} if isinstance(values, dict) else {}
+
+    whole = {key: config.get(key) for key in IDENTITY_KEYS}
+    return {**whole, **part("options", IDENTITY_OPTIONS), **part("versions", IDENTITY_VERSIONS)}
+
+
+def _differences(before: Any, after: Any, name: str) -> Iterator[tuple[str, str, str]]:
+    """The places where two JSON values differ: name, one value, the other."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*after, *before]):
+            yield from _differences(before.get(key), after.get(key), f"{name}.{key}".lstrip("."))
+    elif before != after:
+        yield name, json.dumps(before)[:60], json.dumps(after)[:60]
+
+
+def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
+    """The steps of a run as its trajectory.txt and frames.csv tell them.
+
+    Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame without a pose has
+    the one before it.
+
+    Args:
+        folder: Of the run.
+        trajectory: Of trajectory.txt, where it has been read already.
+
+    Raises:
+        GavoError: a file cannot be read or is damaged.
+    """
+    poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
+    by_stamp = {f"{stamp:.6f}": i for i, stamp in enumerate(poses.timestamps)}
+    steps: list[Step] = []
+    place = 0
+    for number, row in enumerate(csv.DictReader(read_text(folder / FRAMES).splitlines()), start=2):
+        try:
+            stamp = float(row["timestamp"])
+            if row["timestamp"] in by_stamp:
+                place = by_stamp[row["timestamp"]]
+                stamp = float(poses.timestamps[place])
+            world_T_camera = poses.world_T_camera[place]
+            reference = poses.world_T_camera[by_stamp.get(row["reference_timestamp"], place)]
+            steps.append(_read_step(row, stamp, world_T_camera, inverse(world_T_camera) @ reference))
+        except (KeyError, TypeError, ValueError):
+            raise GavoError(f"{folder / FRAMES}:{number}: not a row of a run") from None
+    return steps
+
+
+def _read_step(
+    row: Mapping[str, str], timestamp: float, world_T_camera: np.ndarray, target_T_reference: np.ndarray
+) -> Step:
+    deviations = np.array([float(row[name]) for name in DEVIATIONS])
+    alignment = no_alignment(AlignmentStatus[row["status"].upper()])._replace(
+        target_T_reference=target_T_reference,
+        error=np.float32(row["error"]),
+        overlap=np.float32(row["overlap"]),
+        covariance=np.diag(deviations**2),
+    )
+    return Step(
+        int(row["index"]),
+        float(row["reference_timestamp"]),
+        timestamp,
+        alignment,
+        world_T_camera,
+        float(row["milliseconds"]),
+        row["lost"] == "1",
+        row["on_lost"],  # pyright: ignore[reportArgumentType]
+    )
 
 
 def frame_row(step: Step) -> list[Any]:
@@ -124,6 +323,7 @@ def frame_row(step: Step) -> list[Any]:
         _digits(alignment.overlap),
         alignment.status.name.lower(),
         int(step.lost),
+        step.policy,
         *map(_digits, deviations),
         f"{step.milliseconds:.3f}",
     ]
@@ -135,7 +335,7 @@ class RecordedRun(NamedTuple):
     config: dict[str, Any]
     trajectory: Trajectory
     steps: list[Step]
-    """Of each frame after the first; covariance, history and twist are not on disk and left unknown."""
+    """Of each frame after the first; see `read_steps`."""
 
 
 def read_run(folder: str | Path) -> RecordedRun:
@@ -146,49 +346,24 @@ def read_run(folder: str | Path) -> RecordedRun:
     """
     folder = Path(folder)
     config = read_json(folder / CONFIG)
-    if not isinstance(config, dict):
-        raise GavoError(f"{folder / CONFIG}: not a configuration")
     trajectory = Trajectory.read_tum(folder / TRAJECTORY)
-    rows = list(csv.DictReader(read_text(folder / FRAMES).splitlines()))[: len(trajectory) - 1]
-    try:
-        steps = [_read_step(row, trajectory) for row in rows]
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise GavoError(f"{folder / FRAMES}: not the frames of {TRAJECTORY}: {error}") from None
-    return RecordedRun(config, trajectory, steps)
+    return RecordedRun(config, trajectory, read_steps(folder, trajectory))
 
 
-def _read_step(row: Mapping[str, str], trajectory: Trajectory) -> Step:
-    index = int(row["index"])
-    reference_timestamp, timestamp = float(row["reference_timestamp"]), float(row["timestamp"])
-    reference = int(np.argmin(np.abs(trajectory.timestamps - reference_timestamp)))
-    if abs(trajectory.timestamps[index] - timestamp) > STAMP_TOLERANCE:
-        raise ValueError(f"its row {index} is of another time")
-    world_T_camera = trajectory.world_T_camera[index]
-    target_T_reference = inverse(world_T_camera) @ trajectory.world_T_camera[reference]
-    alignment = no_alignment(AlignmentStatus[row["status"].upper()])._replace(
-        target_T_reference=target_T_reference, error=float(row["error"]), overlap=float(row["overlap"])
-    )
-    return Step(
-        index,
-        reference_timestamp,
-        timestamp,
-        alignment,
-        world_T_camera,
-        float(row["milliseconds"]),
-        bool(int(row["lost"])),
-    )
-
-
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
 
     Raises:
-        GavoError: it is missing, unreadable or no JSON.
+        GavoError: it is missing, unreadable or none.
     """
+    text = read_text(path)
     try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise error if isinstance(error, GavoError) else GavoError(f"{path}: not JSON: {error}") from None
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise GavoError(f"{path}: not a JSON object")
+    return value
 
 
 def environment() -> dict[str, str]:
@@ -206,7 +381,8 @@ def environment() -> dict[str, str]:
 def describe(value: Any) -> Any:
     """Return a value as JSON knows it: settings with the name of their type, arrays as lists, not-a-number as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        entries = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        shown = [field.name for field in dataclasses.fields(value) if field.repr]
+        entries = {name: describe(getattr(value, name)) for name in shown}
         return {"type": type(value).__name__, **entries}
     if isinstance(value, enum.Enum):
         return value.name.lower()
@@ -241,16 +417,16 @@ def prepare_folder(folder: str | Path) -> Path:
 
 
 def remove_files(folder: Path, *names: str) -> None:
-    """Remove files of an earlier run, where there are any.
+    """Remove files of an earlier run, and what a kill left half written, where there are any.
 
     Raises:
         GavoError: one cannot be removed.
     """
-    for name in names:
+    for path in (folder / (name + suffix) for name in names for suffix in ("", PARTIAL)):
         try:
-            (folder / name).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
         except OSError as error:
-            raise GavoError(f"{folder / name}: cannot be replaced: {error.strerror or error}") from None
+            raise GavoError(f"{path}: cannot be replaced: {error.strerror or error}") from None
 
 
 def remove_figures(folder: Path) -> None:

@@ -19,6 +19,9 @@ MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
 
+PARTIAL = ".partial"
+"""Suffix of a file that is being written."""
+
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
 
@@ -264,15 +267,24 @@ def _digits(value: float, decimals: int) -> str:
 
 
 def write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    """Write a text file whole or not at all: beside it first, then renamed into place.
+    """Write a text file whole or not at all.
+
+    Raises:
+        GavoError: the file cannot be written.
+    """
+    write_bytes(path, ("\n".join(lines) + "\n").encode("utf-8"))
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file whole or not at all: beside it first, then renamed into place.
 
     Raises:
         GavoError: the file cannot be written.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(path.name + PARTIAL)
     try:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        partial.write_bytes(data)
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)

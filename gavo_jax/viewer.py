@@ -547,9 +547,9 @@ class Generation(NamedTuple):
 
 def generations_of(population: Population) -> list[Generation]:
     """Return a level's generations. Blue is the level's best error, vermilion that of its worst particles."""
+    population = population.trimmed()
     xi, error = np.asarray(population.xi), np.asarray(population.error)
-    filled = ~np.isnan(error).all(axis=1)
-    xi, rmse = xi[filled], np.sqrt(np.where(np.isfinite(error[filled]), error[filled], np.inf))
+    rmse = np.sqrt(np.where(np.isfinite(error), error, np.inf))
     finite = rmse[np.isfinite(rmse)]
     if finite.size == 0:
         return []

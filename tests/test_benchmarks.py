@@ -109,6 +109,23 @@ def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path) -> None:
     assert record["ratios"]["score / numba"]["80x60"] == pytest.approx(times["score"] / times["numba"])
 
 
+def test_faults_are_counted(load, tmp_path: Path) -> None:
+    faults: ModuleType = load("faults")
+    monkey = SyntheticSequence(20, rate=10.0, speed=0.2)
+    faults.common.open_clip = lambda _: monkey
+    chosen = "black,truncated PNG,equal stamps"
+    faults.main(clip=CLIP, clips=CLIP, method="gauss-newton", faults=chosen, json=tmp_path / "faults.json")
+    record = read(tmp_path / "faults.json")
+    assert [row["fault"] for row in record["faults"]] == chosen.split(",")
+    for row, status in zip(record["faults"], ("blank", "unreadable", "bad_timestamp"), strict=True):
+        assert row["flagged"] == 1.0 and row["statuses"] == {status: 5} and not row["crashed"]
+        assert row["ratio"] == pytest.approx(row["drift"] / row["clean_drift"])
+    [clean] = record["clean"]
+    assert clean["pairs"] == 19 and clean["false_alarms"] == 1 - clean["statuses"].get("ok", 0) / 19
+    with pytest.raises(GavoError, match="nonsense"):
+        faults.main(clip=CLIP, faults="nonsense")
+
+
 def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
     monkeypatch.syspath_prepend(str(FOLDER))
     open_clip = importlib.import_module("common").open_clip

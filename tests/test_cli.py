@@ -155,7 +155,25 @@ def test_torn_frame_is_flagged_and_the_run_goes_on(gavo, clip, tmp_path):
     rows = read_rows(tmp_path / "out")
     assert metrics["frames"] == 6 and metrics["lost_pairs"] == sum(int(row["lost"]) for row in rows) >= 1
     assert [row["status"] for row in rows].count("unreadable") == 1 and len(rows) == 5
+    assert all(row["on_lost"] == ("hold" if row["lost"] == "1" else "") for row in rows)
+    assert metrics["statuses"]["unreadable"] == 1 and sum(metrics["statuses"].values()) == 5
     assert gavo(*arguments, "--strict").status == 3
+
+
+def test_equal_stamps_are_flagged_and_have_no_pose(gavo, pristine, tmp_path):
+    clip = tmp_path / "clip"
+    shutil.copytree(pristine, clip)
+    rows = (clip / "rgb.txt").read_text().splitlines()
+    rows[8] = f"{rows[7].split()[0]} {rows[8].split()[1]}"
+    (clip / "rgb.txt").write_text("\n".join(rows) + "\n")
+    done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--frames", 14, "--output", tmp_path / "out")
+    assert done.status == 0 and "bad_timestamp" in done.out
+    table = read_rows(tmp_path / "out")
+    assert [row["index"] for row in table if row["status"] == "bad_timestamp"] == ["6", "7"]
+    assert [row["status"] for row in table].count("ok") >= 10
+    stamps = Trajectory.read_tum(tmp_path / "out" / "trajectory.txt").timestamps
+    assert len(stamps) == 12 and np.all(np.diff(stamps) > 0)
+    assert read_json(tmp_path / "out" / "metrics.json")["frames"] == 14
 
 
 def test_interrupted_run_keeps_what_is_done(gavo, clip, tmp_path, monkeypatch):

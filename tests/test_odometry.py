@@ -233,6 +233,93 @@ def test_a_covered_lens_is_survived(sequence: SyntheticSequence) -> None:
     assert np.isfinite(result.trajectory.world_T_camera).all()
 
 
+def grey(value: int) -> Callable[[Frame], Frame]:
+    return lambda frame: replace(frame, grey=np.full_like(frame.grey, value))
+
+
+def without_depth(share: float) -> Callable[[Frame], Frame]:
+    def damage(frame: Frame) -> Frame:
+        rows = np.arange(frame.depth.shape[0])[:, None]
+        return replace(frame, depth=np.where(rows < share * len(rows), 0, frame.depth))
+
+    return damage
+
+
+DAMAGES = {
+    "black": (grey(0), AlignmentStatus.BLANK, True),
+    "millimetres": (lambda frame: replace(frame, depth=frame.depth // 5), AlignmentStatus.DEPTH_UNITS, True),
+    "no depth": (without_depth(1.0), AlignmentStatus.NO_DEPTH, False),
+    "half the depth": (without_depth(0.5), AlignmentStatus.PARTIAL_DEPTH, False),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_frame_is_flagged_and_never_a_reference(
+    name: str, sequence: SyntheticSequence, plain_run: OdometryRun
+) -> None:
+    damage, status, lost = DAMAGES[name]
+    damaged = (4, 8)
+    result = run(Altered(sequence, lambda index, frame: damage(frame) if index in damaged else frame))
+    for step in result.steps:
+        expected = (status, lost) if step.index in damaged else (AlignmentStatus.OK, False)
+        assert (step.alignment.status, step.lost) == expected, step.index
+        assert step.policy == ("hold" if step.lost else "")
+        if step.index - 1 in damaged:
+            assert step.reference_timestamp == sequence.timestamps[step.index - 2]
+    others = [i for i in range(FRAMES) if i not in damaged or not lost]
+    assert errors(result, sequence)[others].max() < errors(plain_run, sequence).max() + 0.004
+
+
+def test_a_frozen_image_stands_still(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
+    frozen = Altered(sequence, lambda i, f: replace(sequence[4], timestamp=f.timestamp) if i == 5 else f)
+    result = run(frozen)
+    assert result.steps[4].alignment.status is AlignmentStatus.FROZEN
+    np.testing.assert_array_equal(result.steps[4].world_T_camera, result.steps[3].world_T_camera)
+    assert [step.index for step in result.steps if step.lost] == [5]
+    assert errors(result, sequence)[6:].max() < errors(plain_run, sequence).max() + 0.004
+
+
+@pytest.mark.parametrize("shift", [0.0, -0.02])
+def test_a_bad_stamp_has_no_pose(sequence: SyntheticSequence, plain_run: OdometryRun, shift: float) -> None:
+    altered = Altered(sequence, lambda index, frame: replace(frame, timestamp=float(altered.timestamps[index])))
+    altered.timestamps = sequence.timestamps.copy()
+    altered.timestamps[6] = altered.timestamps[5] + shift
+    result = run(altered)
+    assert [step.index for step in result.steps if step.lost] == [6]
+    assert result.steps[5].alignment.status is AlignmentStatus.BAD_TIMESTAMP
+    assert result.metrics["statuses"] == {"ok": FRAMES - 2, "bad_timestamp": 1}
+    np.testing.assert_array_equal(result.trajectory.timestamps, np.delete(sequence.timestamps, 6))
+    assert errors(result, sequence).max() < errors(plain_run, sequence).max() + 0.004
+
+
+def test_dropped_frames_are_told_and_bridged(sequence: SyntheticSequence) -> None:
+    kept = [0, 1, 2, 3, 4, 5, 9, 10, 11]
+    gapped = Altered(sequence, lambda index, frame: frame)
+    gapped.timestamps = sequence.timestamps[kept]
+    odometry = Odometry(CAMERA, SOLVER, options=PLAIN)
+    steps = [odometry.register(sequence[i], float(sequence.timestamps[i])) for i in kept]
+    told = {kept[i]: step.alignment.status for i, step in enumerate(steps) if step and step.alignment.status}
+    assert told == {9: AlignmentStatus.GAP} and not any(step.lost for step in steps if step)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_only_a_good_frame_becomes_the_first_reference(sequence: SyntheticSequence, count: int) -> None:
+    """A lens cap on at the start, for shorter and longer than a reference is held."""
+    result = run(Altered(sequence, lambda index, frame: grey(0)(frame) if index < count else frame))
+    statuses = [step.alignment.status for step in result.steps]
+    assert statuses[: count - 1] == [AlignmentStatus.BLANK] * (count - 1)
+    assert statuses[count - 1] is AlignmentStatus.NO_REFERENCE
+    assert statuses[count:] == [AlignmentStatus.OK] * (FRAMES - 1 - count)
+    np.testing.assert_array_equal(result.steps[count - 1].world_T_camera, np.eye(4))
+
+
+def test_a_lost_run_never_starts_again_from_a_bad_frame(sequence: SyntheticSequence) -> None:
+    """Five black frames, more than a reference is held: the frame after them is aligned with the one before."""
+    result = run(Altered(sequence[:10], lambda index, frame: grey(0)(frame) if 3 <= index < 8 else frame))
+    after = result.steps[7]
+    assert after.reference_timestamp == sequence.timestamps[2]
+
+
 def test_the_first_frame_is_needed(sequence: SyntheticSequence) -> None:
     with pytest.raises(FrameError, match="0.png"):
         run(Altered(sequence, unreadable(0)))

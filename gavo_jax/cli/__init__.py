@@ -1,6 +1,7 @@
 """The command `gavo`: parses, hands over to a subcommand, and turns bad input into one line and exit status 2."""
 
 import contextlib
+import errno
 import io
 import itertools
 import os
@@ -15,6 +16,9 @@ from gavo_jax.version import __version__
 
 BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 """Exit statuses; 0 is done, 3 is `cli.run.LOST` (`--strict`)."""
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a full disk, quota or file."""
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
@@ -33,16 +37,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         command = _parse(arguments)
-        return 0 if command is None else _execute(command)
+        status = 0 if command is None else _execute(command)
+        sys.stdout.flush()
+        return status
     except GavoError as error:
         return _refuse(str(error))
     except KeyboardInterrupt:
         print("gavo: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # the reader of standard output has gone; point it elsewhere so that closing it at exit stays quiet
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence_output()
         return BROKEN_PIPE
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        _silence_output()
+        return _refuse(f"{error.filename or 'output'}: cannot be written to: {error.strerror}")
 
 
 def _execute(command: Command) -> int:
@@ -102,6 +112,11 @@ def _first_paragraph(box: str) -> str:
 def _help_of(arguments: list[str]) -> str:
     known = ("run", "compare", "view", "align", "evaluate")
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
+
+
+def _silence_output() -> None:
+    """Point standard output, which takes no more, elsewhere, so that closing it at exit stays quiet."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _refuse(message: str) -> int:

@@ -1,6 +1,7 @@
 """Where compiled programs are kept between runs, so that only the first command on a machine waits for them."""
 
 import os
+import warnings
 from pathlib import Path
 
 import jax
@@ -17,7 +18,11 @@ def cache_folder() -> Path | None:
 
 
 def enable_compilation_cache() -> None:
-    """Have JAX keep compiled programs in `cache_folder()`, unless `JAX_COMPILATION_CACHE_DIR` says where."""
+    """Have JAX keep compiled programs in `cache_folder()`, unless `JAX_COMPILATION_CACHE_DIR` says where.
+
+    An entry that cannot be read or written (torn by a kill, a full disk) costs a compilation and no word.
+    """
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
     folder = cache_folder()
     if os.environ.get("JAX_COMPILATION_CACHE_DIR") or folder is None:
         return

@@ -52,6 +52,8 @@ class Run(Source):
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
+    resume: bool = False
+    """Go on with the run in the folder where it was cut short; the options have to be the same."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 

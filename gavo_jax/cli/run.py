@@ -1,5 +1,7 @@
 """`gavo run`: a sequence to a trajectory, its errors and figures."""
 
+import sys
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +15,16 @@ from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.odometry import Odometry
+from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
 from gavo_jax.presets import Preset, get_preset
 from gavo_jax.results import RECORDING, RunFolder, environment
-from gavo_jax.viewer import make_viewer
+from gavo_jax.viewer import Viewer, make_viewer
 
 LOST = 3
 """Exit status where a pair was lost and `--strict` asked to know."""
+
+CHECKPOINT_SECONDS = 2.0
+"""Between two checkpoints; each takes some 20 ms."""
 
 FIGURES_OF_MERIT = (
     ("drift: RPE over 1 s, translation, RMSE", "rpe_translation_rmse_m_per_s", 6, "m/s"),
@@ -46,8 +51,6 @@ def run(options: Run) -> int:
     viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
     with RunFolder(path) as folder, viewer:
-        folder.start(_config(options, preset, sequence), float(sequence.timestamps[0]))
-        viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
         odometry = Odometry(
             sequence.camera,
             preset.solver,
@@ -56,23 +59,61 @@ def run(options: Run) -> int:
             options.seed,
             record=viewer.wants_populations,
         )
-        tracked = track_visibly(name, sequence, odometry, folder.add, viewer)
-        metrics = {
-            "sequence": sequence.name,
-            "method": options.method,
-            "preset": options.preset,
-            "seed": options.seed,
-            "complete": len(tracked.steps) == len(sequence) - 1,
-            **tracked.metrics,
-        }
-        draw(folder.path, {options.method: tracked.trajectory}, sequence.ground_truth)
-        draw_search(folder.path, sequence, odometry, tracked.steps)
-        folder.finish(metrics)
+        config = _config(options, preset, sequence)
+        progress = folder.resume(config, odometry.blank_state()) if options.resume else None
+        metrics, interrupted = folder.finished() if options.resume else None, False
+        if metrics is not None:
+            print(f"gavo: {folder.path}: the run came to its end before: nothing to resume", file=sys.stderr)
+        else:
+            if progress is None:
+                folder.start(config, float(sequence.timestamps[0]))
+            else:
+                odometry.progress = progress
+            viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
+            metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
     _report(name, metrics, folder.path)
-    if tracked.interrupted:
+    if interrupted:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _track(
+    name: str, options: Run, sequence: Sequence, odometry: Odometry, folder: RunFolder, viewer: Viewer
+) -> tuple[dict[str, Any], bool]:
+    """Track the frames that are left and write the files; return what metrics.json says, and whether Ctrl-C came.
+
+    Errors are computed from the files, so that a run that was resumed ends with the same ones as a run in one go.
+    """
+    saved: float | None = None
+
+    def on_step(step: Step) -> None:
+        nonlocal saved
+        folder.add(step, odometry.progress)
+        if saved is None:
+            saved = time.monotonic()
+        elif time.monotonic() - saved > CHECKPOINT_SECONDS:
+            folder.save_checkpoint()
+            saved = time.monotonic()
+
+    tracked = track_visibly(name, sequence, odometry, on_step, viewer)
+    if tracked.interrupted:
+        folder.save_checkpoint()
+    steps = folder.steps()
+    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    metrics = {
+        "sequence": sequence.name,
+        "method": options.method,
+        "preset": options.preset,
+        "seed": options.seed,
+        "complete": len(steps) == len(sequence) - 1,
+        **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics["compile_seconds"]),
+        "frames_per_second": tracked.metrics["frames_per_second"],
+    }
+    draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
+    draw_search(folder.path, sequence, odometry, tracked.steps)
+    folder.finish(metrics, complete=not tracked.interrupted)
+    return metrics, tracked.interrupted
 
 
 def _effective_preset(options: Run) -> Preset:
@@ -110,6 +151,9 @@ def _config(options: Run, preset: Preset, sequence: Sequence) -> dict[str, Any]:
 
 
 def _report(name: str, metrics: Mapping[str, Any], folder: Path) -> None:
-    rows = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in FIGURES_OF_MERIT]
+    rows = [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in FIGURES_OF_MERIT]
+    rows += [
+        (f"pairs: {status}", str(count), "") for status, count in metrics.get("statuses", {}).items() if status != "ok"
+    ]
     print_table(name, ("", "", "unit"), rows)
     print(f"files in {folder}")

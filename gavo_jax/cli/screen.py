@@ -23,7 +23,7 @@ class PairProgress:
 
 
 @contextmanager
-def pair_progress(label: str, pairs: int) -> Iterator[PairProgress]:
+def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgress]:
     """Show a bar on standard error while the block runs; nothing where that is no terminal."""
     console = Console(stderr=True)
     columns = (
@@ -34,7 +34,7 @@ def pair_progress(label: str, pairs: int) -> Iterator[PairProgress]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        yield PairProgress(progress, progress.add_task(f"{label}: compiling …", total=pairs), label)
+        yield PairProgress(progress, progress.add_task(f"{label}: compiling …", total=pairs, completed=done), label)
 
 
 @contextmanager

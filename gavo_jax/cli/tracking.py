@@ -43,19 +43,19 @@ def track_visibly(
     on_step: Callable[[Step], None] | None = None,
     viewer: Viewer = NO_VIEWER,
 ) -> Tracked:
-    """Compile, then track every frame under a progress bar and before a viewer's eyes.
+    """Compile, then track every frame, from where the driver stands, under a progress bar and before a viewer's eyes.
 
     Raises:
         KeyboardInterrupt: the user stopped it before the first pair was done.
     """
-    pairs = len(sequence) - 1
+    pairs, done = len(sequence) - 1, max(odometry.progress.last_index, 0)
     steps: list[Step] = []
     interrupted = False
 
     def watch(frame: Frame | None, step: Step | None) -> None:
         viewer.watch(frame, step, odometry.populations)
 
-    with pair_progress(label, pairs) as bar:
+    with pair_progress(label, pairs, done) as bar:
         compile_seconds = odometry.warm_up()
         start = time.perf_counter()
         try:
@@ -70,7 +70,7 @@ def track_visibly(
             interrupted = True
         seconds = time.perf_counter() - start
     if interrupted:
-        print(f"gavo: {label}: interrupted after {len(steps)} of {pairs} pairs", file=sys.stderr)
+        print(f"gavo: {label}: interrupted after {done + len(steps)} of {pairs} pairs", file=sys.stderr)
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
     return Tracked(trajectory, steps, metrics, interrupted)
@@ -111,7 +111,8 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
         histories = dict(zip(solver.levels, parts, strict=True))
         save_figure(plots.plot_convergence(histories), folder, "convergence")
     if odometry.populations:
-        errors = {int(population.level): np.asarray(population.error) for population in odometry.populations}
+        trimmed = [population.trimmed() for population in odometry.populations]
+        errors = {int(population.level): np.asarray(population.error) for population in trimmed}
         save_figure(plots.plot_population(errors), folder, "population")
     landscape = _landscape_of(sequence, odometry, good[len(good) // 2])
     if landscape is not None:

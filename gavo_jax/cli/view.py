@@ -4,14 +4,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gavo_jax.camera import Camera
 from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.results import CONFIG, STAMP_TOLERANCE, VIEW, RecordedRun, read_run
+from gavo_jax.odometry import Step
+from gavo_jax.results import CONFIG, VIEW, RecordedRun, read_run
 from gavo_jax.viewer import make_viewer
 
 
@@ -47,13 +46,20 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
             sequence = open_sequence(source)
         except (KeyError, TypeError) as error:
             raise GavoError(f"{folder / CONFIG}: does not name the sequence: {error}") from None
-        stamps = run.trajectory.timestamps
-        if len(sequence) < len(stamps) or np.any(np.abs(sequence.timestamps[: len(stamps)] - stamps) > STAMP_TOLERANCE):
+        if not all(_is_of(step, sequence) for step in run.steps):
             raise GavoError(f"{source.sequence}: holds other frames than those of the run")
         return sequence
     except GavoError as error:
         print(f"gavo: without images and truth: {error}", file=sys.stderr)
         return None
+
+
+def _is_of(step: Step, sequence: Sequence) -> bool:
+    return step.index < len(sequence) and abs(sequence.timestamps[step.index] - step.timestamp) < ROUNDED
+
+
+ROUNDED = 1e-6
+"""Seconds: stamps of a run's files are rounded to microseconds."""
 
 
 def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:

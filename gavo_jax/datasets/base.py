@@ -16,6 +16,10 @@ class FrameError(GavoError):
     """A single frame that cannot be read: a fault of that frame, not of the whole sequence."""
 
 
+class TimestampError(FrameError):
+    """A frame whose time is in doubt."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One RGB-D image.

@@ -1,10 +1,13 @@
 """Sequences in the folder layout of the TUM RGB-D benchmark (Sturm et al. 2012)."""
 
+import bisect
+import itertools
 import math
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +18,24 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera, camera_for_sequence, load_camera
-from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate
 
 MAX_DIFFERENCE = 0.02
 """Colour and depth stamps at least this far apart, in seconds, are not of one frame."""
+
+MAX_LIST_BYTES = 16 * 2**20
+"""Hours of frames; what is larger is no list of them."""
+
+MAX_PATH = 1000
+"""Characters of a path in a list."""
+
+MAX_STAMP = 1e15
+"""Seconds; beyond, microseconds are lost in double precision anyway."""
+
+MAX_MISPLACED = 0.25
+"""Share of a list's rows whose stamps may be out of order; a list with more is merely unsorted."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREYSCALE = 0
@@ -31,8 +46,12 @@ class TumSequence:
     """A folder with `rgb.txt`, `depth.txt`, the PNG images they list and, where known, `groundtruth.txt`.
 
     Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`); frames come in the
-    order of their colour stamps and carry them. Lists need not be sorted; of rows with equal stamps the first is kept.
-    Images are decoded one by one when asked for, and nothing of them is kept.
+    order of their colour stamps and carry them. Images are decoded one by one when asked for, and nothing of them is
+    kept.
+
+    Lists need not be sorted. But where all but a few stamps of a list increase (`MAX_MISPLACED`), those few are in
+    doubt: a frame of such a colour or depth stamp has its place by it, but reading it raises `TimestampError`. In an
+    unsorted list the first of rows with equal stamps is kept.
 
     Attributes:
         name: the folder's name, unless given.
@@ -76,15 +95,14 @@ class TumSequence:
         self._recorded = camera if isinstance(camera, Camera) else load_camera(camera)
         self._undistort, self._color = undistort, color
         self.camera = self._recorded.rectified() if undistort else self._recorded
-        color_stamps, color_paths = _read_list(resolved, self.folder / "rgb.txt")
-        depth_stamps, depth_paths = _read_list(resolved, self.folder / "depth.txt")
-        color_index, depth_index = associate(color_stamps, depth_stamps, max_difference)
-        if len(color_index) == 0:
+        color_rows, depth_rows = (_read_list(resolved, self.folder / name) for name in ("rgb.txt", "depth.txt"))
+        entries = _associate_lists(color_rows, depth_rows, max_difference)
+        if not entries:
             raise GavoError(
                 f"{self.folder}: no stamps of rgb.txt and depth.txt within {max_difference:g} s of each other"
             )
-        self._timestamps, self._depth_timestamps = color_stamps[color_index], depth_stamps[depth_index]
-        self._paths = [(color_paths[i], depth_paths[j]) for i, j in zip(color_index, depth_index, strict=True)]
+        self._timestamps = np.array([entry.color.stamp for entry in entries])
+        self._entries = entries
         truth = self.folder / "groundtruth.txt"
         self.ground_truth = Trajectory.read_tum(truth) if truth.exists() else None
 
@@ -95,7 +113,7 @@ class TumSequence:
 
     def __len__(self) -> int:
         """Return the number of frames."""
-        return len(self._paths)
+        return len(self._entries)
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
@@ -106,17 +124,19 @@ class TumSequence:
 
         Raises:
             IndexError: no such frame.
-            FrameError: one of its two images is missing, torn, or of the wrong size or kind.
+            FrameError: one of its two images is missing, torn, or of the wrong size or kind, or its stamp is in doubt.
         """
         if isinstance(index, slice):
             part = copy(self)
-            part._timestamps, part._paths = self._timestamps[index], self._paths[index]
-            part._depth_timestamps = self._depth_timestamps[index]
+            part._timestamps, part._entries = self._timestamps[index], self._entries[index]
             return part
-        color_path, depth_path = self._paths[index]
-        timestamp, depth_timestamp = float(self._timestamps[index]), float(self._depth_timestamps[index])
-        frame = read_frame(color_path, depth_path, self._recorded, timestamp, self._color, self._undistort)
-        return replace(frame, depth_timestamp=depth_timestamp)
+        color, depth = self._entries[index]
+        for row in (color, depth):
+            if row is not None and row.misplaced:
+                raise TimestampError(f"{row.place}: stamp {row.stamp:.6f} is out of order or given twice")
+        assert depth is not None
+        frame = read_frame(color.path, depth.path, self._recorded, color.stamp, self._color, self._undistort)
+        return replace(frame, depth_timestamp=depth.stamp)
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode frame after frame; raises `FrameError` at one that cannot be read."""
@@ -130,10 +150,10 @@ class TumSequence:
         """
         if len(self) == 0:
             raise GavoError(f"{self.folder}: no frames in the chosen range")
-        for paths in self._paths:
-            for path in paths:
-                if not os.path.isfile(path):
-                    raise GavoError(f"{path}: listed image is missing")
+        for entry in self._entries:
+            for row in entry:
+                if row is not None and not os.path.isfile(row.path):
+                    raise GavoError(f"{row.path}: listed image is missing")
         self[0]
 
 
@@ -175,29 +195,93 @@ class _PngHeader(NamedTuple):
     color_type: int
 
 
-def _read_list(root: Path, path: Path) -> tuple[np.ndarray, list[Path]]:
-    """Read `timestamp path` rows: stamps in increasing order, [n], and the images' paths, which stay below `root`."""
-    images: dict[float, Path] = {}
-    for place, fields in data_rows(path):
+class _Row(NamedTuple):
+    """A row of a list."""
+
+    stamp: float
+    path: Path
+    place: str
+    """file:line"""
+    misplaced: bool = False
+
+
+class _Entry(NamedTuple):
+    """A frame: its colour row, and its depth row unless the colour stamp is in doubt."""
+
+    color: _Row
+    depth: _Row | None
+
+
+def _read_list(root: Path, path: Path) -> list[_Row]:
+    """Read `timestamp path` rows, in the order of their stamps; the images' paths stay below `root`."""
+    rows: list[_Row] = []
+    for place, fields in data_rows(path, MAX_LIST_BYTES):
         if len(fields) != 2:
             raise GavoError(f"{place}: expected `timestamp path`, found {len(fields)} fields")
         try:
             stamp = float(fields[0])
         except ValueError:
             stamp = math.nan
-        if not math.isfinite(stamp):
+        if not abs(stamp) < MAX_STAMP:
             raise GavoError(f"{place}: not a time stamp: {fields[0][:60]!r}")
         try:
             image = (root / fields[1]).resolve()
+            if len(fields[1]) > MAX_PATH:
+                raise ValueError("too long")
         except (OSError, RuntimeError, ValueError):
             raise GavoError(f"{place}: not a usable path: {fields[1][:60]!r}") from None
         if not image.is_relative_to(root):
             raise GavoError(f"{place}: path leaves the sequence's folder: {fields[1][:200]!r}")
-        images.setdefault(stamp, path.parent / fields[1])
-    if not images:
+        rows.append(_Row(stamp, path.parent / fields[1], place))
+    if not rows:
         raise GavoError(f"{path}: lists no images")
-    stamps = sorted(images)
-    return np.array(stamps), [images[stamp] for stamp in stamps]
+    trusted = _in_order([row.stamp for row in rows])
+    if trusted.count(False) > MAX_MISPLACED * len(rows):
+        first = {row.stamp: row for row in reversed(rows)}
+        return [first[stamp] for stamp in sorted(first)]
+    rows = [row._replace(misplaced=not good) for row, good in zip(rows, trusted, strict=True)]
+    return sorted(rows, key=lambda row: row.stamp)
+
+
+def _in_order(stamps: list[float]) -> list[bool]:
+    """Whether each stamp belongs to every longest increasing run of stamps (rows may be left out of a run)."""
+
+    def lengths(values: Iterable[float]) -> list[int]:
+        tails: list[float] = []
+        result = []
+        for value in values:
+            at = bisect.bisect_left(tails, value)
+            tails[at : at + 1] = [value]
+            result.append(at + 1)
+        return result
+
+    before, after = lengths(stamps), lengths(-stamp for stamp in reversed(stamps))[::-1]
+    longest = max(before)
+    on_a_longest = [i + j - 1 == longest for i, j in zip(before, after, strict=True)]
+    rivals = Counter(i for i, used in zip(before, on_a_longest, strict=True) if used)
+    return [used and rivals[i] == 1 for i, used in zip(before, on_a_longest, strict=True)]
+
+
+def _associate_lists(color: list[_Row], depth: list[_Row], max_difference: float) -> list[_Entry]:
+    """Frames in the order of their colour stamps, from the first one that is in no doubt.
+
+    Rows in no doubt are associated first; of the others, depth goes to what is left of the colour rows, and a colour
+    row stands alone.
+    """
+    good = [row for row in color if not row.misplaced]
+    entries = [_Entry(row, None) for row in color if row.misplaced]
+    for misplaced in (False, True):
+        some = [row for row in depth if row.misplaced == misplaced]
+        i, j = associate(np.array([r.stamp for r in good]), np.array([r.stamp for r in some]), max_difference)
+        entries += [_Entry(good[a], some[b]) for a, b in zip(i, j, strict=True)]
+        taken = set(i.tolist())
+        good = [row for at, row in enumerate(good) if at not in taken]
+    entries.sort(key=lambda entry: entry.color.stamp)
+
+    def in_doubt(entry: _Entry) -> bool:
+        return entry.depth is None or entry.depth.misplaced
+
+    return list(itertools.dropwhile(in_doubt, entries))
 
 
 def _decode(path: Path, camera: Camera, depth: bool) -> np.ndarray:

@@ -104,8 +104,9 @@ class GeneticAlgorithm(PerLevel):
         return Best(state.population[0], state.error[0])
 
     def candidates(self, state: GeneticState) -> Candidates:
-        """The population, best first."""
-        return Candidates(state.population, state.error)
+        """The population, best first; NaN in the empty places."""
+        present = jnp.arange(state.error.shape[0]) < self.here(self.population)
+        return Candidates(jnp.where(present[:, None], state.population, jnp.nan), state.error)
 
     def _select(self, key: PRNGKeyArray, error: Float[Array, " p"], count: int) -> Integer[Array, " n"]:
         """Roulette wheel (11): indices drawn in proportion to the fitness f = exp(−8 E/E_min) (10)."""

@@ -84,5 +84,6 @@ class ParticleSwarm(PerLevel):
         return Best(state.memory[leader], state.memory_error[leader])
 
     def candidates(self, state: SwarmState) -> Candidates:
-        """The particles' memories."""
-        return Candidates(state.memory, state.memory_error)
+        """The particles' memories; NaN in the empty places."""
+        present = jnp.arange(state.x.shape[0]) < self.here(self.population)
+        return Candidates(jnp.where(present[:, None], state.memory, jnp.nan), state.memory_error)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, TimestampError
 from gavo_jax.datasets.tum import TumSequence, read_frame
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
@@ -107,6 +107,42 @@ def test_association_is_one_to_one_and_in_the_order_of_colour_stamps(folder):
     np.testing.assert_array_equal(sequence[0].color[..., ::-1], color_image(1))
     np.testing.assert_array_equal(sequence[0].depth, depth_image(1))
     np.testing.assert_array_equal(sequence[1].depth, depth_image(3))
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+@pytest.mark.parametrize(
+    ("stamps", "in_doubt"),
+    [
+        ({7: -0.05}, [6, 7]),
+        ({7: 0.0}, [6, 7]),
+        ({7: -0.4}, [7]),
+        ({4: -0.15, 9: -0.15}, [4, 9]),
+    ],
+    ids=str,
+)
+def test_a_few_stamps_out_of_order_are_in_doubt(folder, kind, stamps, in_doubt):
+    """Rows whose stamps do not fit the others', both where either may be the wrong one, are told and spoil no other."""
+    rows = {"rgb": [], "depth": []}
+    for i in range(12):
+        for part, wrong in (("rgb", kind == "rgb"), ("depth", kind == "depth")):
+            stamp = 100 + i / 10
+            if wrong and i in stamps:
+                stamp = 100 + (i - 1) / 10 + stamps[i]
+            rows[part].append(f"{stamp:.6f} {part}/{i % 6}.png")
+    for part, lines in rows.items():
+        (folder / f"{part}.txt").write_text("\n".join(lines) + "\n")
+    sequence = TumSequence(folder, CAMERA)
+    sequence.check()
+    good, bad = [], []
+    for i, stamp in enumerate(sequence.timestamps):
+        try:
+            good.append(round((sequence[i].timestamp - 100) * 10))
+        except TimestampError as error:
+            assert f"{kind}.txt:" in str(error)
+            bad.append(stamp)
+    assert good == [i for i in range(12) if i not in in_doubt]
+    assert len(bad) == len(in_doubt) or kind == "depth"
+    assert np.all(np.diff(sequence.timestamps) >= 0)
 
 
 def test_a_missing_ground_truth_is_none(folder):

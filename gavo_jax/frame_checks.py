@@ -1,0 +1,191 @@
+"""Whether a new frame can be trusted, before anything is aligned: from its own figures and those of the frames before.
+
+Each check costs a look at every fourth row, on the host; together they take well under a millisecond. A frame that
+fails one is told apart by its `AlignmentStatus`, and by what it may still be used for (`Use`).
+"""
+
+import enum
+import math
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from gavo_jax.alignment import MIN_DEPTH_SHARE, AlignmentStatus
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+
+
+class Use(enum.Enum):
+    """What a frame may be used for."""
+
+    NOTHING = "nothing"
+    TARGET = "target"
+    """It can be aligned with a reference, but makes a poor one itself."""
+    ALL = "all"
+
+
+class Finding(NamedTuple):
+    """What is known of a frame before it is aligned."""
+
+    status: AlignmentStatus
+    use: Use
+
+
+class History(NamedTuple):
+    """What the checks remember of the frames before."""
+
+    timestamp: float | None = None
+    """Latest stamp, seconds."""
+    checksum: int | None = None
+    """Of the last readable image."""
+    intervals: tuple[float, ...] = ()
+    """Between the last frames, seconds."""
+    clipped: tuple[float, ...] = ()
+    """Shares of black or white pixels of the last good frames."""
+    coverages: tuple[float, ...] = ()
+    """Shares of pixels with depth of the last frames that had any."""
+    range: float | None = None
+    """Median depth of the last good frame, metres."""
+    doubts: int = 0
+    """Frames in a row that were refused only for being unlike those before."""
+
+
+REMEMBERED = 15
+"""Frames whose median says what is usual."""
+MAX_DOUBTS = 3
+"""Frames in a row that may be refused for being unlike those before; then what was usual is forgotten."""
+MIN_CONTRAST = 3.0
+"""Grey levels: an image of a smaller standard deviation is blank."""
+BLACK, WHITE = 5, 250
+"""Grey levels up to and from which a pixel counts as clipped."""
+MAX_CLIPPED = 0.75
+"""Share of clipped pixels above which an image is blank or saturated."""
+MAX_CLIPPED_JUMP = 0.3
+"""The same, above the usual share: twice what the TUM clips show within half a second (a lamp, a window)."""
+MIN_CORRELATION = 0.7
+"""Of neighbouring pixels; below it an image is noise. Scenes have 0.93 and more at 160 pixels across, noise has 0, and
+up to a half where undistortion interpolated it."""
+MIN_COVERAGE_RATIO = 0.7
+"""Depth readings, against their usual number, below which depth is partial; the TUM clips stay above 0.92."""
+MAX_RANGE_RATIO = 2.5
+"""A median depth that grows or shrinks by more than this from a frame to the next is in other units; handheld motion
+stays within 1.4 a frame."""
+DEPTH_RANGE = (0.4, 15.0)
+"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer). Millimetres that are
+read as fifths of one put a scene nearer than 2 m there."""
+MAX_INTERVAL_RATIO = 2.5
+"""An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
+MIN_INTERVALS = 3
+"""Intervals that have to be known before one can be unusual."""
+ROW_STEP = 4
+
+
+def check_frame(
+    frame: Frame | FrameError | None, timestamp: float, camera: Camera, history: History
+) -> tuple[Finding, History]:
+    """Say whether the next frame can be trusted.
+
+    Args:
+        frame: The frame, or why there is none.
+        timestamp: Its colour stamp, seconds.
+        camera: Its size and depth units.
+        history: What is remembered of the frames before; `History()` at first.
+
+    Returns:
+        The finding, and what to remember from now on.
+    """
+    late = _check_timestamp(frame, timestamp, history)
+    if late.use is Use.NOTHING:
+        return _doubt(late, history)
+    history = _with_timestamp(history, timestamp)
+    if not isinstance(frame, Frame) or any(
+        np.shape(image) != (camera.height, camera.width) for image in (frame.grey, frame.depth)
+    ):
+        return _refused(AlignmentStatus.UNREADABLE), history
+    grey = np.asarray(frame.grey)[::ROW_STEP]
+    repeated, checksum = history.checksum, zlib.crc32(grey.tobytes())
+    history = history._replace(checksum=checksum)
+    if not np.isfinite(grey).all():
+        return _refused(AlignmentStatus.NOT_FINITE), history
+    clipped = float(np.mean((grey <= BLACK) | (grey >= WHITE)))
+    status = _check_image(grey, clipped)
+    if status is not AlignmentStatus.OK:
+        return _refused(status), history
+    if checksum == repeated:
+        return _refused(AlignmentStatus.FROZEN), history
+    if history.clipped and clipped - np.median(history.clipped) > MAX_CLIPPED_JUMP:
+        return _doubt(_refused(AlignmentStatus.BLANK), history)
+    depth, history = _check_depth(np.asarray(frame.depth)[::ROW_STEP], camera.depth_scale, history)
+    if depth.use is Use.NOTHING:
+        return _doubt(depth, history)
+    history = history._replace(clipped=_remember(history.clipped, clipped), doubts=0)
+    return (late if depth.status is AlignmentStatus.OK else depth), history
+
+
+def _refused(status: AlignmentStatus) -> Finding:
+    return Finding(status, Use.NOTHING)
+
+
+def _doubt(finding: Finding, history: History) -> tuple[Finding, History]:
+    """Refuse a frame for being unlike those before; if that goes on, forget them, so that the next one can pass."""
+    if history.doubts + 1 < MAX_DOUBTS:
+        return finding, history._replace(doubts=history.doubts + 1)
+    timestamp = None if finding.status is AlignmentStatus.BAD_TIMESTAMP else history.timestamp
+    return finding, History(timestamp=timestamp, checksum=history.checksum)
+
+
+def _check_timestamp(frame: Frame | FrameError | None, timestamp: float, history: History) -> Finding:
+    early = history.timestamp is not None and timestamp <= history.timestamp
+    if isinstance(frame, TimestampError) or early or not math.isfinite(timestamp):
+        return _refused(AlignmentStatus.BAD_TIMESTAMP)
+    if isinstance(frame, Frame) and not math.isfinite(frame.depth_timestamp or 0.0):
+        return _refused(AlignmentStatus.BAD_TIMESTAMP)
+    if history.timestamp is not None and len(history.intervals) >= MIN_INTERVALS:
+        if timestamp - history.timestamp > MAX_INTERVAL_RATIO * float(np.median(history.intervals)):
+            return Finding(AlignmentStatus.GAP, Use.ALL)
+    return Finding(AlignmentStatus.OK, Use.ALL)
+
+
+def _with_timestamp(history: History, timestamp: float) -> History:
+    if history.timestamp is None:
+        return history._replace(timestamp=timestamp)
+    intervals = _remember(history.intervals, timestamp - history.timestamp)
+    return history._replace(timestamp=timestamp, intervals=intervals)
+
+
+def _check_image(grey: np.ndarray, clipped: float) -> AlignmentStatus:
+    """Status of an image by itself."""
+    values = grey.astype(np.float32)
+    values -= values.mean()
+    variance = float(np.mean(values**2))
+    if variance < MIN_CONTRAST**2 or clipped > MAX_CLIPPED:
+        return AlignmentStatus.BLANK
+    if float(np.mean(values[:, 1:] * values[:, :-1])) < MIN_CORRELATION * variance:
+        return AlignmentStatus.NOISE
+    return AlignmentStatus.OK
+
+
+def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:
+    """Coverage and range of depth against what was usual."""
+    readings = depth[(depth > 0) & np.isfinite(depth)]
+    coverage = readings.size / depth.size
+    if coverage < MIN_DEPTH_SHARE:
+        return Finding(AlignmentStatus.NO_DEPTH, Use.TARGET), history
+    usual = np.median(history.coverages) if history.coverages else coverage
+    history = history._replace(coverages=_remember(history.coverages, coverage))
+    range_m = float(np.median(readings)) / depth_scale
+    if history.range is not None:
+        ratio = range_m / history.range
+        if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
+            return _refused(AlignmentStatus.DEPTH_UNITS), history
+    history = history._replace(range=range_m)
+    if not DEPTH_RANGE[0] < range_m < DEPTH_RANGE[1]:
+        return Finding(AlignmentStatus.DEPTH_UNITS, Use.ALL), history
+    if coverage < MIN_COVERAGE_RATIO * usual:
+        return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
+    return Finding(AlignmentStatus.OK, Use.ALL), history
+
+
+def _remember(values: tuple[float, ...], value: float) -> tuple[float, ...]:
+    return (*values, value)[-REMEMBERED:]

@@ -1,0 +1,147 @@
+"""What is told of a frame before it is aligned, and what it may still be used for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gavo_jax.alignment import AlignmentStatus as Status
+from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame
+
+CAMERA = DEFAULT_CAMERA.level(1)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return list(SyntheticSequence(frames=8, camera=CAMERA))
+
+
+def look(history: History, *frames: Frame) -> tuple[list[Finding], History]:
+    findings = []
+    for frame in frames:
+        finding, history = check_frame(frame, frame.timestamp, CAMERA, history)
+        findings.append(finding)
+    return findings, history
+
+
+@pytest.fixture(scope="module")
+def seen(frames) -> History:
+    """What is remembered after five good frames."""
+    findings, history = look(History(), *frames[:5])
+    assert findings == [Finding(Status.OK, Use.ALL)] * 5
+    return history
+
+
+def random_image(shape: tuple[int, ...], low: int = 0, high: int = 256) -> np.ndarray:
+    return np.random.default_rng(0).integers(low, high, shape).astype(np.uint8)
+
+
+def half(depth: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(depth.shape[0])[:, None] < depth.shape[0] // 2, 0, depth)
+
+
+def with_nan(grey: np.ndarray) -> np.ndarray:
+    values = grey.astype(np.float32)
+    values[:8, 3] = np.nan
+    return values
+
+
+GREY = {
+    "black": (np.zeros_like, Status.BLANK),
+    "black with the sensor's noise": (lambda grey: random_image(grey.shape, 0, 5), Status.BLANK),
+    "white": (lambda grey: np.full_like(grey, 255), Status.BLANK),
+    "grey": (lambda grey: np.full_like(grey, 128), Status.BLANK),
+    "saturated": (lambda grey: np.minimum(grey.astype(int) * 4, 255), Status.BLANK),
+    "lower half black": (lambda grey: np.where(half(grey) == 0, grey, 0), Status.BLANK),
+    "noise": (lambda grey: random_image(grey.shape), Status.NOISE),
+    "a few pixels that are not numbers": (with_nan, Status.NOT_FINITE),
+    "another size": (lambda grey: grey[:-1], Status.UNREADABLE),
+}
+
+
+@pytest.mark.parametrize("name", GREY)
+def test_a_damaged_image_is_used_for_nothing(frames, seen, name):
+    make, status = GREY[name]
+    (finding,), _ = look(seen, replace(frames[5], grey=make(frames[5].grey)))
+    assert finding == Finding(status, Use.NOTHING)
+
+
+DEPTH = {
+    "none": (np.zeros_like, Status.NO_DEPTH, Use.TARGET),
+    "nothing but NaN": (lambda depth: np.full(depth.shape, np.nan, np.float32), Status.NO_DEPTH, Use.TARGET),
+    "half": (half, Status.PARTIAL_DEPTH, Use.TARGET),
+    "millimetres": (lambda depth: depth // 5, Status.DEPTH_UNITS, Use.NOTHING),
+    "tenths of a millimetre": (lambda depth: depth.astype(np.int64) * 10, Status.DEPTH_UNITS, Use.NOTHING),
+}
+
+
+@pytest.mark.parametrize("name", DEPTH)
+def test_damaged_depth(frames, seen, name):
+    make, status, use = DEPTH[name]
+    (finding,), _ = look(seen, replace(frames[5], depth=make(frames[5].depth)))
+    assert finding == Finding(status, use)
+
+
+def test_depth_in_other_units_throughout_is_told_but_used(frames):
+    wrong = [replace(frame, depth=frame.depth // 10) for frame in frames]
+    findings, _ = look(History(), *wrong)
+    assert findings == [Finding(Status.DEPTH_UNITS, Use.ALL)] * len(frames)
+
+
+def test_a_frozen_image(frames, seen):
+    frozen = replace(frames[4], timestamp=frames[5].timestamp, depth=frames[5].depth)
+    findings, _ = look(seen, frozen, frames[6])
+    assert findings == [Finding(Status.FROZEN, Use.NOTHING), Finding(Status.OK, Use.ALL)]
+
+
+@pytest.mark.parametrize("stamp", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_stamp_that_is_not_later(frames, seen, stamp):
+    bad = replace(frames[5], timestamp=frames[4].timestamp + stamp)
+    findings, _ = look(seen, bad, frames[6])
+    assert findings == [Finding(Status.BAD_TIMESTAMP, Use.NOTHING), Finding(Status.OK, Use.ALL)]
+
+
+def test_frames_that_are_not_there(frames, seen):
+    stamp = frames[5].timestamp
+    for frame, status in (
+        (None, Status.UNREADABLE),
+        (FrameError("x.png: torn"), Status.UNREADABLE),
+        (TimestampError("rgb.txt:3: out of order"), Status.BAD_TIMESTAMP),
+        (replace(frames[5], depth_timestamp=float("nan")), Status.BAD_TIMESTAMP),
+    ):
+        assert check_frame(frame, stamp, CAMERA, seen)[0] == Finding(status, Use.NOTHING)
+
+
+def test_a_gap_is_told_a_single_missing_frame_is_not(frames, seen):
+    interval = frames[1].timestamp - frames[0].timestamp
+    for missing, status in ((1, Status.OK), (2, Status.GAP), (100, Status.GAP)):
+        later = replace(frames[5], timestamp=frames[4].timestamp + (missing + 1) * interval)
+        assert look(seen, later)[0] == [Finding(status, Use.ALL)]
+
+
+CHANGES = {
+    "a clock that was set back": (lambda frame: replace(frame, timestamp=frame.timestamp - 50.0), Status.BAD_TIMESTAMP),
+    "depth three times nearer": (lambda frame: replace(frame, depth=frame.depth // 3), Status.DEPTH_UNITS),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_lasts_becomes_usual(frames, seen, name):
+    change, status = CHANGES[name]
+    more = [replace(frame, timestamp=frame.timestamp + 1.0) for frame in frames[:3]]
+    findings, _ = look(seen, *map(change, [*frames[5:], *more]))
+    doubted, rest = findings[:MAX_DOUBTS], findings[MAX_DOUBTS:]
+    assert doubted == [Finding(status, Use.NOTHING)] * MAX_DOUBTS
+    assert all(finding.use is Use.ALL for finding in rest)
+
+
+@pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
+def test_no_false_alarms_on_real_clips(data_dir, clip):
+    sequence = TumSequence(data_dir / clip)
+    history = History()
+    for frame in sequence:
+        finding, history = check_frame(frame, frame.timestamp, sequence.camera, history)
+        assert finding == Finding(Status.OK, Use.ALL)
