@@ -255,12 +255,14 @@ class Odometry:
         if frame is not None and self._held >= MAX_HELD:
             self._restart(frame)
 
-    def _align(self, state: TrackerState, frame: Frame) -> tuple[TrackerState, Alignment]:
-        """Align with the references; a result that looks wrong is tried again by the wide search."""
+    def _clock(self, frame: Frame) -> Clock:
         elapsed = frame.timestamp - self._reference_timestamp
         delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
-        clock = Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay))
-        key = jax.random.fold_in(self._key, self._index)
+        return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay))
+
+    def _align(self, state: TrackerState, frame: Frame) -> tuple[TrackerState, Alignment]:
+        """Align with the references; a result that looks wrong is tried again by the wide search."""
+        clock, key = self._clock(frame), jax.random.fold_in(self._key, self._index)
         state_after, result = self._run(state, frame, clock, key)
         if result.status == AlignmentStatus.OK or not self.options.recover:
             return state_after, result

@@ -1,0 +1,233 @@
+"""Who runs the runs: this process on its own device, or a Ray cluster."""
+
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+
+from gavo_jax.comparison import PeerOdometry
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
+from gavo_jax.experiments.together import track_stacked, track_together
+from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
+from gavo_jax.results import environment
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a batch: its rows, or the one line that says why there are none."""
+
+    batch: Batch
+    rows: tuple[Row, ...]
+    fault: str | None = None
+
+
+class Executor(Protocol):
+    """Runs batches, in any order."""
+
+    def slots(self) -> int:
+        """How many batches it can run at the same time."""
+        ...
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Yield each batch's outcome as soon as it is known; `on_pairs` hears of pairs that are done."""
+        ...
+
+
+class LocalExecutor:
+    """One batch after the other in this process; the device works on the runs of a batch together."""
+
+    def slots(self) -> int:
+        """One."""
+        return 1
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Run them in their order."""
+        for batch in batches:
+            yield run_batch(experiment, batch, on_pairs)
+
+
+class RayExecutor:
+    """Batches as tasks of a Ray cluster: the one that RAY_ADDRESS names, else one that is started here.
+
+    Ray retries a task whose process or node dies. Rows travel back to the driver, which alone writes the table; only the
+    frames have to be readable on every node, under the same paths.
+    """
+
+    RETRIES = 5
+
+    def __init__(self, options: RayOptions) -> None:
+        """Join the cluster.
+
+        Raises:
+            GavoError: Ray is missing, no cluster answers, or none of its nodes has what a batch takes.
+        """
+        try:
+            import ray
+        except ImportError:
+            raise GavoError("--executor ray needs Ray: pip install 'gavo-jax[ray]'") from None
+        self._ray = ray
+        self._started = not ray.is_initialized()
+        if self._started:
+            try:
+                ray.init(log_to_driver=False, configure_logging=False, include_dashboard=False)
+            except (ConnectionError, RuntimeError, ValueError) as error:
+                raise GavoError(f"--executor ray: no cluster: {' '.join(str(error).split())}") from None
+        resources = ray.cluster_resources()
+        gpus = options.gpus if options.gpus is not None else min(1.0, resources.get("GPU", 0.0))
+        self._wanted = {"CPU": min(options.cpus, resources.get("CPU", 1.0)), "GPU": gpus}
+        for name, amount in self._wanted.items():
+            if amount > resources.get(name, 0.0):
+                raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
+
+    def slots(self) -> int:
+        """As many as the cluster's processors and GPUs allow now."""
+        resources = self._ray.cluster_resources()
+        return max(1, int(min(resources.get(name, 0.0) // n for name, n in self._wanted.items() if n)))
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Hand all of them to the cluster and yield them in the order in which they come back."""
+        ray = self._ray
+        variables = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir} if _cache_dir() else {}
+        task = ray.remote(run_batch).options(
+            num_cpus=self._wanted["CPU"],
+            num_gpus=self._wanted["GPU"],
+            max_retries=self.RETRIES,
+            runtime_env={"env_vars": variables},
+        )
+        waiting = {task.remote(experiment, batch): batch for batch in batches}
+        try:
+            while waiting:
+                ready, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+                for reference in ready:
+                    batch = waiting.pop(reference)
+                    try:
+                        outcome = ray.get(reference)
+                    except ray.exceptions.RayError as error:
+                        outcome = Outcome(batch, (), " ".join(str(error).split())[:500])
+                    on_pairs(sum(run.pairs for run in batch.runs))
+                    yield outcome
+        finally:
+            for reference in waiting:
+                ray.cancel(reference, force=True)
+
+    def close(self) -> None:
+        """Leave the cluster; one that was started here ends."""
+        if self._started:
+            self._ray.shutdown()
+
+
+def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | None = None) -> Outcome:
+    """Run a batch on this process's device.
+
+    Args:
+        experiment: Name that the rows carry.
+        batch: Runs of one program over the same frames.
+        on_pairs: Hears of pairs that are done.
+
+    Returns:
+        A row of the results table a run; bad input is an outcome, too.
+    """
+    try:
+        sequence = batch.part.open()
+        odometries = [_odometry(run, sequence) for run in batch.runs]
+        compile_seconds = odometries[0].warm_up()
+        start = time.perf_counter()
+        steps = _track(batch, sequence, odometries, on_pairs)
+        seconds = (time.perf_counter() - start) / len(batch.runs)
+        first = float(sequence.timestamps[0])
+        rows = []
+        for run, odometry, own in zip(batch.runs, odometries, steps, strict=True):
+            truth = sequence.ground_truth
+            metrics = compute_metrics(trajectory_of(first, own), truth, own, seconds, compile_seconds)
+            versions = odometry.peer.versions if isinstance(odometry, PeerOdometry) else {}
+            rows.append(_row(experiment, batch, run, sequence, metrics, versions))
+    except GavoError as error:
+        return Outcome(batch, (), str(error))
+    return Outcome(batch, tuple(rows))
+
+
+def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
+    if run.settings is None:
+        return PeerOdometry(run.method, sequence.camera)
+    settings = run.settings
+    return Odometry(sequence.camera, settings.solver, settings.alignment, settings.odometry, run.seed or 0)
+
+
+def _track(
+    batch: Batch, sequence: FrameSequence, odometries: list[Odometry], on_pairs: Callable[[int], None] | None
+) -> list[list[Step]]:
+    """All runs of the batch: stacked into one call a frame where the device gains by it."""
+    frames = iter(range(len(sequence)))
+
+    def on_frame() -> None:
+        if on_pairs is not None and next(frames) > 0:
+            on_pairs(len(batch.runs))
+
+    settings = [run.settings for run in batch.runs if run.settings is not None]
+    if jax.default_backend() == "cpu" or len(settings) < 2:
+        return track_together(sequence, odometries, on_frame)
+    return track_stacked(sequence, settings, [run.seed or 0 for run in batch.runs], on_frame)
+
+
+def _row(
+    experiment: str,
+    batch: Batch,
+    run: Run,
+    sequence: FrameSequence,
+    metrics: dict[str, Any],
+    peer_versions: dict[str, str],
+) -> Row:
+    commit, modified = git_state()
+    return {
+        "run": run.id,
+        "experiment": experiment,
+        "sequence": run.part.name,
+        "method": run.method,
+        "preset": run.preset,
+        "variant": run.variant,
+        "label": run.label,
+        "seed": run.seed,
+        **metrics,
+        "runs_together": len(batch.runs),
+        "pixels": run.pixels,
+        "configuration": configuration(run, sequence),
+        "versions": environment() | peer_versions,
+        "git_commit": commit,
+        "git_modified": modified,
+        "host": platform.node(),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+@cache
+def git_state() -> tuple[str | None, bool | None]:
+    """Commit of the checkout that this package is imported from, and whether it has changes; None where it is none."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=20)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return None, None
+    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
+    return commit, None if changes is None else bool(changes)
+
+
+def _cache_dir() -> str | None:
+    return jax.config.jax_compilation_cache_dir or os.environ.get("JAX_COMPILATION_CACHE_DIR")
