@@ -19,6 +19,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
+from gavo_jax.peers import make_peer
 from gavo_jax.results import environment
 
 Row = dict[str, Any]
@@ -141,21 +142,52 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
     """
     try:
         sequence = batch.part.open()
-        odometries = [_odometry(run, sequence) for run in batch.runs]
-        compile_seconds = odometries[0].warm_up()
+        tracker = _Tracker(batch, sequence)
+        compile_seconds = tracker.warm_up()
         start = time.perf_counter()
-        steps = _track(batch, sequence, odometries, on_pairs)
+        steps = tracker.track(on_pairs)
         seconds = (time.perf_counter() - start) / len(batch.runs)
         first = float(sequence.timestamps[0])
         rows = []
-        for run, odometry, own in zip(batch.runs, odometries, steps, strict=True):
+        for run, own in zip(batch.runs, steps, strict=True):
             truth = sequence.ground_truth
             metrics = compute_metrics(trajectory_of(first, own), truth, own, seconds, compile_seconds)
-            versions = odometry.peer.versions if isinstance(odometry, PeerOdometry) else {}
-            rows.append(_row(experiment, batch, run, sequence, metrics, versions))
+            rows.append(_row(experiment, batch, run, sequence, metrics))
     except GavoError as error:
         return Outcome(batch, (), str(error))
     return Outcome(batch, tuple(rows))
+
+
+class _Tracker:
+    """All runs of a batch over its frames: stacked into one call a frame where the device gains by it."""
+
+    def __init__(self, batch: Batch, sequence: FrameSequence) -> None:
+        self._sequence, self._runs = sequence, batch.runs
+        self._stacked = jax.default_backend() != "cpu" and batch.runs[0].settings is not None
+
+    def warm_up(self) -> float:
+        """Compile; returns the seconds this took."""
+        if not self._stacked:
+            return _odometry(self._runs[0], self._sequence).warm_up()
+        start = time.perf_counter()
+        self._track(self._sequence[:2], None)
+        return time.perf_counter() - start
+
+    def track(self, on_pairs: Callable[[int], None] | None) -> list[list[Step]]:
+        """The steps of each run."""
+        frames = iter(range(len(self._sequence)))
+
+        def on_frame() -> None:
+            if on_pairs is not None and next(frames) > 0:
+                on_pairs(len(self._runs))
+
+        return self._track(self._sequence, on_frame)
+
+    def _track(self, sequence: FrameSequence, on_frame: Callable[[], None] | None) -> list[list[Step]]:
+        settings = [run.settings for run in self._runs if run.settings is not None]
+        if self._stacked:
+            return track_stacked(sequence, settings, [run.seed or 0 for run in self._runs], on_frame)
+        return track_together(sequence, [_odometry(run, sequence) for run in self._runs], on_frame)
 
 
 def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
@@ -165,29 +197,8 @@ def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
     return Odometry(sequence.camera, settings.solver, settings.alignment, settings.odometry, run.seed or 0)
 
 
-def _track(
-    batch: Batch, sequence: FrameSequence, odometries: list[Odometry], on_pairs: Callable[[int], None] | None
-) -> list[list[Step]]:
-    """All runs of the batch: stacked into one call a frame where the device gains by it."""
-    frames = iter(range(len(sequence)))
-
-    def on_frame() -> None:
-        if on_pairs is not None and next(frames) > 0:
-            on_pairs(len(batch.runs))
-
-    settings = [run.settings for run in batch.runs if run.settings is not None]
-    if jax.default_backend() == "cpu" or len(settings) < 2:
-        return track_together(sequence, odometries, on_frame)
-    return track_stacked(sequence, settings, [run.seed or 0 for run in batch.runs], on_frame)
-
-
 def _row(
-    experiment: str,
-    batch: Batch,
-    run: Run,
-    sequence: FrameSequence,
-    metrics: dict[str, Any],
-    peer_versions: dict[str, str],
+    experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]
 ) -> Row:
     commit, modified = git_state()
     return {
@@ -203,12 +214,16 @@ def _row(
         "runs_together": len(batch.runs),
         "pixels": run.pixels,
         "configuration": configuration(run, sequence),
-        "versions": environment() | peer_versions,
+        "versions": environment() | _peer_versions(run, sequence),
         "git_commit": commit,
         "git_modified": modified,
         "host": platform.node(),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def _peer_versions(run: Run, sequence: FrameSequence) -> dict[str, str]:
+    return dict(make_peer(run.method, sequence.camera).versions) if run.settings is None else {}
 
 
 @cache

@@ -163,13 +163,15 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
             runs += _runs(part, sequence, variant)
             if variant.settings is not None:
                 programs.add((jax.tree.structure(sequence.camera), program_of(variant.settings)))
-    names = {part.name for part in parts}
+    names = [part.name for part in parts]
+    for variant in variants:
+        refuse_unknown(f"{path}: printed figures of {variant.label}", variant.printed, (*names, *skipped))
     printed = {
         (name, variant.label): value for variant in variants for name, value in variant.printed.items() if name in names
     }
     folder = Path(output or _text(f"{path}: output", table.get("output", f"runs/{name}")))
     batch = _whole(f"{path}: batch", table.get("batch", BATCH), 1)
-    return Plan(name, folder, tuple(runs), len(programs), skipped, printed, batch, _ray(path, table))
+    return Plan(name, folder, tuple(runs), len(programs), tuple(skipped.values()), printed, batch, _ray(path, table))
 
 
 def read_toml(path: Path, keys: Sequence[str]) -> dict[str, Any]:
@@ -221,15 +223,15 @@ def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
     )
 
 
-def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], tuple[str, ...]]:
-    """The parts of all [[sequences]] of a file, and a line for each optional one that is not here.
+def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str, str]]:
+    """The parts of all [[sequences]] of a file, and by name a line for each optional one that is not here.
 
     Raises:
         GavoError: a wrong key or value, a sequence that is nowhere, two of one name, none at all.
     """
     entries = _tables(f"{path}: sequences", table.get("sequences", []))
     parts: list[Part] = []
-    skipped: list[str] = []
+    skipped: dict[str, str] = {}
     for number, entry in enumerate(entries, 1):
         place = f"{path}: sequences[{number}]"
         refuse_unknown(place, entry, SEQUENCE_KEYS)
@@ -240,14 +242,15 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], tuple[st
             line = f"{', '.join(patterns)}: no such folder here, beside {path.name}, or in {DATA}"
             if not _flag(f"{place}: optional", entry.get("optional", False)):
                 raise GavoError(f"{place}: {line}")
-            skipped.append(f"skipped {entry.get('name', patterns[0])}: {line} (gavo download gets TUM's sequences)")
+            name = entry.get("name", patterns[0])
+            skipped[name] = f"skipped {name}: {line} (gavo download gets TUM's sequences)"
         if len(found) > 1 and "name" in entry:
             raise GavoError(f"{place}: name: {len(found)} sequences cannot have one name")
         parts += [_part(place, path.parent, folder, entry) for folder in found]
     _refuse_repeated(f"{path}: sequences", [part.name for part in parts])
     if not parts:
-        raise GavoError(f"{path}: sequences: {'; '.join(skipped) or 'no [[sequences]] given'}")
-    return parts, tuple(skipped)
+        raise GavoError(f"{path}: sequences: {'; '.join(skipped.values()) or 'no [[sequences]] given'}")
+    return parts, skipped
 
 
 def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
