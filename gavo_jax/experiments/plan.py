@@ -143,9 +143,9 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     """
     path = Path(path)
     table = read_toml(path, KEYS)
-    name = _text(f"{path}: name", table.get("name", path.stem))
+    name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, skipped = parts_of(path, table)
-    default_seeds = _seeds(f"{path}: seeds", table.get("seeds", [0]))
+    default_seeds = seeds_of(f"{path}: seeds", table.get("seeds", [0]))
     methods = _tables(f"{path}: methods", table.get("methods", []))
     if not methods:
         raise GavoError(f"{path}: methods: no [[methods]] given")
@@ -169,8 +169,8 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     printed = {
         (name, variant.label): value for variant in variants for name, value in variant.printed.items() if name in names
     }
-    folder = Path(output or _text(f"{path}: output", table.get("output", f"runs/{name}")))
-    batch = _whole(f"{path}: batch", table.get("batch", BATCH), 1)
+    folder = Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}")))
+    batch = whole_of(f"{path}: batch", table.get("batch", BATCH), 1)
     return Plan(name, folder, tuple(runs), len(programs), tuple(skipped.values()), printed, batch, _ray(path, table))
 
 
@@ -236,7 +236,7 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
         place = f"{path}: sequences[{number}]"
         refuse_unknown(place, entry, SEQUENCE_KEYS)
         patterns = entry.get("path", SYNTHETIC)
-        patterns = [_text(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
+        patterns = [text_of(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
         found = _find(path.parent, patterns)
         if not found:
             line = f"{', '.join(patterns)}: no such folder here, beside {path.name}, or in {DATA}"
@@ -267,10 +267,10 @@ def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
 
 
 def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Part:
-    start = _whole(f"{place}: start", entry.get("start", 0), 0)
-    frames = None if "frames" not in entry else _whole(f"{place}: frames", entry["frames"], 2)
-    stride = _whole(f"{place}: stride", entry.get("stride", 1), 1)
-    camera = _text(f"{place}: camera", entry.get("camera", "auto"))
+    start = whole_of(f"{place}: start", entry.get("start", 0), 0)
+    frames = None if "frames" not in entry else whole_of(f"{place}: frames", entry["frames"], 2)
+    stride = whole_of(f"{place}: stride", entry.get("stride", 1), 1)
+    camera = text_of(f"{place}: camera", entry.get("camera", "auto"))
     if (beside / camera).is_file():
         camera = str(beside / camera)
     if camera != "auto":
@@ -278,7 +278,7 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
     name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
     if "name" not in entry and (start, frames, stride) != (0, None, 1):
         name = f"{name}[{start}:{'' if frames is None else start + frames * stride}:{stride}]"
-    return Part(_text(f"{place}: name", name), folder, camera, start, frames, stride)
+    return Part(text_of(f"{place}: name", name), folder, camera, start, frames, stride)
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     method = entry.get("name")
     refuse_unknown(f"{place}: name", [str(method)], (*METHODS, *PEERS))
     printed = {
-        _text(place, name): _real(f"{place}: printed.{name}", value)
+        text_of(place, name): _real(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()
     }
     if method in PEERS:
@@ -314,7 +314,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     if not isinstance(presets, list) or not presets:
         raise GavoError(f"{place}: presets: not a list of names")
     refuse_unknown(f"{place}: presets", map(str, presets), PRESETS)
-    seeds = _seeds(f"{place}: seeds", entry["seeds"]) if "seeds" in entry else default_seeds
+    seeds = seeds_of(f"{place}: seeds", entry["seeds"]) if "seeds" in entry else default_seeds
     rooms = {room: entry[room] for room in ("solver", "alignment", "odometry") if room in entry}
     fixed = flatten(place, rooms)
     swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
@@ -350,13 +350,13 @@ def _ray(path: Path, table: Mapping[str, Any]) -> RayOptions:
     return RayOptions(**{key: _real(f"{place}.{key}", value) for key, value in values.items()})
 
 
-def _seeds(place: str, value: Any) -> tuple[int, ...]:
+def seeds_of(place: str, value: Any) -> tuple[int, ...]:
     """A list of seeds; a number N stands for 0 to N - 1."""
     if isinstance(value, list):
-        seeds = tuple(_whole(place, seed, 0) for seed in value)
+        seeds = tuple(whole_of(place, seed, 0) for seed in value)
         _refuse_repeated(place, seeds)
     else:
-        seeds = tuple(range(_whole(place, value, 1))) if _whole(place, value, 1) <= MAX_RUNS else ()
+        seeds = tuple(range(whole_of(place, value, 1))) if whole_of(place, value, 1) <= MAX_RUNS else ()
     if not seeds or max(seeds) > MAX_SEED:
         raise GavoError(f"{place}: must be a number of seeds, or a list of seeds from 0 to {MAX_SEED}")
     return seeds
@@ -368,7 +368,7 @@ def _tables(place: str, value: Any) -> list[dict[str, Any]]:
     return value
 
 
-def _text(place: str, value: Any) -> str:
+def text_of(place: str, value: Any) -> str:
     if not isinstance(value, str) or not value:
         raise GavoError(f"{place}: must be text, not {value!r}")
     return value
@@ -380,7 +380,7 @@ def _flag(place: str, value: Any) -> bool:
     return value
 
 
-def _whole(place: str, value: Any, least: int) -> int:
+def whole_of(place: str, value: Any, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise GavoError(f"{place}: must be a whole number of at least {least}, not {value!r}")
     return value
