@@ -1,4 +1,4 @@
-"""Sequences of the TUM RGB-D benchmark from its server: resumed where it broke off, checked by size, unpacked safely."""
+"""Sequences of the TUM RGB-D benchmark: resumed where a download broke off, checked by size, unpacked safely."""
 
 import difflib
 import os

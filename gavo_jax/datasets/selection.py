@@ -14,7 +14,9 @@ SYNTHETIC_FRAMES = 40
 MAX_SYNTHETIC_FRAMES = 1_000_000
 
 
-def open_part(sequence: str, camera: Any = "auto", start: int = 0, frames: int | None = None, stride: int = 1) -> Sequence:
+def open_part(
+    sequence: str, camera: Any = "auto", start: int = 0, frames: int | None = None, stride: int = 1
+) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
 
     Args:

@@ -197,9 +197,7 @@ def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
     return Odometry(sequence.camera, settings.solver, settings.alignment, settings.odometry, run.seed or 0)
 
 
-def _row(
-    experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]
-) -> Row:
+def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]) -> Row:
     commit, modified = git_state()
     return {
         "run": run.id,

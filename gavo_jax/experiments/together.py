@@ -21,7 +21,7 @@ from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.odometry import Clock, Odometry, Step, TrackerState, _track, _traced
+from gavo_jax.odometry import Clock, Odometry, Step, TrackerState, _traced, _track
 from gavo_jax.presets import OdometryOptions, Preset
 
 Register = Callable[[Frame | None, float], list[Step | None]]
