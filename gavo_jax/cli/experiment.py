@@ -25,8 +25,8 @@ PLAN, PAGE, FIGURE = "experiment.json", "report.html", "drift"
 SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/pair", "together")
 COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
 DEFINITION = (
-    "Drift: relative pose error over 1 s, RMSE (m/s, deg/s): median over the runs, its quartiles, and what a publication "
-    "prints. Time a pair: median; together: runs that shared the machine while it was taken."
+    "Drift: relative pose error over 1 s, RMSE (m/s, deg/s): median over the runs, its quartiles, and what a "
+    "publication prints. Time a pair: median; together: runs that shared the machine while it was taken."
 )
 TEST = (
     "Methods paired by sequence and seed: median of the ratio of their drifts, and p of the two-sided Wilcoxon "

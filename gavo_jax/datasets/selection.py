@@ -1,7 +1,5 @@
 """Which frames of which sequence, by name."""
 
-from typing import Any
-
 from gavo_jax.camera import load_camera
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import SyntheticSequence
@@ -15,7 +13,7 @@ MAX_SYNTHETIC_FRAMES = 1_000_000
 
 
 def open_part(
-    sequence: str, camera: Any = "auto", start: int = 0, frames: int | None = None, stride: int = 1
+    sequence: str, camera: str = "auto", start: int = 0, frames: int | None = None, stride: int = 1
 ) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
 
@@ -41,7 +39,7 @@ def open_part(
     return chosen
 
 
-def _synthetic(camera: Any, stop: int | None) -> SyntheticSequence:
+def _synthetic(camera: str, stop: int | None) -> SyntheticSequence:
     frames = SYNTHETIC_FRAMES if stop is None else stop
     if frames > MAX_SYNTHETIC_FRAMES:
         raise GavoError(f"{SYNTHETIC}: has no more than {MAX_SYNTHETIC_FRAMES} frames, not {frames}")

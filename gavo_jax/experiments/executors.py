@@ -62,8 +62,8 @@ class LocalExecutor:
 class RayExecutor:
     """Batches as tasks of a Ray cluster: the one that RAY_ADDRESS names, else one that is started here.
 
-    Ray retries a task whose process or node dies. Rows travel back to the driver, which alone writes the table; only the
-    frames have to be readable on every node, under the same paths.
+    Ray retries a task whose process or node dies. Rows travel back to the driver, which alone writes the table; only
+    the frames have to be readable on every node, under the same paths.
     """
 
     RETRIES = 5

@@ -1,4 +1,4 @@
-"""From a TOML file to runs: sequences × methods × presets × settings × seeds, all of it checked before anything runs."""
+"""From a TOML file to runs: sequences × methods × presets × settings × seeds, checked before anything runs."""
 
 import glob
 import hashlib
@@ -26,7 +26,7 @@ from gavo_jax.results import describe
 
 KEYS = ("name", "output", "seeds", "batch", "sequences", "methods", "ray")
 SEQUENCE_KEYS = ("path", "name", "camera", "start", "frames", "stride", "optional")
-METHOD_KEYS = ("name", "presets", "seeds", "solver", "alignment", "odometry", "sweep", "printed")
+METHOD_KEYS = ("name", "presets", "seeds", "solver", "alignment", "odometry", "sweep", "printed", "optional")
 RAY_KEYS = ("cpus", "gpus")
 DATA = "GAVO_DATA"
 BATCH = 32
@@ -151,7 +151,12 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
         raise GavoError(f"{path}: methods: no [[methods]] given")
     variants: list[_Variant] = []
     for number, entry in enumerate(methods, 1):
-        variants += _variants(f"{path}: methods[{number}]", entry, default_seeds)
+        place = f"{path}: methods[{number}]"
+        lacking = _lacking(place, entry)
+        if lacking is None:
+            variants += _variants(place, entry, default_seeds)
+        else:
+            skipped[str(entry["name"])] = lacking
     _refuse_repeated(f"{path}: methods", [variant.label for variant in variants])
     runs: list[Run] = []
     programs = set()
@@ -297,6 +302,21 @@ class _Variant:
         return Run("", Part("", ""), 0, 0, self.method, self.preset, self.text, None, None).label
 
 
+def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
+    """A line for an optional peer that is not installed; None for what can be run.
+
+    Raises:
+        GavoError: a peer that is not installed and not optional.
+    """
+    info = PEERS.get(str(entry.get("name")))
+    if info is None or info.installed:
+        return None
+    line = f"{info.name}: needs {info.module}: pip install 'gavo-jax[peers]'"
+    if not _flag(f"{place}: optional", entry.get("optional", False)):
+        raise GavoError(f"{place}: {line}")
+    return f"skipped {line}"
+
+
 def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
     refuse_unknown(place, entry, METHOD_KEYS)
     method = entry.get("name")
@@ -306,9 +326,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()
     }
     if method in PEERS:
-        refuse_unknown(f"{place}: {method} has no settings", entry, ("name", "printed"))
-        if not PEERS[method].installed:
-            raise GavoError(f"{place}: {method}: needs {PEERS[method].module}: pip install 'gavo-jax[peers]'")
+        refuse_unknown(f"{place}: {method} has no settings", entry, ("name", "printed", "optional"))
         return [_Variant(method, "", "", None, (None,), printed)]
     presets = entry.get("presets", ["default"])
     if not isinstance(presets, list) or not presets:
@@ -369,6 +387,7 @@ def _tables(place: str, value: Any) -> list[dict[str, Any]]:
 
 
 def text_of(place: str, value: Any) -> str:
+    """Return a text that is not empty, or raise GavoError."""
     if not isinstance(value, str) or not value:
         raise GavoError(f"{place}: must be text, not {value!r}")
     return value
@@ -381,6 +400,7 @@ def _flag(place: str, value: Any) -> bool:
 
 
 def whole_of(place: str, value: Any, least: int) -> int:
+    """Return a whole number of at least so much, or raise GavoError."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise GavoError(f"{place}: must be a whole number of at least {least}, not {value!r}")
     return value

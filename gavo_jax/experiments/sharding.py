@@ -1,4 +1,4 @@
-"""The batch axis of one program over many devices: this machine's, or those of all hosts that `jax.distributed` joins."""
+"""The batch axis of one program over many devices: this machine's, or all that `jax.distributed` joins."""
 
 from typing import Any
 

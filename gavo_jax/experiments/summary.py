@@ -41,7 +41,8 @@ class Comparison(NamedTuple):
     ratio: float
     """Median of first / second drift over the pairs."""
     p: float | None
-    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero or there are fewer than two pairs."""
+    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero or there is
+    a single pair."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Summary]:

@@ -49,8 +49,8 @@ COLUMNS = {
     "host": TEXT,
     "finished": TEXT,
 }
-"""Columns and their types: the keys of metrics.json; `runs_together`, the runs that shared the machine while the times were
-taken; `configuration` and `versions` as JSON; the commit of the package's own checkout, where it is one; UTC."""
+"""Columns and their types: the keys of metrics.json; `runs_together`, the runs that shared the machine while the times
+were taken; `configuration` and `versions` as JSON; the commit of the package's own checkout, where it is one; UTC."""
 
 
 class Table:

@@ -105,6 +105,7 @@ def tune(
     """
     try:
         import optuna
+        import sqlalchemy.exc
     except ImportError:
         raise GavoError("tuning needs Optuna: pip install 'gavo-jax[tune]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -114,7 +115,7 @@ def tune(
         study = optuna.create_study(
             storage=storage, study_name=tuning.name, directions=["minimize", "minimize"], load_if_exists=True
         )
-    except (ValueError, ImportError, OSError, RuntimeError) as error:
+    except (ValueError, ImportError, OSError, RuntimeError, sqlalchemy.exc.SQLAlchemyError) as error:
         raise GavoError(f"{storage}: cannot be used as storage: {' '.join(str(error).split())[:300]}") from None
     while len(_finished(optuna, study)) < trials:
         trial = study.ask()
