@@ -92,7 +92,7 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
     name = url.rpartition("/")[2]
     partial = to / f"{name}.part"
 
-    def fetch(url: str, output: Any, _: Any) -> None:
+    def fetch(url: str, output_file: Any, pooch: Any, check_only: bool | None = False) -> None:
         """Pooch's downloader: whatever a try brings stays in `partial`."""
         for attempt in range(ATTEMPTS):
             try:
@@ -104,12 +104,12 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
                 if attempt + 1 == ATTEMPTS:
                     raise
                 time.sleep(PAUSE)
-        os.replace(partial, output)
+        os.replace(partial, output_file)
 
     try:
         return Path(pooch.retrieve(url, known_hash=None, fname=name, path=to, downloader=fetch))
     except requests.HTTPError as error:
-        raise GavoError(f"{url}: the server says {error.response.status_code} {error.response.reason}") from None
+        raise GavoError(f"{url}: the server says: {' '.join(str(error).split())[:200]}") from None
     except (requests.ConnectionError, requests.Timeout) as error:
         kind = "no answer in time" if isinstance(error, requests.Timeout) else "no connection"
         there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""

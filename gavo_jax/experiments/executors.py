@@ -1,6 +1,6 @@
 """Who runs the runs: this process on its own device, or a Ray cluster."""
 
-import os
+import importlib
 import platform
 import subprocess
 import time
@@ -75,7 +75,7 @@ class RayExecutor:
             GavoError: Ray is missing, no cluster answers, or none of its nodes has what a batch takes.
         """
         try:
-            import ray
+            ray = importlib.import_module("ray")
         except ImportError:
             raise GavoError("--executor ray needs Ray: pip install 'gavo-jax[ray]'") from None
         self._ray = ray
@@ -100,7 +100,8 @@ class RayExecutor:
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
         """Hand all of them to the cluster and yield them in the order in which they come back."""
         ray = self._ray
-        variables = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir} if _cache_dir() else {}
+        cache_folder = jax.config.values.get("jax_compilation_cache_dir")
+        variables = {"JAX_COMPILATION_CACHE_DIR": cache_folder} if cache_folder else {}
         task = ray.remote(run_batch).options(
             num_cpus=self._wanted["CPU"],
             num_gpus=self._wanted["GPU"],
@@ -240,7 +241,3 @@ def git_state() -> tuple[str | None, bool | None]:
         return None, None
     commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
     return commit, None if changes is None else bool(changes)
-
-
-def _cache_dir() -> str | None:
-    return jax.config.jax_compilation_cache_dir or os.environ.get("JAX_COMPILATION_CACHE_DIR")

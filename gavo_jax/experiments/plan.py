@@ -319,8 +319,8 @@ def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
 
 def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
     refuse_unknown(place, entry, METHOD_KEYS)
-    method = entry.get("name")
-    refuse_unknown(f"{place}: name", [str(method)], (*METHODS, *PEERS))
+    method = str(entry.get("name"))
+    refuse_unknown(f"{place}: name", [method], (*METHODS, *PEERS))
     printed = {
         text_of(place, name): _real(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()

@@ -101,5 +101,5 @@ def _test(sequence: str, first: str, second: str, pairs: Sequence[tuple[float, f
 
     a, b = np.array(pairs).T
     differ = len(pairs) > 1 and bool(np.any(a != b))
-    p = float(wilcoxon(a, b).pvalue) if differ else None
+    p = float(np.asarray(wilcoxon(a, b))[1]) if differ else None
     return Comparison(sequence, first, second, len(pairs), float(np.median(a / b)), p)

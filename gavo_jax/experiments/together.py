@@ -155,10 +155,19 @@ class _Lane(Odometry):
 
     first_attempt: Alignment
 
-    def _run(self, state: Any, frame: Frame, clock: Clock, key: Any, solver: Any = None, *rest: Any) -> Any:
+    def _run(
+        self,
+        state: TrackerState,
+        frame: Frame,
+        clock: Clock,
+        key: Any,
+        solver: Any = None,
+        alignment: AlignmentOptions | None = None,
+        options: OdometryOptions | None = None,
+    ) -> tuple[TrackerState, Alignment]:
         if solver is None:
             return IN_STACK, self.first_attempt
-        return super()._run(state, frame, clock, key, solver, *rest)
+        return super()._run(state, frame, clock, key, solver, alignment, options)
 
 
 class _Stack:

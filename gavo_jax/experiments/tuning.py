@@ -160,7 +160,7 @@ def _bounds(place: str, spec: Any) -> list[Any]:
     if not isinstance(spec, Mapping):
         raise GavoError(f"{place}: neither a list of choices nor a table with low and high")
     refuse_unknown(place, spec, RANGE_KEYS)
-    ends = [spec.get("low"), spec.get("high")]
+    ends: list[Any] = [spec.get("low"), spec.get("high")]
     if any(isinstance(end, bool) or not isinstance(end, int | float) for end in ends) or not ends[0] < ends[1]:
         raise GavoError(f"{place}: low and high must be numbers, low below high")
     step, log = spec.get("step"), spec.get("log", False)

@@ -15,12 +15,9 @@ PAIRS = 11
 """Neither eight devices nor two divide it."""
 
 
-def settings(method: str) -> Preset:
-    """A preset on the two coarsest levels."""
-    values: dict[str, object] = {"solver.iterations": [0, 0, 0, 8, 12]}
-    if method == "ga":
-        values["solver.population"] = [0, 0, 0, 12, 24]
-    return override(get_preset(method), values)
+def settings() -> Preset:
+    """A solver without randomness, so that rounding stays rounding, on the two coarsest levels."""
+    return override(get_preset("gauss-newton"), {"solver.iterations": [0, 0, 0, 8, 12]})
 
 
 def pairs() -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Camera, jax.Array]:
@@ -38,12 +35,10 @@ def main(out: str, *distributed: str) -> None:
         address, processes, process = distributed
         jax.distributed.initialize(address, int(processes), int(process))
     references, targets, camera, keys = pairs()
-    results = {"devices": np.array([jax.device_count(), jax.local_device_count()])}
-    for method in ("gauss-newton", "ga"):
-        preset = settings(method)
-        found = align_batch_sharded(references, targets, camera, preset.solver, keys, options=preset.alignment)
-        results |= {f"{method} xi": np.asarray(found.xi), f"{method} error": np.asarray(found.error)}
-    np.savez(out, **results)
+    preset = settings()
+    found = align_batch_sharded(references, targets, camera, preset.solver, keys, options=preset.alignment)
+    devices = np.array([jax.device_count(), jax.local_device_count()])
+    np.savez(out, devices=devices, xi=found.xi, error=found.error, covariance=found.covariance)
 
 
 if __name__ == "__main__":

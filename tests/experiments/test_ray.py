@@ -1,5 +1,6 @@
 """The same experiment on a Ray cluster, in good times and bad."""
 
+import importlib
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -52,8 +53,8 @@ class Recording:
     def slots(self) -> int:
         return self.executor.slots()
 
-    def run(self, *arguments: Any) -> Iterator[Outcome]:
-        for outcome in self.executor.run(*arguments):
+    def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+        for outcome in self.executor.run(*arguments, **options):
             if not self.runs:
                 self.on_first()
             self.runs += [row["run"] for row in outcome.rows]
@@ -92,9 +93,7 @@ def test_a_killed_worker_is_retried_and_the_numbers_are_those_of_local(plan, exp
 
 
 def test_a_node_is_removed(plan, expected, tmp_path, shut_down):
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster = importlib.import_module("ray.cluster_utils").Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         node = cluster.add_node(num_cpus=1)
         ray.init(address=cluster.address, log_to_driver=False)

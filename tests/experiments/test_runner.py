@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -38,8 +39,8 @@ def small(write_experiment) -> Path:
 class Interrupted(LocalExecutor):
     """Ctrl-C comes while the second batch runs."""
 
-    def run(self, *arguments) -> Iterator[Outcome]:
-        yield next(iter(super().run(*arguments)))
+    def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+        yield next(iter(super().run(*arguments, **options)))
         raise KeyboardInterrupt
 
 
@@ -53,8 +54,8 @@ def test_interrupted_and_resumed(small, tmp_path):
     ran: list[str] = []
 
     class Counting(LocalExecutor):
-        def run(self, *arguments) -> Iterator[Outcome]:
-            for outcome in super().run(*arguments):
+        def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+            for outcome in super().run(*arguments, **options):
                 ran.extend(row["run"] for row in outcome.rows)
                 yield outcome
 
@@ -80,8 +81,8 @@ def check_columns(rows) -> None:
 
 def test_a_batch_that_fails_leaves_the_others(small, tmp_path):
     class Failing(LocalExecutor):
-        def run(self, *arguments) -> Iterator[Outcome]:
-            first, *others = super().run(*arguments)
+        def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+            first, *others = super().run(*arguments, **options)
             yield Outcome(first.batch, (), "frame 0: torn")
             yield from others
 

@@ -1,12 +1,14 @@
 """Medians, spreads and tests from rows whose answers are known."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from gavo_jax.experiments.summary import ALL, compare, summarise
 
 
-def rows(sequence: str, label: str, drifts: list[float | None], seeds: list[int | None] | None = None):
+def rows(sequence: str, label: str, drifts: list[float | None], seeds: Sequence[int | None] | None = None):
     return [
         {
             "sequence": sequence,

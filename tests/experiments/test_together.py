@@ -56,9 +56,9 @@ def compilations() -> Iterator[list[str]]:
     events: list[str] = []
     counting = True
 
-    def listen(name: str, seconds: float, **_: Any) -> None:
-        if counting and name == "/jax/core/compile/backend_compile_duration":
-            events.append(name)
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if counting and event == "/jax/core/compile/backend_compile_duration":
+            events.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
