@@ -106,8 +106,9 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
                 time.sleep(PAUSE)
         os.replace(partial, output_file)
 
+    downloader: Any = fetch
     try:
-        return Path(pooch.retrieve(url, known_hash=None, fname=name, path=to, downloader=fetch))
+        return Path(pooch.retrieve(url, known_hash=None, fname=name, path=to, downloader=downloader))
     except requests.HTTPError as error:
         raise GavoError(f"{url}: the server says: {' '.join(str(error).split())[:200]}") from None
     except (requests.ConnectionError, requests.Timeout) as error:
