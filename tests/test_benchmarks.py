@@ -125,4 +125,5 @@ def test_throughput_measures_its_parts(load, tmp_path: Path) -> None:
     load("throughput").main(clip=CLIP, methods="gauss-newton", frames=3, together=2, json=tmp_path / "throughput.json")
     record = read(tmp_path / "throughput.json")
     assert record["frames"] == 3 and record["frame_ms"] > 0 and record["row_kB"] > 1
-    assert 0 < record["gauss-newton"]["milliseconds_together"] and 0 < record["gauss-newton"]["milliseconds_alone"]
+    figures = record["gauss-newton"]
+    assert min(figures["milliseconds_together"] + figures["milliseconds_alone"]) > 0

@@ -6,7 +6,7 @@ at all, writers at the same time need no lock, and a run that is done twice, by 
 
 import json
 import os
-import tempfile
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -76,13 +76,14 @@ class Table:
         parquet, schema = _parquet(), _schema()
         prepare_folder(self.folder)
         values = {name: [json.dumps(v) if isinstance(v := row[name], Mapping) else v] for name in COLUMNS}
-        handle, partial = tempfile.mkstemp(dir=self.folder, prefix=".", suffix=".partial")
-        os.close(handle)
+        partial = self.folder / f".{uuid.uuid4().hex}.partial"
         try:
-            parquet.write_table(_arrow().table(values, schema=schema), partial)
+            parquet.write_table(
+                _arrow().table(values, schema=schema), partial, use_dictionary=False, write_statistics=False
+            )
             os.replace(partial, self.folder / f"{row['run']}{SUFFIX}")
         except OSError as error:
-            Path(partial).unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
             raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
 
     def read(self) -> list[dict[str, Any]]:

@@ -57,7 +57,12 @@ def test_two_processes(alone, tmp_path):
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     processes = [start(tmp_path / f"{i}.npz", 2, address, 2, i) for i in range(2)]
-    errors = [process.communicate(timeout=TIMEOUT)[1] for process in processes]
+    try:
+        errors = [process.communicate(timeout=TIMEOUT)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
     assert [process.returncode for process in processes] == [0, 0], errors
     first, second = (np.load(tmp_path / f"{i}.npz") for i in range(2))
     assert first["devices"].tolist() == [4, 2]
