@@ -77,7 +77,7 @@ def report(folder: Path) -> int:
         cells = [_comparison_row(found) for found in comparisons if found.sequence == name]
         tables.append(ReportTable(f"{name}. {TEST}.", COMPARISON_COLUMNS, cells))
         print_table(f"{name}: first / second", COMPARISON_COLUMNS, cells)
-    states = {(row["versions"], row["git_commit"], row["git_modified"]) for row in rows}
+    states = {_state(row) for row in rows}
     note = "" if len(states) == 1 else f"The rows come from {len(states)} versions of the software or of what it uses."
     print(f"{DEFINITION}\n{TEST}.{' ' if note else ''}{note}")
     configurations = {row["run"]: json.loads(row["configuration"]) for row in rows}
@@ -87,6 +87,12 @@ def report(folder: Path) -> int:
     )
     print(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
     return 0
+
+
+def _state(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a row's software was, without the libraries that one peer alone brings."""
+    versions = json.loads(row["versions"])
+    return (*(versions.get(name) for name in environment()), row["git_commit"], row["git_modified"])
 
 
 def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
