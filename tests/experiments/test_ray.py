@@ -3,6 +3,7 @@
 import importlib
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,9 @@ def test_a_node_is_removed(plan, expected, tmp_path, shut_down):
         recording = Recording(RayExecutor(plan.ray), lambda: cluster.remove_node(node, allow_graceful=False))
         table = Table(tmp_path / "ray")
         assert run_experiment(plan, table, recording) == (RUNS, [])
+        deadline = time.monotonic() + 60
+        while sum(found["Alive"] for found in ray.nodes()) > 1 and time.monotonic() < deadline:
+            time.sleep(0.5)
         assert sum(found["Alive"] for found in ray.nodes()) == 1
     finally:
         ray.shutdown()
