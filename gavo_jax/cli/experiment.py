@@ -1,27 +1,32 @@
 """`gavo experiment`: a file of runs to a table of results, and a table of results to a report."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gavo_jax import plots
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Experiment
 from gavo_jax.cli.screen import number, pair_progress, print_table
+from gavo_jax.cli.tracking import save_figure
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.experiments.executors import LocalExecutor, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
-from gavo_jax.experiments.summary import DRIFT, Comparison, Summary, compare, summarise
+from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
+from gavo_jax.presets import METHODS
+from gavo_jax.report import REPORT as PAGE
 from gavo_jax.report import Picture, write_report
 from gavo_jax.report import Table as ReportTable
 from gavo_jax.results import environment, prepare_folder, write_json
 
 REPORT = "report"
-PLAN, PAGE, FIGURE = "experiment.json", "report.html", "drift"
+PLAN, FIGURE = "experiment.json", "drift"
 SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/pair", "together")
 COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
 DEFINITION = (
@@ -157,14 +162,14 @@ def _comparison_row(found: Comparison) -> list[Any]:
     return [f"{found.first} / {found.second}", found.pairs, number(found.ratio, 4), p]
 
 
-def _figures(folder: Path, rows: Iterable[Mapping[str, Any]]) -> list[Picture]:
-    if not plots.available():
-        return []
-    groups: dict[str, dict[str, list[float]]] = {}
+def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
+    """Write the drift of every method on every sequence as a figure, where matplotlib is installed."""
+    clips: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in rows:
         if row[DRIFT] is not None:
-            groups.setdefault(row["sequence"], {}).setdefault(row["label"], []).append(row[DRIFT])
-    if not groups:
+            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append((row[DRIFT], row[ROTATION]))
+    if not clips or not plots.available():
         return []
-    paths = plots.save(plots.plot_spread(groups, "drift (m/s)"), folder, FIGURE)
-    return [Picture("Drift of every run; the bar is the median.", next(p for p in paths if p.suffix == ".svg"))]
+    drifts = {clip: {name: np.array(runs) for name, runs in methods.items()} for clip, methods in clips.items()}
+    ours = list({row["label"] for row in rows if row["method"] in METHODS})
+    return [save_figure(plots.plot_drift(drifts, ours), folder, FIGURE)]
