@@ -141,7 +141,7 @@ def _track_stack(
     """One frame of R runs: everything but the images, the camera and the program has a leading axis R."""
 
     def one(state: TrackerState, clock: Clock, key: Any, solver: Any, alignment: AlignmentOptions) -> Any:
-        return _track(state, grey, depth, clock, key, camera, solver, alignment, odometry)
+        return _track(state, grey, depth, clock, key, camera, solver, alignment, odometry, record=False)[:2]
 
     return jax.vmap(one)(states, clocks, keys, solvers, alignments)
 

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sharded_pairs import PAIRS, pairs, settings
+from sharded_pairs import METHOD, PAIRS, pairs
 
 from gavo_jax.alignment import Alignment, align_batch
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.sharding import align_batch_sharded
+from gavo_jax.presets import get_preset
 
 SCRIPT = Path(__file__).with_name("sharded_pairs.py")
 TIMEOUT = 300
@@ -32,7 +33,7 @@ def start(out: Path, devices: int, *distributed: object) -> subprocess.Popen[str
 @pytest.fixture(scope="module")
 def alone() -> Alignment:
     references, targets, camera, keys = pairs()
-    preset = settings()
+    preset = get_preset(METHOD)
     return align_batch(references, targets, camera, preset.solver, keys, options=preset.alignment)
 
 
