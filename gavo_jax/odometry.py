@@ -318,15 +318,20 @@ class Odometry:
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
 
-    def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment]:
-        """Align with the references; a result that looks wrong is tried again by the wide search."""
+    def inputs(self, before: Progress, frame: Frame) -> tuple[Clock, PRNGKeyArray]:
+        """Times and random key that a frame is aligned with."""
         assert before.tracker is not None
         elapsed = frame.timestamp - before.reference_timestamp
         if elapsed <= 0:
             elapsed = float(before.tracker.seconds)
         delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
-        clock = Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay))
         key = jax.random.fold_in(self._key, before.last_index)
+        return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay)), key
+
+    def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment]:
+        """Align with the references; a result that looks wrong is tried again by the wide search."""
+        assert before.tracker is not None
+        clock, key = self.inputs(before, frame)
         state_after, result = self._run(before.tracker, frame, clock, key)
         if result.status == AlignmentStatus.OK or not self.options.recover:
             return state_after, result

@@ -136,3 +136,11 @@ def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path
     for text in ("fr1_xyz:1", "fr1_xyz:x", "no_such_clip"):
         with pytest.raises(GavoError, match=text.partition(":")[0]):
             open_clip(text)
+
+
+def test_throughput_measures_its_parts(load, tmp_path: Path) -> None:
+    load("throughput").main(clip=CLIP, methods="gauss-newton", frames=3, together=2, json=tmp_path / "throughput.json")
+    record = read(tmp_path / "throughput.json")
+    assert record["frames"] == 3 and record["frame_ms"] > 0 and record["row_kB"] > 1
+    figures = record["gauss-newton"]
+    assert min(figures["milliseconds_together"] + figures["milliseconds_alone"]) > 0

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from gavo_jax.cli.options import Align, Command, Compare, Evaluate, Run, View
+from gavo_jax.cli.options import Align, Command, Compare, Download, Evaluate, Experiment, Run, Tune, View
 from gavo_jax.errors import GavoError
 from gavo_jax.version import __version__
 
@@ -78,6 +78,18 @@ def _execute(command: Command) -> int:
             from gavo_jax.cli.evaluate import evaluate
 
             return evaluate(command)
+        case Experiment():
+            from gavo_jax.cli.experiment import experiment
+
+            return experiment(command)
+        case Download():
+            from gavo_jax.cli.download import download
+
+            return download(command)
+        case Tune():
+            from gavo_jax.cli.tune import tune
+
+            return tune(command)
 
 
 def _parse(arguments: list[str]) -> Command | None:
@@ -110,7 +122,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = ("run", "compare", "view", "align", "evaluate")
+    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune")
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 

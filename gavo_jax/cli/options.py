@@ -120,10 +120,57 @@ class Evaluate:
     """Unit of the span."""
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """Run sequences x methods x presets x seeds x settings into a table of results, and report on it."""
+
+    file: Annotated[Positional[str], arg(metavar="{FILE.toml,report}")]
+    """The experiment (docs/experiments.md), or the word report and a folder of results."""
+    folder: Annotated[Positional[Path | None], arg(metavar="[DIR]", help_behavior_hint="(with report)")] = None
+    """Folder of results to report on."""
+    executor: Literal["local", "ray"] = "local"
+    """This process, or the Ray cluster that RAY_ADDRESS names (else one that is started here)."""
+    dry_run: bool = False
+    """Print the plan and stop."""
+    output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
+        None
+    )
+    """Folder for the table and the report; what it has already is not run again."""
+
+
+@dataclass(frozen=True)
+class Download:
+    """Get a sequence of the TUM RGB-D benchmark and unpack it."""
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """As fr1_xyz, freiburg1_xyz or rgbd_dataset_freiburg1_xyz."""
+    to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: GAVO_DATA, else data)")] = None
+    """Folder that receives the sequence's folder."""
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Search settings for small drift and little time at once, by Optuna; the result is a Pareto front."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
+    """What is tuned, over which sequences (docs/experiments.md)."""
+    trials: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the file's, else 50)")] = None
+    """Trials that the study is to hold in the end; it goes on from those it has."""
+    storage: Annotated[str | None, arg(metavar="URL", help_behavior_hint="(default: SQLite in --output)")] = None
+    """Any storage of Optuna; several machines may share one."""
+    output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
+        None
+    )
+    """Folder for the study and the front."""
+
+
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[View, subcommand("view")]
     | Annotated[Align, subcommand("align")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Experiment, subcommand("experiment")]
+    | Annotated[Download, subcommand("download")]
+    | Annotated[Tune, subcommand("tune")]
 )

@@ -17,9 +17,9 @@ class PairProgress:
     def __init__(self, progress: Progress, task: TaskID, label: str) -> None:
         self._progress, self._task, self._label = progress, task, label
 
-    def advance(self) -> None:
-        """Count one pair."""
-        self._progress.update(self._task, advance=1, description=self._label)
+    def advance(self, pairs: int = 1) -> None:
+        """Count a pair, or several."""
+        self._progress.update(self._task, advance=pairs, description=self._label)
 
 
 @contextmanager

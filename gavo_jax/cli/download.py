@@ -1,0 +1,31 @@
+"""`gavo download`: a sequence of the TUM RGB-D benchmark, unpacked."""
+
+import os
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+from gavo_jax.cli.options import Download
+from gavo_jax.datasets.download import SERVER
+from gavo_jax.datasets.download import download as download_sequence
+
+SERVER_VARIABLE = "GAVO_TUM_SERVER"
+"""Environment variable that names a mirror of the benchmark."""
+
+
+def download(options: Download) -> int:
+    """Get the sequence under a progress bar on standard error; print its folder."""
+    to = options.to or Path(os.environ.get("GAVO_DATA") or "data")
+    console = Console(stderr=True)
+    columns = (TextColumn(options.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(have: int, total: int | None) -> None:
+            bar.update(task, completed=have, total=total)
+
+        server = os.environ.get(SERVER_VARIABLE) or SERVER
+        folder = download_sequence(options.name, to, server, show)
+    print(folder)
+    return 0

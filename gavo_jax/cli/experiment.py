@@ -1,0 +1,175 @@
+"""`gavo experiment`: a file of runs to a table of results, and a table of results to a report."""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import closing, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gavo_jax import plots
+from gavo_jax.cli.compilation_cache import enable_compilation_cache
+from gavo_jax.cli.options import Experiment
+from gavo_jax.cli.screen import number, pair_progress, print_table
+from gavo_jax.cli.tracking import save_figure
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.experiments.executors import LocalExecutor, RayExecutor
+from gavo_jax.experiments.plan import Plan, Run, read_plan
+from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
+from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
+from gavo_jax.experiments.table import Table
+from gavo_jax.presets import METHODS
+from gavo_jax.report import REPORT as PAGE
+from gavo_jax.report import Picture, write_report
+from gavo_jax.report import Table as ReportTable
+from gavo_jax.results import environment, prepare_folder, write_json
+
+REPORT = "report"
+PLAN, FIGURE = "experiment.json", "drift"
+SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/pair", "together")
+COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
+DEFINITION = (
+    "Drift: relative pose error over 1 s, RMSE (m/s, deg/s): median over the runs, its quartiles, and what a "
+    "publication prints. Time a pair: median; together: runs that shared the machine while it was taken."
+)
+TEST = (
+    "Methods paired by sequence and seed: median of the ratio of their drifts, and p of the two-sided Wilcoxon "
+    "signed-rank test, not corrected for the number of comparisons"
+)
+Printed = Mapping[tuple[str, str], float]
+
+
+def experiment(options: Experiment) -> int:
+    """Print the plan, run what the table does not have yet, print and write the report; return the exit status."""
+    if options.file == REPORT:
+        if options.folder is None:
+            raise GavoError("report: which folder? gavo experiment report DIR")
+        return report(options.folder)
+    if options.folder is not None:
+        raise GavoError(f"unexpected argument {str(options.folder)!r}: the folder for results is --output DIR")
+    plan = read_plan(options.file, options.output)
+    table = Table(plan.folder)
+    if options.dry_run:
+        _print_plan(plan, table, missing(plan, table), 1)
+        return 0
+    prepare_folder(plan.folder)
+    enable_compilation_cache()
+    with closing(RayExecutor(plan.ray)) if options.executor == "ray" else nullcontext(LocalExecutor()) as executor:
+        runs = missing(plan, table)
+        _print_plan(plan, table, runs, executor.slots())
+        write_json(plan.folder / PLAN, _record(plan))
+        with pair_progress(plan.name, sum(run.pairs for run in runs)) as bar:
+            finished = run_experiment(plan, table, executor, bar.advance)
+    if finished.faults:
+        raise GavoError(f"{len(finished.faults)} batches of runs failed: {'; '.join(finished.faults)}")
+    return report(plan.folder)
+
+
+def report(folder: Path) -> int:
+    """Print the tables of an experiment's folder and write report.html and the figure there."""
+    rows = Table(folder).read()
+    printed, order = _read_record(folder)
+    rows.sort(key=lambda row: (order.get((row["sequence"], row["label"]), len(order)), row["seed"] or 0))
+    summaries, comparisons = summarise(rows), compare(rows)
+    sequences = list(dict.fromkeys(summary.sequence for summary in summaries))
+    tables = []
+    for name in sequences:
+        cells = [_summary_row(summary, printed) for summary in summaries if summary.sequence == name]
+        tables.append(ReportTable(f"{name}. {DEFINITION}", SUMMARY_COLUMNS, cells))
+        print_table(name, SUMMARY_COLUMNS, cells)
+    for name in dict.fromkeys(comparison.sequence for comparison in comparisons):
+        cells = [_comparison_row(found) for found in comparisons if found.sequence == name]
+        tables.append(ReportTable(f"{name}. {TEST}.", COMPARISON_COLUMNS, cells))
+        print_table(f"{name}: first / second", COMPARISON_COLUMNS, cells)
+    states = {_state(row) for row in rows}
+    note = "" if len(states) == 1 else f"The rows come from {len(states)} versions of the software or of what it uses."
+    print(f"{DEFINITION}\n{TEST}.{' ' if note else ''}{note}")
+    configurations = {row["run"]: json.loads(row["configuration"]) for row in rows}
+    page = folder / PAGE
+    write_report(
+        page, f"Experiment {rows[0]['experiment']}", tables, _figures(folder, rows), configurations, environment(), note
+    )
+    print(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
+    return 0
+
+
+def _state(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a row's software was, without the libraries that one peer alone brings."""
+    versions = json.loads(row["versions"])
+    return (*(versions.get(name) for name in environment()), row["git_commit"], row["git_modified"])
+
+
+def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
+    """Say what will be run, before it is."""
+    todo = fitted_batches(runs, plan.batch, slots)
+    ours = {run.id for run in runs}
+    rows = []
+    for name, label in dict.fromkeys((run.part.name, run.label) for run in plan.runs):
+        group = [run for run in plan.runs if (run.part.name, run.label) == (name, label)]
+        rows.append((f"{name}: {label}", len(group), sum(run.id in ours for run in group), group[0].pairs))
+    print_table(f"experiment {plan.name}", ("", "runs", "to do", "pairs"), rows)
+    for line in plan.skipped:
+        print(line)
+    seconds = estimate_seconds(plan, runs, table.read() if table.done() else [], slots)
+    print(
+        f"{len(plan.runs)} runs, {len(plan.runs) - len(runs)} of them done; {len(runs)} to do in {len(todo)} batches, "
+        f"{plan.programs} compiled programs, about {_duration(seconds)}; results in {plan.folder}"
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _record(plan: Plan) -> dict[str, Any]:
+    """What a report needs beside the table: the order of the rows, and what is printed elsewhere."""
+    order = list(dict.fromkeys((run.part.name, run.label) for run in plan.runs))
+    printed = [{"sequence": name, "label": label, "drift": value} for (name, label), value in plan.printed.items()]
+    return {"name": plan.name, "order": order, "printed": printed}
+
+
+def _read_record(folder: Path) -> tuple[Printed, dict[tuple[str, str], int]]:
+    path = folder / PLAN
+    if not path.is_file():
+        return {}, {}
+    try:
+        record = json.loads(read_text(path))
+        printed = {(entry["sequence"], entry["label"]): float(entry["drift"]) for entry in record["printed"]}
+        return printed, {(name, label): i for i, (name, label) in enumerate(record["order"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise GavoError(f"{path}: not the record of an experiment: {error}") from None
+
+
+def _summary_row(summary: Summary, printed: Printed) -> list[Any]:
+    low, median, high = summary.drift or (None, None, None)
+    return [
+        summary.label,
+        summary.runs,
+        *(number(value, 5) for value in (median, low, high)),
+        number(printed.get((summary.sequence, summary.label)), 5),
+        number(summary.rotation, 3),
+        summary.lost,
+        number(summary.milliseconds, 1),
+        summary.together,
+    ]
+
+
+def _comparison_row(found: Comparison) -> list[Any]:
+    p = "–" if found.p is None else f"{found.p:.2g}"
+    return [f"{found.first} / {found.second}", found.pairs, number(found.ratio, 4), p]
+
+
+def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
+    """Write the drift of every method on every sequence as a figure, where matplotlib is installed."""
+    clips: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for row in rows:
+        if row[DRIFT] is not None:
+            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append((row[DRIFT], row[ROTATION]))
+    if not clips or not plots.available():
+        return []
+    drifts = {clip: {name: np.array(runs) for name, runs in methods.items()} for clip, methods in clips.items()}
+    ours = list({row["label"] for row in rows if row["method"] in METHODS})
+    return [save_figure(plots.plot_drift(drifts, ours), folder, FIGURE)]

@@ -1,0 +1,45 @@
+"""`gavo tune`: settings of small drift and little time, as a Pareto front."""
+
+from typing import Any
+
+from gavo_jax.cli.compilation_cache import enable_compilation_cache
+from gavo_jax.cli.options import Tune
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.tuning import Choice, read_tuning
+from gavo_jax.experiments.tuning import tune as search
+from gavo_jax.results import prepare_folder, write_json
+
+STUDY, FRONT = "study.db", "front.json"
+
+
+def tune(options: Tune) -> int:
+    """Bring the study up to its number of trials; print the front and write front.json."""
+    tuning = read_tuning(options.file, options.output)
+    trials = tuning.trials if options.trials is None else options.trials
+    if trials < 1:
+        raise GavoError(f"--trials: must be at least 1, not {trials}")
+    folder = prepare_folder(tuning.folder)
+    storage = options.storage or f"sqlite:///{(folder / STUDY).resolve()}"
+    enable_compilation_cache()
+    print(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {storage}")
+
+    def show(trial: int, drift: float, milliseconds: float) -> None:
+        print(f"trial {trial}: {number(drift, 5)} m/s, {number(milliseconds, 1)} ms/pair", flush=True)
+
+    front = search(tuning, storage, trials, show)
+    names = list(tuning.space)
+    rows = [_row(choice, names) for choice in front]
+    print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)
+    write_json(folder / FRONT, [choice._asdict() for choice in front])
+    print(f"front in {folder / FRONT}")
+    return 0
+
+
+def _row(choice: Choice, names: list[str]) -> list[Any]:
+    settings = [choice.settings.get(name, "–") for name in names]
+    return [choice.trial, number(choice.drift, 5), number(choice.milliseconds, 1), *map(_short, settings)]
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,178 @@
+"""Sequences of the TUM RGB-D benchmark: resumed where a download broke off, checked by size, unpacked safely."""
+
+import difflib
+import os
+import re
+import shutil
+import tarfile
+import tempfile
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gavo_jax.errors import GavoError
+
+SERVER = "https://cvg.cit.tum.de/rgbd/dataset"
+SEQUENCES = {
+    "1": "360 desk desk2 floor plant room rpy teddy xyz",
+    "2": "360_hemisphere 360_kidnap coke desk desk_with_person dishes flowerbouquet flowerbouquet_brownbackground "
+    "large_no_loop large_with_loop metallic_sphere metallic_sphere2 pioneer_360 pioneer_slam pioneer_slam2 "
+    "pioneer_slam3 rpy xyz",
+    "3": "cabinet large_cabinet long_office_household nostructure_notexture_far nostructure_notexture_near_withloop "
+    "nostructure_texture_far nostructure_texture_near_withloop sitting_halfsphere sitting_rpy sitting_static "
+    "sitting_xyz structure_notexture_far structure_notexture_near structure_texture_far structure_texture_near teddy "
+    "walking_halfsphere walking_rpy walking_static walking_xyz",
+}
+"""Names by camera."""
+ATTEMPTS, PAUSE = 5, 1.0
+"""Tries to get the whole file, each going on where the last one ended, and seconds between them."""
+TIMEOUT = (10.0, 30.0)
+"""Seconds without a connection, and without a byte, after which a try has failed."""
+CHUNK = 2**18
+
+Progress = Callable[[int, int | None], None]
+"""Called with the bytes that are there and the bytes that there will be, where the server says."""
+
+
+def folder_of(name: str) -> str:
+    """Name of a sequence's folder, from `fr1_xyz`, `freiburg1_xyz` or the folder's name itself.
+
+    Raises:
+        GavoError: no such sequence; the nearest one is named.
+    """
+    known = [f"fr{camera}_{rest}" for camera, names in SEQUENCES.items() for rest in names.split()]
+    short = re.sub(r"^(rgbd_dataset_)?freiburg", "fr", name.strip())
+    if short not in known:
+        near = difflib.get_close_matches(short, known, n=1, cutoff=0.0)[0]
+        raise GavoError(f"{name!r}: no sequence of the TUM RGB-D benchmark; did you mean {near!r}?")
+    return f"rgbd_dataset_freiburg{short[2:]}"
+
+
+def download(name: str, to: str | Path, server: str = SERVER, progress: Progress = lambda *_: None) -> Path:
+    """Get a sequence and unpack it; nothing is done where its folder is there already.
+
+    Args:
+        name: As in `folder_of`.
+        to: Folder that receives the sequence's folder. A part of the archive that an earlier call left is gone on with.
+        server: Address below which the benchmark's files lie.
+        progress: Hears of the bytes that are there.
+
+    Returns:
+        The sequence's folder.
+
+    Raises:
+        GavoError: unknown name, no connection, the server refuses or breaks off again and again, the archive is damaged
+            or would write outside its folder, the disk is full; pooch is missing.
+    """
+    folder = folder_of(name)
+    target = Path(to) / folder
+    if target.is_dir():
+        return target
+    url = f"{server.rstrip('/')}/freiburg{folder.removeprefix('rgbd_dataset_freiburg')[0]}/{folder}.tgz"
+    try:
+        Path(to).mkdir(parents=True, exist_ok=True)
+        archive = _retrieve(url, Path(to), progress)
+        _unpack(archive, target)
+        archive.unlink()
+    except OSError as error:
+        raise GavoError(f"{to}: cannot be written to: {error.strerror or error}") from None
+    return target
+
+
+def _retrieve(url: str, to: Path, progress: Progress) -> Path:
+    """Return the whole archive in `to`."""
+    try:
+        import pooch
+        import requests
+    except ImportError:
+        raise GavoError("downloads need pooch: pip install 'gavo-jax[download]'") from None
+    pooch.get_logger().setLevel("WARNING")
+    name = url.rpartition("/")[2]
+    partial = to / f"{name}.part"
+
+    def fetch(url: str, output_file: Any, pooch: Any, check_only: bool | None = False) -> None:
+        """Pooch's downloader: whatever a try brings stays in `partial`."""
+        for attempt in range(ATTEMPTS):
+            try:
+                _fetch(url, partial, progress)
+                break
+            except requests.HTTPError:
+                raise
+            except requests.RequestException:
+                if attempt + 1 == ATTEMPTS:
+                    raise
+                time.sleep(PAUSE)
+        os.replace(partial, output_file)
+
+    downloader: Any = fetch
+    try:
+        return Path(pooch.retrieve(url, known_hash=None, fname=name, path=to, downloader=downloader))
+    except requests.HTTPError as error:
+        raise GavoError(f"{url}: the server says: {' '.join(str(error).split())[:200]}") from None
+    except (requests.ConnectionError, requests.Timeout) as error:
+        kind = "no answer in time" if isinstance(error, requests.Timeout) else "no connection"
+        there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
+        raise GavoError(f"{url}: {kind} (is there a network?){there}") from None
+    except requests.RequestException as error:
+        there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
+        raise GavoError(f"{url}: broke off {ATTEMPTS} times: {' '.join(str(error).split())[:200]}{there}") from None
+
+
+def _fetch(url: str, partial: Path, progress: Progress) -> None:
+    """One try: go on after what is there already, if the server can, else from the start; the size has to be right."""
+    import requests
+
+    have = partial.stat().st_size if partial.exists() else 0
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
+    with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
+        if response.status_code == requests.codes.requested_range_not_satisfiable:
+            partial.unlink()
+            raise requests.ConnectionError("what was there is no part of the server's file")
+        response.raise_for_status()
+        span = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", response.headers.get("Content-Range", ""))
+        goes_on = response.status_code == requests.codes.partial_content and span is not None
+        if goes_on and span is not None and int(span[1]) != have:
+            partial.unlink(missing_ok=True)
+            raise requests.ConnectionError("the server goes on at another place")
+        if not goes_on:
+            have = 0
+        length = response.headers.get("Content-Length")
+        total = None if length is None else have + int(length)
+        with partial.open("ab" if goes_on else "wb") as file:
+            for chunk in response.iter_content(CHUNK):
+                file.write(chunk)
+                have += len(chunk)
+                progress(have, total)
+    if total is not None and have != total:
+        raise requests.ConnectionError(f"{have} of {total} bytes came")
+
+
+def _unpack(archive: Path, target: Path) -> None:
+    """Unpack beside the target and rename: its folder is there whole or not at all."""
+    scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=".unpacking-"))
+    try:
+        with tarfile.open(archive, "r:gz") as tar:
+            tar.extractall(scratch, filter=_only_files_below(target.name))
+        if not (scratch / target.name / "rgb.txt").is_file():
+            raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
+        os.replace(scratch / target.name, target)
+    except (tarfile.TarError, EOFError, zlib.error) as error:
+        reason = " ".join(str(error).split())
+        archive.unlink()
+        raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {reason}") from None
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _only_files_below(folder: str) -> Callable[[tarfile.TarInfo, str], tarfile.TarInfo]:
+    def check(member: tarfile.TarInfo, path: str) -> tarfile.TarInfo:
+        member = tarfile.data_filter(member, path)
+        if not (member.isfile() or member.isdir()):
+            raise tarfile.ReadError(f"{member.name}: neither a file nor a folder")
+        if Path(os.path.normpath(member.name)).parts[:1] not in ((folder,), ()):
+            raise tarfile.ReadError(f"{member.name}: outside {folder}")
+        return member
+
+    return check

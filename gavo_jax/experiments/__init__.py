@@ -1,0 +1,1 @@
+"""Many runs: what is planned, who runs it, where the results go, what they say."""

@@ -1,0 +1,243 @@
+"""Who runs the runs: this process on its own device, or a Ray cluster."""
+
+import importlib
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+
+from gavo_jax.comparison import PeerOdometry
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
+from gavo_jax.experiments.together import track_stacked, track_together
+from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
+from gavo_jax.peers import make_peer
+from gavo_jax.results import environment
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a batch: its rows, or the one line that says why there are none."""
+
+    batch: Batch
+    rows: tuple[Row, ...]
+    fault: str | None = None
+
+
+class Executor(Protocol):
+    """Runs batches, in any order."""
+
+    def slots(self) -> int:
+        """How many batches it can run at the same time."""
+        ...
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Yield each batch's outcome as soon as it is known; `on_pairs` hears of pairs that are done."""
+        ...
+
+
+class LocalExecutor:
+    """One batch after the other in this process; the device works on the runs of a batch together."""
+
+    def slots(self) -> int:
+        """One."""
+        return 1
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Run them in their order."""
+        for batch in batches:
+            yield run_batch(experiment, batch, on_pairs)
+
+
+class RayExecutor:
+    """Batches as tasks of a Ray cluster: the one that RAY_ADDRESS names, else one that is started here.
+
+    Ray retries a task whose process or node dies. Rows travel back to the driver, which alone writes the table; only
+    the frames have to be readable on every node, under the same paths.
+    """
+
+    RETRIES = 5
+
+    def __init__(self, options: RayOptions) -> None:
+        """Join the cluster.
+
+        Raises:
+            GavoError: Ray is missing, no cluster answers, or none of its nodes has what a batch takes.
+        """
+        try:
+            ray = importlib.import_module("ray")
+        except ImportError:
+            raise GavoError("--executor ray needs Ray: pip install 'gavo-jax[ray]'") from None
+        self._ray = ray
+        self._started = not ray.is_initialized()
+        if self._started:
+            try:
+                ray.init(log_to_driver=False, configure_logging=False, include_dashboard=False)
+            except (ConnectionError, RuntimeError, ValueError) as error:
+                raise GavoError(f"--executor ray: no cluster: {' '.join(str(error).split())}") from None
+        resources = ray.cluster_resources()
+        gpus = options.gpus if options.gpus is not None else min(1.0, resources.get("GPU", 0.0))
+        self._wanted = {"CPU": min(options.cpus, resources.get("CPU", 1.0)), "GPU": gpus}
+        for name, amount in self._wanted.items():
+            if amount > resources.get(name, 0.0):
+                raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
+
+    def slots(self) -> int:
+        """As many as the cluster's processors and GPUs allow now."""
+        resources = self._ray.cluster_resources()
+        return max(1, int(min(resources.get(name, 0.0) // n for name, n in self._wanted.items() if n)))
+
+    def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
+        """Hand all of them to the cluster and yield them in the order in which they come back."""
+        ray = self._ray
+        cache_folder = jax.config.values.get("jax_compilation_cache_dir")
+        variables = {"JAX_COMPILATION_CACHE_DIR": cache_folder} if cache_folder else {}
+        task = ray.remote(run_batch).options(
+            num_cpus=self._wanted["CPU"],
+            num_gpus=self._wanted["GPU"],
+            max_retries=self.RETRIES,
+            runtime_env={"env_vars": variables},
+        )
+        waiting = {task.remote(experiment, batch): batch for batch in batches}
+        try:
+            while waiting:
+                ready, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+                for reference in ready:
+                    batch = waiting.pop(reference)
+                    try:
+                        outcome = ray.get(reference)
+                    except ray.exceptions.RayError as error:
+                        outcome = Outcome(batch, (), " ".join(str(error).split())[:500])
+                    on_pairs(sum(run.pairs for run in batch.runs))
+                    yield outcome
+        finally:
+            for reference in waiting:
+                ray.cancel(reference, force=True)
+
+    def close(self) -> None:
+        """Leave the cluster; one that was started here ends."""
+        if self._started:
+            self._ray.shutdown()
+
+
+def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | None = None) -> Outcome:
+    """Run a batch on this process's device.
+
+    Args:
+        experiment: Name that the rows carry.
+        batch: Runs of one program over the same frames.
+        on_pairs: Hears of pairs that are done.
+
+    Returns:
+        A row of the results table a run; bad input is an outcome, too.
+    """
+    try:
+        sequence = batch.part.open()
+        tracker = _Tracker(batch, sequence)
+        compile_seconds = tracker.warm_up()
+        start = time.perf_counter()
+        steps = tracker.track(on_pairs)
+        seconds = (time.perf_counter() - start) / len(batch.runs)
+        first = float(sequence.timestamps[0])
+        rows = []
+        for run, own in zip(batch.runs, steps, strict=True):
+            truth = sequence.ground_truth
+            metrics = compute_metrics(trajectory_of(first, own), truth, own, seconds, compile_seconds)
+            rows.append(_row(experiment, batch, run, sequence, metrics))
+    except GavoError as error:
+        return Outcome(batch, (), str(error))
+    return Outcome(batch, tuple(rows))
+
+
+class _Tracker:
+    """All runs of a batch over its frames: stacked into one call a frame where the device gains by it."""
+
+    def __init__(self, batch: Batch, sequence: FrameSequence) -> None:
+        self._sequence, self._runs = sequence, batch.runs
+        self._stacked = jax.default_backend() != "cpu" and batch.runs[0].settings is not None
+
+    def warm_up(self) -> float:
+        """Compile; returns the seconds this took."""
+        if not self._stacked:
+            return _odometry(self._runs[0], self._sequence).warm_up()
+        start = time.perf_counter()
+        self._track(self._sequence[:2], None)
+        return time.perf_counter() - start
+
+    def track(self, on_pairs: Callable[[int], None] | None) -> list[list[Step]]:
+        """The steps of each run."""
+        frames = iter(range(len(self._sequence)))
+
+        def on_frame() -> None:
+            if on_pairs is not None and next(frames) > 0:
+                on_pairs(len(self._runs))
+
+        return self._track(self._sequence, on_frame)
+
+    def _track(self, sequence: FrameSequence, on_frame: Callable[[], None] | None) -> list[list[Step]]:
+        settings = [run.settings for run in self._runs if run.settings is not None]
+        if self._stacked:
+            return track_stacked(sequence, settings, [run.seed or 0 for run in self._runs], on_frame)
+        return track_together(sequence, [_odometry(run, sequence) for run in self._runs], on_frame)
+
+
+def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
+    if run.settings is None:
+        return PeerOdometry(run.method, sequence.camera)
+    settings = run.settings
+    return Odometry(sequence.camera, settings.solver, settings.alignment, settings.odometry, run.seed or 0)
+
+
+def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]) -> Row:
+    commit, modified = git_state()
+    return {
+        "run": run.id,
+        "experiment": experiment,
+        "sequence": run.part.name,
+        "method": run.method,
+        "preset": run.preset,
+        "variant": run.variant,
+        "label": run.label,
+        "seed": run.seed,
+        **metrics,
+        "runs_together": len(batch.runs),
+        "pixels": run.pixels,
+        "configuration": configuration(run, sequence),
+        "versions": environment() | _peer_versions(run, sequence),
+        "git_commit": commit,
+        "git_modified": modified,
+        "host": platform.node(),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _peer_versions(run: Run, sequence: FrameSequence) -> dict[str, str]:
+    return dict(make_peer(run.method, sequence.camera).versions) if run.settings is None else {}
+
+
+@cache
+def git_state() -> tuple[str | None, bool | None]:
+    """Commit of the checkout that this package is imported from, and whether it has changes; None where it is none."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=20)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return None, None
+    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
+    return commit, None if changes is None else bool(changes)

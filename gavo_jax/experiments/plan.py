@@ -1,0 +1,422 @@
+"""From a TOML file to runs: sequences × methods × presets × settings × seeds, checked before anything runs."""
+
+import glob
+import hashlib
+import itertools
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gavo_jax.camera import load_camera
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.selection import SYNTHETIC, open_part
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.experiments.settings import flatten, override, refuse_unknown
+from gavo_jax.experiments.together import program_of
+from gavo_jax.peers import PEERS
+from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
+from gavo_jax.results import describe
+
+KEYS = ("name", "output", "seeds", "batch", "sequences", "methods", "ray")
+SEQUENCE_KEYS = ("path", "name", "camera", "start", "frames", "stride", "optional")
+METHOD_KEYS = ("name", "presets", "seeds", "solver", "alignment", "odometry", "sweep", "printed", "optional")
+RAY_KEYS = ("cpus", "gpus")
+DATA = "GAVO_DATA"
+BATCH = 32
+"""Runs that are tracked together unless the file says otherwise."""
+MAX_SEED = 2**32 - 1
+MAX_RUNS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Part:
+    """Frames of one sequence."""
+
+    name: str
+    """As tables call it."""
+    path: str
+    """A folder, or the word synthetic."""
+    camera: str = "auto"
+    start: int = 0
+    frames: int | None = None
+    stride: int = 1
+
+    def open(self) -> FrameSequence:
+        """Return the frames, checked.
+
+        Raises:
+            GavoError: as `open_part`.
+        """
+        return open_part(self.path, self.camera, self.start, self.frames, self.stride)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run, ready to go.
+
+    Attributes:
+        id: Hash of everything below and of the frames' stamps and camera: equal runs have equal ones everywhere.
+        part: Which frames.
+        pairs: How many pairs these make.
+        pixels: Of one image.
+        method: One of `METHODS`, or a peer.
+        preset: Name of the preset; empty for a peer.
+        variant: The settings that differ from the preset's, in words; mostly empty.
+        seed: None for a peer, which has none.
+        settings: Effective settings; None for a peer.
+    """
+
+    id: str = field(compare=False)
+    part: Part
+    pairs: int
+    pixels: int
+    method: str
+    preset: str
+    variant: str
+    seed: int | None
+    settings: Preset | None
+
+    @property
+    def label(self) -> str:
+        """Name of method, preset and variant in tables."""
+        name = self.method if self.preset in ("", "default") else f"{self.method}, {self.preset}"
+        return f"{name}, {self.variant}" if self.variant else name
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Runs of one program over the same frames, tracked together."""
+
+    part: Part
+    runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """What one batch takes of a Ray cluster; None: two processors, and a GPU where the cluster has any."""
+
+    cpus: float = 2.0
+    gpus: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an experiment's file asks for.
+
+    Attributes:
+        name: Of the experiment.
+        folder: Where the results go.
+        runs: All runs, sequence by sequence.
+        programs: Number of distinct compiled programs.
+        skipped: A line for each optional sequence that is not here.
+        printed: Drift that a publication gives, by (sequence, method's label), m/s.
+        batch: Most runs that are tracked together.
+        ray: What a batch takes of a Ray cluster.
+    """
+
+    name: str
+    folder: Path
+    runs: tuple[Run, ...]
+    programs: int
+    skipped: tuple[str, ...]
+    printed: Mapping[tuple[str, str], float]
+    batch: int
+    ray: RayOptions
+
+
+def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
+    """Read an experiment's file, check all of it, and lay out its runs.
+
+    Args:
+        path: The TOML file.
+        output: Folder for the results; the file's own `output`, else runs/NAME.
+
+    Raises:
+        GavoError: names the file, the key and the fault; an unknown key comes with the nearest known one.
+    """
+    path = Path(path)
+    table = read_toml(path, KEYS)
+    name = text_of(f"{path}: name", table.get("name", path.stem))
+    parts, skipped = parts_of(path, table)
+    default_seeds = seeds_of(f"{path}: seeds", table.get("seeds", [0]))
+    methods = _tables(f"{path}: methods", table.get("methods", []))
+    if not methods:
+        raise GavoError(f"{path}: methods: no [[methods]] given")
+    variants: list[_Variant] = []
+    for number, entry in enumerate(methods, 1):
+        place = f"{path}: methods[{number}]"
+        lacking = _lacking(place, entry)
+        if lacking is None:
+            variants += _variants(place, entry, default_seeds)
+        else:
+            skipped[str(entry["name"])] = lacking
+    _refuse_repeated(f"{path}: methods", [variant.label for variant in variants])
+    runs: list[Run] = []
+    programs = set()
+    if len(parts) * sum(len(variant.seeds) for variant in variants) > MAX_RUNS:
+        raise GavoError(f"{path}: more than {MAX_RUNS} runs")
+    for part in parts:
+        sequence = part.open()
+        for variant in variants:
+            runs += _runs(part, sequence, variant)
+            if variant.settings is not None:
+                programs.add((jax.tree.structure(sequence.camera), program_of(variant.settings)))
+    names = [part.name for part in parts]
+    for variant in variants:
+        refuse_unknown(f"{path}: printed figures of {variant.label}", variant.printed, (*names, *skipped))
+    printed = {
+        (name, variant.label): value for variant in variants for name, value in variant.printed.items() if name in names
+    }
+    folder = Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}")))
+    batch = whole_of(f"{path}: batch", table.get("batch", BATCH), 1)
+    return Plan(name, folder, tuple(runs), len(programs), tuple(skipped.values()), printed, batch, _ray(path, table))
+
+
+def read_toml(path: Path, keys: Sequence[str]) -> dict[str, Any]:
+    """Return a TOML file's table, whose keys are all known.
+
+    Raises:
+        GavoError: not readable, not TOML, an unknown key.
+    """
+    try:
+        table = tomllib.loads(read_text(path))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise GavoError(f"{path}: not TOML: {' '.join(str(error).split())}") from None
+    refuse_unknown(str(path), table, keys)
+    return table
+
+
+def batches(runs: Iterable[Run], size: int) -> list[Batch]:
+    """Put runs of one part and one program together, at most `size` of them; peers go one by one."""
+    groups: dict[Any, list[Run]] = {}
+    for run in runs:
+        together = run.id if run.settings is None else program_of(run.settings)
+        groups.setdefault((run.part, run.method, together), []).append(run)
+    return [
+        Batch(group[0].part, tuple(group[first : first + size]))
+        for group in groups.values()
+        for first in range(0, len(group), size)
+    ]
+
+
+def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
+    """The full configuration of a run, without what belongs to a machine: equal ones are one run."""
+    stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
+    return describe(
+        {
+            "sequence": {
+                "name": run.part.name,
+                "frames": len(sequence),
+                "first_timestamp": float(stamps[0]),
+                "last_timestamp": float(stamps[-1]),
+                "timestamps_sha256": hashlib.sha256(stamps.tobytes()).hexdigest(),
+                "camera": sequence.camera,
+            },
+            "method": run.method,
+            "preset": run.preset,
+            "variant": run.variant,
+            "seed": run.seed,
+            "settings": run.settings,
+        }
+    )
+
+
+def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str, str]]:
+    """The parts of all [[sequences]] of a file, and by name a line for each optional one that is not here.
+
+    Raises:
+        GavoError: a wrong key or value, a sequence that is nowhere, two of one name, none at all.
+    """
+    entries = _tables(f"{path}: sequences", table.get("sequences", []))
+    parts: list[Part] = []
+    skipped: dict[str, str] = {}
+    for number, entry in enumerate(entries, 1):
+        place = f"{path}: sequences[{number}]"
+        refuse_unknown(place, entry, SEQUENCE_KEYS)
+        patterns = entry.get("path", SYNTHETIC)
+        patterns = [text_of(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
+        found = _find(path.parent, patterns)
+        if not found:
+            line = f"{', '.join(patterns)}: no such folder here, beside {path.name}, or in {DATA}"
+            if not _flag(f"{place}: optional", entry.get("optional", False)):
+                raise GavoError(f"{place}: {line}")
+            name = entry.get("name", patterns[0])
+            skipped[name] = f"skipped {name}: {line} (gavo download gets TUM's sequences)"
+        if len(found) > 1 and "name" in entry:
+            raise GavoError(f"{place}: name: {len(found)} sequences cannot have one name")
+        parts += [_part(place, path.parent, folder, entry) for folder in found]
+    _refuse_repeated(f"{path}: sequences", [part.name for part in parts])
+    if not parts:
+        raise GavoError(f"{path}: sequences: {'; '.join(skipped.values()) or 'no [[sequences]] given'}")
+    return parts, skipped
+
+
+def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
+    """Folders that the first pattern with any match stands for: from here, beside the file, in GAVO_DATA."""
+    roots = ["", str(beside), *([os.environ[DATA]] if os.environ.get(DATA) else [])]
+    for pattern in patterns:
+        if pattern == SYNTHETIC:
+            return [SYNTHETIC]
+        for root in roots:
+            found = sorted(match for match in glob.glob(os.path.join(root, pattern)) if os.path.isdir(match))
+            if found:
+                return found
+    return []
+
+
+def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Part:
+    start = whole_of(f"{place}: start", entry.get("start", 0), 0)
+    frames = None if "frames" not in entry else whole_of(f"{place}: frames", entry["frames"], 2)
+    stride = whole_of(f"{place}: stride", entry.get("stride", 1), 1)
+    camera = text_of(f"{place}: camera", entry.get("camera", "auto"))
+    if (beside / camera).is_file():
+        camera = str(beside / camera)
+    if camera != "auto":
+        load_camera(camera)
+    name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
+    if "name" not in entry and (start, frames, stride) != (0, None, 1):
+        name = f"{name}[{start}:{'' if frames is None else start + frames * stride}:{stride}]"
+    return Part(text_of(f"{place}: name", name), folder, camera, start, frames, stride)
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """One method with one choice of settings, and the seeds it is run with."""
+
+    method: str
+    preset: str
+    text: str
+    settings: Preset | None
+    seeds: tuple[int | None, ...]
+    printed: Mapping[str, float]
+
+    @property
+    def label(self) -> str:
+        return Run("", Part("", ""), 0, 0, self.method, self.preset, self.text, None, None).label
+
+
+def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
+    """A line for an optional peer that is not installed; None for what can be run.
+
+    Raises:
+        GavoError: a peer that is not installed and not optional.
+    """
+    info = PEERS.get(str(entry.get("name")))
+    if info is None or info.installed:
+        return None
+    line = f"{info.name}: needs {info.module}: pip install 'gavo-jax[peers]'"
+    if not _flag(f"{place}: optional", entry.get("optional", False)):
+        raise GavoError(f"{place}: {line}")
+    return f"skipped {line}"
+
+
+def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
+    refuse_unknown(place, entry, METHOD_KEYS)
+    method = str(entry.get("name"))
+    refuse_unknown(f"{place}: name", [method], (*METHODS, *PEERS))
+    printed = {
+        text_of(place, name): _real(f"{place}: printed.{name}", value)
+        for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()
+    }
+    if method in PEERS:
+        refuse_unknown(f"{place}: {method} has no settings", entry, ("name", "printed", "optional"))
+        return [_Variant(method, "", "", None, (None,), printed)]
+    presets = entry.get("presets", ["default"])
+    if not isinstance(presets, list) or not presets:
+        raise GavoError(f"{place}: presets: not a list of names")
+    refuse_unknown(f"{place}: presets", map(str, presets), PRESETS)
+    seeds = seeds_of(f"{place}: seeds", entry["seeds"]) if "seeds" in entry else default_seeds
+    rooms = {room: entry[room] for room in ("solver", "alignment", "odometry") if room in entry}
+    fixed = flatten(place, rooms)
+    swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
+    for name, values in swept.items():
+        if not isinstance(values, list) or not values:
+            raise GavoError(f"{place}: sweep.{name}: not a list of values")
+    variants = []
+    for preset in presets:
+        for choice in itertools.product(*swept.values()):
+            values = fixed | dict(zip(swept, choice, strict=True))
+            settings = override(get_preset(method, preset), values, place)
+            text = ", ".join(f"{name.partition('.')[2]}={_short(value)}" for name, value in values.items())
+            variants.append(_Variant(method, preset, text, settings, seeds, printed))
+    return variants
+
+
+def _runs(part: Part, sequence: FrameSequence, variant: _Variant) -> list[Run]:
+    pairs, pixels = len(sequence) - 1, sequence.camera.width * sequence.camera.height
+    shared = (part, pairs, pixels, variant.method, variant.preset, variant.text)
+    runs = []
+    for seed in variant.seeds:
+        run = Run("", *shared, seed, variant.settings)
+        canonical = json.dumps(configuration(run, sequence), sort_keys=True, allow_nan=False)
+        identity = hashlib.sha256(canonical.encode()).hexdigest()[:32]
+        runs.append(Run(identity, *shared, seed, variant.settings))
+    return runs
+
+
+def _ray(path: Path, table: Mapping[str, Any]) -> RayOptions:
+    values = table.get("ray", {})
+    place = f"{path}: ray"
+    refuse_unknown(place, flatten(place, values), RAY_KEYS)
+    return RayOptions(**{key: _real(f"{place}.{key}", value) for key, value in values.items()})
+
+
+def seeds_of(place: str, value: Any) -> tuple[int, ...]:
+    """A list of seeds; a number N stands for 0 to N - 1."""
+    if isinstance(value, list):
+        seeds = tuple(whole_of(place, seed, 0) for seed in value)
+        _refuse_repeated(place, seeds)
+    else:
+        seeds = tuple(range(whole_of(place, value, 1))) if whole_of(place, value, 1) <= MAX_RUNS else ()
+    if not seeds or max(seeds) > MAX_SEED:
+        raise GavoError(f"{place}: must be a number of seeds, or a list of seeds from 0 to {MAX_SEED}")
+    return seeds
+
+
+def _tables(place: str, value: Any) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise GavoError(f"{place}: must be given as [[{place.rpartition(' ')[2]}]] tables")
+    return value
+
+
+def text_of(place: str, value: Any) -> str:
+    """Return a text that is not empty, or raise GavoError."""
+    if not isinstance(value, str) or not value:
+        raise GavoError(f"{place}: must be text, not {value!r}")
+    return value
+
+
+def _flag(place: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise GavoError(f"{place}: must be true or false, not {value!r}")
+    return value
+
+
+def whole_of(place: str, value: Any, least: int) -> int:
+    """Return a whole number of at least so much, or raise GavoError."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise GavoError(f"{place}: must be a whole number of at least {least}, not {value!r}")
+    return value
+
+
+def _real(place: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
+        raise GavoError(f"{place}: must be a number of at least 0, not {value!r}")
+    return float(value)
+
+
+def _refuse_repeated(place: str, values: Sequence[Any]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise GavoError(f"{place}: {value} is given twice")
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,142 @@
+"""Any hyperparameter by its dotted name: `solver.mutation_rate`, `alignment.loss`, `solver.population.4`."""
+
+import dataclasses
+import difflib
+import math
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import optax
+
+from gavo_jax.errors import GavoError
+from gavo_jax.objective import LOSSES
+from gavo_jax.presets import Preset
+
+ROOMS = tuple(field.name for field in dataclasses.fields(Preset))
+"""First part of a dotted name: the parts of a preset."""
+OPTIMIZERS = ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
+"""optax's optimisers that need nothing but a learning rate."""
+
+
+def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> None:
+    """Raise GavoError for the first key that is not known, and name the nearest one that is."""
+    known = tuple(known)
+    for key in keys:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise GavoError(f"{place}: unknown key {key!r}{hint}")
+
+
+def override(preset: Preset, values: Mapping[str, Any], place: str = "settings") -> Preset:
+    """Return the preset with some hyperparameters replaced.
+
+    Args:
+        preset: What the others are taken from.
+        values: Value by dotted name. A list gives a schedule an entry a pyramid level (level 0 first); a single number
+            stands for every level of a schedule of rates; `solver.population.4` names the entry of level 4. The word
+            `none` switches an optional number off; losses and optax's optimisers go by their names.
+        place: Where the values stand, for the message.
+
+    Raises:
+        GavoError: an unknown name (with the nearest known one), or a value of the wrong kind.
+    """
+    for name, value in values.items():
+        room, _, rest = name.partition(".")
+        refuse_unknown(place, [room], ROOMS)
+        part = getattr(preset, room)
+        field, _, level = rest.partition(".")
+        refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part)])
+        current = getattr(part, field)
+        where = f"{place}: {name}"
+        if level:
+            new: Any = _with_level(where, current, level, value)
+        else:
+            new = _convert(where, type(part), field, current, value)
+        preset = dataclasses.replace(preset, **{room: dataclasses.replace(part, **{field: new})})
+    _check_schedules(place, preset.solver)
+    return preset
+
+
+def flatten(place: str, table: Mapping[str, Any], is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
+    """Return nested tables as one, with dotted names.
+
+    Raises:
+        GavoError: `place` holds no table.
+    """
+    if not isinstance(table, Mapping):
+        raise GavoError(f"{place}: not a table")
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, Mapping) and not (is_leaf and is_leaf(value)):
+            flat |= {f"{key}.{name}": leaf for name, leaf in flatten(f"{place}.{key}", value, is_leaf).items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _with_level(where: str, current: Any, level: str, value: Any) -> tuple[Any, ...]:
+    if not isinstance(current, tuple) or not level.isdecimal() or int(level) >= len(current):
+        raise GavoError(f"{where}: no such entry of {current!r}")
+    entries = list(current)
+    entries[int(level)] = _number(where, value, isinstance(current[0], int))
+    return tuple(entries)
+
+
+def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> Any:
+    """The value as the field's kind, which its present value tells."""
+    if value == "none":
+        if type(None) not in typing.get_args(typing.get_type_hints(owner)[field]):
+            raise GavoError(f"{where}: cannot be left out")
+        return None
+    if callable(current):
+        return _callable(where, field, value)
+    if isinstance(current, str):
+        allowed = typing.get_args(typing.get_type_hints(owner)[field])
+        if value not in allowed:
+            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {value!r}")
+        return value
+    if isinstance(current, bool):
+        if not isinstance(value, bool):
+            raise GavoError(f"{where}: must be true or false, not {value!r}")
+        return value
+    if isinstance(current, tuple):
+        whole = all(isinstance(entry, int) for entry in current)
+        if not isinstance(value, list):
+            if whole:
+                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {value!r}")
+            return (_number(where, value, whole),) * len(current)
+        if len(value) != len(current):
+            raise GavoError(f"{where}: must have {len(current)} entries, not {len(value)}")
+        return tuple(_number(where, entry, whole) for entry in value)
+    if isinstance(value, list) and current is None:
+        return tuple(_number(where, entry, False) for entry in value)
+    return _number(where, value, isinstance(current, int))
+
+
+def _callable(where: str, field: str, value: Any) -> Any:
+    known = LOSSES if field == "loss" else {name: getattr(optax, name) for name in OPTIMIZERS}
+    if not isinstance(value, str):
+        raise GavoError(f"{where}: must be a name, not {value!r}")
+    refuse_unknown(where, [value], known)
+    return known[value]
+
+
+def _number(where: str, value: Any, whole: bool) -> int | float:
+    kinds = (int,) if whole else (int, float)
+    if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {value!r}")
+    if whole and value < 0:
+        raise GavoError(f"{where}: must be at least 0, not {value}")
+    return int(value) if whole else float(value)
+
+
+def _check_schedules(place: str, solver: Any) -> None:
+    """Refuse sizes that no search can run with."""
+    iterations = solver.iterations
+    if not any(iterations):
+        raise GavoError(f"{place}: solver.iterations: every level has 0")
+    for level, size in enumerate(getattr(solver, "population", ())):
+        if iterations[level] and size < 4:
+            raise GavoError(f"{place}: solver.population: level {level} is searched and needs at least 4, not {size}")

@@ -1,0 +1,86 @@
+"""The batch axis of one program over many devices: this machine's, or all that `jax.distributed` joins."""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax._src import distributed
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Float, PRNGKeyArray
+
+from gavo_jax.alignment import Alignment, AlignmentOptions, _stacked_images, align_batch
+from gavo_jax.camera import Camera
+from gavo_jax.errors import GavoError
+
+PAIRS = PartitionSpec("pairs")
+
+
+def align_batch_sharded(
+    references: Any,
+    targets: Any,
+    camera: Camera,
+    solver: Any = None,
+    keys: PRNGKeyArray | None = None,
+    guesses: Float[Any, "b 4 4"] | None = None,
+    options: AlignmentOptions | None = None,
+) -> Alignment:
+    """`align_batch` with its B pairs laid out over all devices, one program for all (`shard_map`).
+
+    Under `jax.distributed` every process calls it with the same arguments and gets the whole result. The pairs' results
+    agree with those of `align_batch` to rounding, which a random search may enlarge.
+
+    Args:
+        references: As in `align_batch`.
+        targets: As in `align_batch`.
+        camera: As in `align_batch`.
+        solver: As in `align_batch`.
+        keys: As in `align_batch`.
+        guesses: As in `align_batch`.
+        options: As in `align_batch`.
+
+    Returns:
+        As `align_batch`, in NumPy arrays.
+
+    Raises:
+        GavoError: as `align_batch`.
+    """
+    sides = [_stacked_images(side, camera) for side in (references, targets)]
+    count = len(sides[0].grey)
+    if len(sides[1].grey) != count:
+        raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
+    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
+    guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
+    mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
+
+    def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:
+        keys = jax.random.wrap_key_data(keys)
+        return align_batch(references, targets, camera.rectified(), solver, keys, guesses, options)
+
+    align_all = jax.jit(jax.shard_map(align_own, mesh=mesh, in_specs=PAIRS, out_specs=PAIRS, check_vma=False))
+    rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), guesses)
+    found = jax.block_until_ready(align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows)))
+    _wait_for_all()
+    return jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found)
+
+
+_meetings = itertools.count()
+WAIT = 3600
+"""Seconds until a process that never comes is missed."""
+
+
+def _wait_for_all() -> None:
+    """Wait until all processes are here: collectives on CPUs miss one that compiles for half a minute longer."""
+    client = distributed.global_state.client
+    if client is not None:
+        client.wait_at_barrier(f"gavo_align_batch_sharded_{next(_meetings)}", WAIT * 1000)
+
+
+def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:
+    """Rows over the devices; the last one is repeated until they divide evenly."""
+    rows = np.asarray(rows)
+    missing = -len(rows) % mesh.size
+    padded = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+    return jax.make_array_from_callback(padded.shape, NamedSharding(mesh, PAIRS), lambda index: padded[index])

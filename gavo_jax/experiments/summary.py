@@ -1,0 +1,105 @@
+"""What a results table says: median and spread of each method, and whether two of them differ."""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+DRIFT = "rpe_translation_rmse_m_per_s"
+ROTATION = "rpe_rotation_rmse_deg_per_s"
+ALL = "all sequences"
+
+Row = Mapping[str, Any]
+
+
+class Summary(NamedTuple):
+    """One method on one sequence, over its seeds."""
+
+    sequence: str
+    label: str
+    runs: int
+    drift: tuple[float, float, float] | None
+    """Lower quartile, median and upper quartile of the drift, m/s; None where there is no ground truth."""
+    rotation: float | None
+    """Median, deg/s."""
+    lost: int
+    """Lost pairs of the worst run."""
+    milliseconds: float
+    """Median over the runs of the median time a pair."""
+    together: int
+    """Most runs that shared the machine while that time was taken."""
+
+
+class Comparison(NamedTuple):
+    """Two methods, paired by sequence and seed."""
+
+    sequence: str
+    first: str
+    second: str
+    pairs: int
+    ratio: float
+    """Median of first / second drift over the pairs."""
+    p: float | None
+    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero or there is
+    a single pair."""
+
+
+def summarise(rows: Iterable[Row]) -> list[Summary]:
+    """A summary of each sequence and label, in the order in which they come."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["sequence"], row["label"]), []).append(row)
+    return [_summary(sequence, label, group) for (sequence, label), group in groups.items()]
+
+
+def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
+    drifts = [row[DRIFT] for row in rows if row[DRIFT] is not None]
+    turns = [row[ROTATION] for row in rows if row[ROTATION] is not None]
+    quartiles = np.quantile(drifts, (0.25, 0.5, 0.75)).tolist() if drifts else None
+    return Summary(
+        sequence,
+        label,
+        len(rows),
+        None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
+        float(np.median(turns)) if turns else None,
+        max(row["lost_pairs"] for row in rows),
+        float(np.median([row["milliseconds_per_pair_median"] for row in rows])),
+        max(row["runs_together"] for row in rows),
+    )
+
+
+def compare(rows: Sequence[Row]) -> list[Comparison]:
+    """Each two labels on each sequence, and over all where there are several.
+
+    A method that ran once on a sequence (it has no randomness) stands against every seed of the other.
+    """
+    drifts: dict[str, dict[str, dict[Any, float]]] = {}
+    for row in rows:
+        if row[DRIFT] is not None:
+            drifts.setdefault(row["label"], {}).setdefault(row["sequence"], {})[row["seed"]] = row[DRIFT]
+    sequences = list(dict.fromkeys(row["sequence"] for row in rows))
+    found = []
+    for first, second in itertools.combinations(drifts, 2):
+        matched = {name: _matched(drifts[first].get(name, {}), drifts[second].get(name, {})) for name in sequences}
+        if len(sequences) > 1:
+            matched[ALL] = list(itertools.chain(*matched.values()))
+        found += [_test(name, first, second, pairs) for name, pairs in matched.items() if pairs]
+    return sorted(found, key=lambda comparison: [*sequences, ALL].index(comparison.sequence))
+
+
+def _matched(first: Mapping[Any, float], second: Mapping[Any, float]) -> list[tuple[float, float]]:
+    if len(first) == 1:
+        return [(next(iter(first.values())), value) for value in second.values()]
+    if len(second) == 1:
+        return [(value, next(iter(second.values()))) for value in first.values()]
+    return [(first[seed], second[seed]) for seed in first if seed in second]
+
+
+def _test(sequence: str, first: str, second: str, pairs: Sequence[tuple[float, float]]) -> Comparison:
+    from scipy.stats import wilcoxon
+
+    a, b = np.array(pairs).T
+    differ = len(pairs) > 1 and bool(np.any(a != b))
+    p = float(np.asarray(wilcoxon(a, b))[1]) if differ else None
+    return Comparison(sequence, first, second, len(pairs), float(np.median(a / b)), p)

@@ -1,0 +1,126 @@
+"""The results table: a folder of Parquet files, a row a run.
+
+A run's file is named by the run's hash, is written beside its place and renamed into it. So a row is there whole or not
+at all, writers at the same time need no lock, and a run that is done twice, by whomever, is in the table once.
+"""
+
+import json
+import os
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gavo_jax.errors import GavoError
+from gavo_jax.results import prepare_folder
+
+SUFFIX = ".parquet"
+ROWS = "runs"
+"""Folder of the table within an experiment's folder."""
+
+TEXT, WHOLE, REAL, FLAG = "string", "int64", "float64", "bool"
+COLUMNS = {
+    "run": TEXT,
+    "experiment": TEXT,
+    "sequence": TEXT,
+    "method": TEXT,
+    "preset": TEXT,
+    "variant": TEXT,
+    "label": TEXT,
+    "seed": WHOLE,
+    "device": TEXT,
+    "frames": WHOLE,
+    "pairs": WHOLE,
+    "lost_pairs": WHOLE,
+    "rpe_translation_rmse_m_per_s": REAL,
+    "rpe_rotation_rmse_deg_per_s": REAL,
+    "rpe_translation_rmse_m_per_frame": REAL,
+    "ate_translation_rmse_m": REAL,
+    "distance_error_final_m": REAL,
+    "compile_seconds": REAL,
+    "milliseconds_per_pair_median": REAL,
+    "frames_per_second": REAL,
+    "runs_together": WHOLE,
+    "pixels": WHOLE,
+    "configuration": TEXT,
+    "versions": TEXT,
+    "git_commit": TEXT,
+    "git_modified": FLAG,
+    "host": TEXT,
+    "finished": TEXT,
+}
+"""Columns and their types: the keys of metrics.json; `runs_together`, the runs that shared the machine while the times
+were taken; `configuration` and `versions` as JSON; the commit of the package's own checkout, where it is one; UTC."""
+
+
+class Table:
+    """The table in an experiment's folder."""
+
+    def __init__(self, folder: str | Path) -> None:
+        """Name the folder; nothing is made yet."""
+        self.folder = Path(folder) / ROWS
+
+    def done(self) -> set[str]:
+        """Hashes of the runs that are in the table."""
+        return {path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")}
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Add a row, atomically; one of the same run is replaced.
+
+        Args:
+            row: A value or None for each of `COLUMNS`; mappings become JSON.
+
+        Raises:
+            GavoError: the disk is full, or the like; pyarrow is missing.
+        """
+        parquet, schema = _parquet(), _schema()
+        prepare_folder(self.folder)
+        values = {name: [json.dumps(v) if isinstance(v := row[name], Mapping) else v] for name in COLUMNS}
+        partial = self.folder / f".{uuid.uuid4().hex}.partial"
+        try:
+            parquet.write_table(
+                _arrow().table(values, schema=schema), partial, use_dictionary=False, write_statistics=False
+            )
+            os.replace(partial, self.folder / f"{row['run']}{SUFFIX}")
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
+
+    def read(self) -> list[dict[str, Any]]:
+        """Return all rows, in the order of their hashes.
+
+        Raises:
+            GavoError: there is no table, a file of it is damaged, pyarrow is missing.
+        """
+        parquet = _parquet()
+        if not self.done():
+            raise GavoError(f"{self.folder}: no results of an experiment")
+        rows = []
+        for run in sorted(self.done()):
+            path = self.folder / f"{run}{SUFFIX}"
+            try:
+                rows += parquet.read_table(path, schema=_schema(), partitioning=None).to_pylist()
+            except (OSError, _arrow().ArrowException) as error:
+                raise GavoError(f"{path}: not a row of results: {' '.join(str(error).split())}") from None
+        return rows
+
+
+def _arrow() -> Any:
+    try:
+        import pyarrow
+    except ImportError:
+        raise GavoError("results tables need pyarrow: pip install 'gavo-jax[experiments]'") from None
+    return pyarrow
+
+
+def _parquet() -> Any:
+    _arrow()
+    import pyarrow.parquet
+
+    return pyarrow.parquet
+
+
+def _schema() -> Any:
+    arrow = _arrow()
+    types = {TEXT: arrow.string(), WHOLE: arrow.int64(), REAL: arrow.float64(), FLAG: arrow.bool_()}
+    return arrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])

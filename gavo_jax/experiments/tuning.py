@@ -1,0 +1,180 @@
+"""Settings searched by Optuna for small drift and little time at once."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
+from gavo_jax.experiments.settings import flatten, override, refuse_unknown
+from gavo_jax.odometry import run_odometry
+from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
+
+KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
+RANGE_KEYS = ("low", "high", "step", "log")
+TRIALS = 50
+DRIFT, TIME = "rpe_translation_rmse_m_per_s", "milliseconds_per_pair_median"
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What a tuning file asks for.
+
+    Attributes:
+        name: Of the study.
+        folder: Where the default storage and the front go.
+        parts: Frames that are tracked by every trial.
+        seeds: Each trial tracks them once a seed.
+        method: One of `METHODS`.
+        preset: What all other settings are taken from.
+        trials: Trials that the study is to hold.
+        space: By dotted name of a hyperparameter, a list of choices or a table of `low`, `high`, `step`, `log`.
+    """
+
+    name: str
+    folder: Path
+    parts: tuple[Part, ...]
+    seeds: tuple[int, ...]
+    method: str
+    preset: str
+    trials: int
+    space: Mapping[str, Any]
+
+
+class Choice(NamedTuple):
+    """A trial that no other one beats in both drift and time."""
+
+    trial: int
+    drift: float
+    """Geometric mean over sequences and seeds, m/s."""
+    milliseconds: float
+    """Geometric mean of the median time a pair."""
+    settings: dict[str, Any]
+
+
+def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
+    """Read a tuning file and check all of it.
+
+    Raises:
+        GavoError: names the file, the key and the fault.
+    """
+    path = Path(path)
+    table = read_toml(path, KEYS)
+    name = text_of(f"{path}: name", table.get("name", path.stem))
+    parts, _ = parts_of(path, table)
+    method, preset = table.get("method", "ga"), table.get("preset", "default")
+    refuse_unknown(f"{path}: method", [str(method)], METHODS)
+    refuse_unknown(f"{path}: preset", [str(preset)], PRESETS)
+    space = flatten(f"{path}: space", table.get("space", {}), lambda value: "low" in value or "high" in value)
+    if not space:
+        raise GavoError(f"{path}: space: nothing to tune")
+    start = get_preset(method, preset)
+    for key, spec in space.items():
+        place = f"{path}: space.{key}"
+        for bound in _bounds(place, spec):
+            override(start, {key: bound}, place)
+    return Tuning(
+        name,
+        Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}"))),
+        tuple(parts),
+        seeds_of(f"{path}: seeds", table.get("seeds", [0])),
+        method,
+        preset,
+        whole_of(f"{path}: trials", table.get("trials", TRIALS), 1),
+        space,
+    )
+
+
+def tune(
+    tuning: Tuning, storage: str, trials: int, on_trial: Callable[[int, float, float], None] = lambda *_: None
+) -> list[Choice]:
+    """Bring a study up to a number of finished trials and return its Pareto front, fastest first.
+
+    Args:
+        tuning: What is tuned.
+        storage: Any of Optuna's storages; a study of the same name in it is gone on with, by many machines at once.
+        trials: Finished trials that the study is to hold.
+        on_trial: Hears of each finished trial: number, drift, milliseconds.
+
+    Raises:
+        GavoError: no ground truth over a second of a sequence, the storage cannot be used, Optuna is missing.
+    """
+    try:
+        import optuna
+        import sqlalchemy.exc
+    except ImportError:
+        raise GavoError("tuning needs Optuna: pip install 'gavo-jax[tune]'") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sequences = [part.open() for part in tuning.parts]
+    start = get_preset(tuning.method, tuning.preset)
+    try:
+        study = optuna.create_study(
+            storage=storage, study_name=tuning.name, directions=["minimize", "minimize"], load_if_exists=True
+        )
+    except (ValueError, ImportError, OSError, RuntimeError, sqlalchemy.exc.SQLAlchemyError) as error:
+        raise GavoError(f"{storage}: cannot be used as storage: {' '.join(str(error).split())[:300]}") from None
+    while len(_finished(optuna, study)) < trials:
+        trial = study.ask()
+        try:
+            values = {key: _suggest(trial, key, spec) for key, spec in tuning.space.items()}
+            preset = override(start, values, f"trial {trial.number}")
+            drift, milliseconds = measure(sequences, preset, tuning.seeds)
+        except BaseException:
+            study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            raise
+        study.tell(trial, [drift, milliseconds])
+        on_trial(trial.number, drift, milliseconds)
+    front = [Choice(t.number, t.values[0], t.values[1], dict(t.params)) for t in study.best_trials]
+    return sorted(front, key=lambda choice: choice.milliseconds)
+
+
+def measure(sequences: list[FrameSequence], preset: Preset, seeds: tuple[int, ...]) -> tuple[float, float]:
+    """Geometric means of drift (m/s) and of the median time a pair (ms), run by run: nothing shares the machine.
+
+    Raises:
+        GavoError: no ground truth over a second of a sequence.
+    """
+    figures = []
+    for sequence in sequences:
+        for seed in seeds:
+            run = run_odometry(sequence, preset.solver, seed, preset.alignment, preset.odometry)
+            if run.metrics[DRIFT] is None:
+                raise GavoError(f"{sequence.name}: no ground truth over a second of it")
+            figures.append((run.metrics[DRIFT], run.metrics[TIME]))
+    drift, milliseconds = np.exp(np.mean(np.log(figures), axis=0))
+    return float(drift), float(milliseconds)
+
+
+def _finished(optuna: Any, study: Any) -> list[Any]:
+    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+
+
+def _bounds(place: str, spec: Any) -> list[Any]:
+    """The values that have to be possible: all choices, or both ends of a range."""
+    if isinstance(spec, list) and spec:
+        return spec
+    if not isinstance(spec, Mapping):
+        raise GavoError(f"{place}: neither a list of choices nor a table with low and high")
+    refuse_unknown(place, spec, RANGE_KEYS)
+    ends: list[Any] = [spec.get("low"), spec.get("high")]
+    if any(isinstance(end, bool) or not isinstance(end, int | float) for end in ends) or not ends[0] < ends[1]:
+        raise GavoError(f"{place}: low and high must be numbers, low below high")
+    step, log = spec.get("step"), spec.get("log", False)
+    if not isinstance(log, bool) or (log and (step is not None or ends[0] <= 0)):
+        raise GavoError(f"{place}: log: true or false; a logarithmic range starts above 0 and has no step")
+    if step is not None and (isinstance(step, bool) or not isinstance(step, int | float) or step <= 0):
+        raise GavoError(f"{place}: step: must be a number above 0, not {step!r}")
+    return ends
+
+
+def _suggest(trial: Any, key: str, spec: Any) -> Any:
+    if isinstance(spec, list):
+        return trial.suggest_categorical(key, spec)
+    low, high, step, log = spec["low"], spec["high"], spec.get("step"), spec.get("log", False)
+    if isinstance(low, int) and isinstance(high, int):
+        return trial.suggest_int(key, low, high, step=step or 1, log=log)
+    return trial.suggest_float(key, low, high, step=step, log=log)

@@ -1,0 +1,115 @@
+"""An experiment's file: what it comes to, and what is refused."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.plan import batches, read_plan
+from gavo_jax.experiments.runner import fitted_batches
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+GRID = """
+[[methods]]
+name = "ga"
+presets = ["fast", "default"]
+solver.patience = 5
+sweep.solver.mutation_rate = [0.1, 0.2]
+sweep.alignment.loss = ["huber", "l2"]
+[[methods]]
+name = "gauss-newton"
+seeds = [7]
+[[methods]]
+name = "opencv-rgb"
+"""
+
+
+def test_a_grid(write_experiment, tmp_path):
+    plan = read_plan(write_experiment("seeds = 3", GRID))
+    assert plan.name == "small" and plan.folder == Path("runs/small")
+    assert len(plan.runs) == 2 * 4 * 3 + 1 + 1 == len({run.id for run in plan.runs})
+    labels = list(dict.fromkeys(run.label for run in plan.runs))
+    assert labels[0] == "ga, fast, patience=5, mutation_rate=0.1, loss=huber"
+    assert labels[-2:] == ["gauss-newton", "opencv-rgb"]
+    assert [run.seed for run in plan.runs[-2:]] == [7, None]
+    # the loss and the preset shape a program, the rate does not
+    assert plan.programs == 2 * 2 + 1
+    assert sorted(len(batch.runs) for batch in batches(plan.runs, 100)) == [1, 1, 6, 6, 6, 6]
+    assert max(len(batch.runs) for batch in batches(plan.runs, 4)) == 4
+    assert len(fitted_batches(plan.runs, 100, slots=13)) == 14
+
+
+def test_a_run_is_known_by_what_it_does_not_by_where(write_experiment, tmp_path):
+    first = read_plan(write_experiment("seeds = 2", GRID))
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("small.toml", "camera.toml"):
+        shutil.copy(tmp_path / name, tmp_path / "elsewhere" / name)
+    again = read_plan(tmp_path / "elsewhere" / "small.toml")
+    assert [run.id for run in again.runs] == [run.id for run in first.runs]
+    longer = read_plan(write_experiment("seeds = 2", GRID, frames=5))
+    assert not {run.id for run in longer.runs} & {run.id for run in first.runs}
+
+
+def test_globs_parts_and_missing_sequences(tmp_path, monkeypatch):
+    for name in ("walk_a", "walk_b"):
+        write_tum(SyntheticSequence(frames=6, camera=CAMERA), tmp_path / "data" / name)
+    monkeypatch.setenv("GAVO_DATA", str(tmp_path / "data"))
+    shutil.copy(tmp_path / "data" / "walk_a" / "camera.toml", tmp_path)
+    (tmp_path / "x.toml").write_text(
+        """
+        [[sequences]]
+        path = "walk_*"
+        camera = "camera.toml"
+        [[sequences]]
+        path = ["nowhere", "walk_b"]
+        camera = "camera.toml"
+        start = 1
+        frames = 2
+        stride = 2
+        [[sequences]]
+        path = "fr2_desk"
+        name = "desk"
+        optional = true
+        [[methods]]
+        name = "ga"
+        printed = { walk_a = 0.5, desk = 0.25 }
+        """
+    )
+    plan = read_plan(tmp_path / "x.toml")
+    assert [(run.part.name, run.pairs) for run in plan.runs] == [("walk_a", 5), ("walk_b", 5), ("walk_b[1:5:2]", 1)]
+    assert len(plan.skipped) == 1 and "desk" in plan.skipped[0] and "gavo download" in plan.skipped[0]
+    assert plan.printed == {("walk_a", "ga"): 0.5}
+
+
+METHOD = '[[methods]]\nname = "ga"\n'
+REFUSED = {
+    "unknown key": ("sedes = 3", METHOD, ["'sedes'", "'seeds'"]),
+    "unknown key of a method": ("", METHOD + "preset = 'fast'", ["methods[1]", "'preset'", "'presets'"]),
+    "unknown key of a sequence": ("[[sequences]]\npth = 'synthetic'", METHOD, ["sequences[1]", "'pth'", "'path'"]),
+    "unknown hyperparameter": ("", METHOD + "solver.mutatoin_rate = 1", ["'mutatoin_rate'", "'mutation_rate'"]),
+    "unknown swept one": ("", METHOD + "sweep.solver.presure = [1]", ["'presure'", "'pressure'"]),
+    "unknown method": ("", '[[methods]]\nname = "gauss"', ["'gauss'", "'gauss-newton'"]),
+    "unknown preset": ("", METHOD + "presets = ['quick']", ["presets", "'quick'"]),
+    "unknown printed sequence": ("", METHOD + "printed.sinthetic = 1", ["'sinthetic'", "synthetic"]),
+    "sweep without a list": ("", METHOD + "sweep.solver.pressure = 8", ["sweep.solver.pressure", "list"]),
+    "settings of a peer": ("", '[[methods]]\nname = "opencv-rgb"\nseeds = 3', ["opencv-rgb", "'seeds'"]),
+    "the same twice": ("", METHOD + METHOD, ["ga", "twice"]),
+    "no methods": ("", "", ["methods"]),
+    "seed of the wrong kind": ("seeds = 1.5", METHOD, ["seeds", "1.5"]),
+    "seed too large": ("seeds = [4294967296]", METHOD, ["seeds"]),
+    "one frame": ("[[sequences]]\nframes = 1", METHOD, ["sequences[1]: frames", "at least 2"]),
+    "no such sequence": ("[[sequences]]\npath = 'nowhere'", METHOD, ["sequences[1]", "nowhere"]),
+    "no TOML": ("seeds = ", METHOD, ["not TOML"]),
+    "ray": ("[ray]\ncpu = 2", METHOD, ["ray", "'cpu'", "'cpus'"]),
+}
+
+
+@pytest.mark.parametrize("top, rest, words", REFUSED.values(), ids=REFUSED.keys())
+def test_what_is_refused(write_experiment, top, rest, words):
+    path = write_experiment(top, rest)
+    with pytest.raises(GavoError) as refused:
+        read_plan(path)
+    assert "\n" not in str(refused.value) and all(word in str(refused.value) for word in (str(path), *words))

@@ -1,0 +1,184 @@
+"""From a file to a table: resumed, interrupted, reported; and tuned."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gavo_jax.cli import main
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments import tuning
+from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state
+from gavo_jax.experiments.plan import read_plan
+from gavo_jax.experiments.runner import estimate_seconds, missing, run_experiment
+from gavo_jax.experiments.settings import override
+from gavo_jax.experiments.table import COLUMNS, Table
+from gavo_jax.experiments.tuning import measure, read_tuning, tune
+from gavo_jax.presets import get_preset
+
+METHODS = """
+[[methods]]
+name = "gauss-newton"
+solver.iterations = [0, 0, 6, 6, 8]
+printed.synthetic = 0.04
+[[methods]]
+name = "opencv-rgbd"
+"""
+NAME = '[[sequences]]\nname = "synthetic"\n'
+
+
+@pytest.fixture
+def small(write_experiment) -> Path:
+    path = write_experiment("seeds = 3\nbatch = 2", METHODS, frames=34)
+    path.write_text(path.read_text().replace("[[sequences]]\n", NAME))
+    return path
+
+
+class Interrupted(LocalExecutor):
+    """Ctrl-C comes while the second batch runs."""
+
+    def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+        yield next(iter(super().run(*arguments, **options)))
+        raise KeyboardInterrupt
+
+
+def test_interrupted_and_resumed(small, tmp_path):
+    plan, table = read_plan(small, tmp_path / "out"), Table(tmp_path / "out")
+    assert len(missing(plan, table)) == 4 and estimate_seconds(plan, plan.runs, [], 1) > 0
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(plan, table, Interrupted())
+    kept = {row["run"]: row["finished"] for row in table.read()}
+    assert len(kept) == 2 and len(missing(plan, table)) == 2
+    ran: list[str] = []
+
+    class Counting(LocalExecutor):
+        def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+            for outcome in super().run(*arguments, **options):
+                ran.extend(row["run"] for row in outcome.rows)
+                yield outcome
+
+    pairs: list[int] = []
+    assert run_experiment(plan, table, Counting(), pairs.append) == (2, [])
+    assert sum(pairs) == 2 * 33 and not set(ran) & set(kept)
+    rows = table.read()
+    assert {row["run"] for row in rows} == {run.id for run in plan.runs} and len(rows) == 4
+    assert run_experiment(plan, table, Counting()) == (0, []) and len(ran) == 2
+    check_columns(rows)
+
+
+def check_columns(rows) -> None:
+    ours = next(row for row in rows if row["seed"] == 2)
+    assert tuple(ours) == tuple(COLUMNS)
+    assert ours["label"] == "gauss-newton, iterations=[0, 0, 6, 6, 8]" and ours["pairs"] == 33
+    assert 0 < ours["rpe_translation_rmse_m_per_s"] < 0.5 and ours["lost_pairs"] == 0
+    configuration = json.loads(ours["configuration"])
+    assert configuration["settings"]["solver"]["iterations"] == [0, 0, 6, 6, 8]
+    assert configuration["sequence"]["camera"]["width"] == 160 and configuration["seed"] == 2
+    assert "jax" in json.loads(ours["versions"]) and (ours["git_commit"], ours["git_modified"]) == git_state()
+
+
+def test_a_batch_that_fails_leaves_the_others(small, tmp_path):
+    class Failing(LocalExecutor):
+        def run(self, *arguments: Any, **options: Any) -> Iterator[Outcome]:
+            first, *others = super().run(*arguments, **options)
+            yield Outcome(first.batch, (), "frame 0: torn")
+            yield from others
+
+    plan, table = read_plan(small, tmp_path / "out"), Table(tmp_path / "out")
+    finished = run_experiment(plan, table, Failing())
+    assert finished.rows == 2 and len(finished.faults) == 1 and "frame 0: torn" in finished.faults[0]
+    assert len(missing(plan, table)) == 2
+
+
+def test_command(small, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["experiment", str(small), "--output", str(out), "--dry-run"]) == 0
+    planned = capsys.readouterr().out
+    assert "4 runs, 0 of them done; 4 to do in 3 batches, 1 compiled programs" in planned and not out.exists()
+    assert main(["experiment", str(small), "--output", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "0.04000" in printed and "Wilcoxon" in printed
+    assert (out / "report.html").stat().st_size and (out / "drift.svg").stat().st_size
+    assert main(["experiment", "report", str(out)]) == 0
+    again = capsys.readouterr().out
+    assert again.splitlines()[-1] == printed.splitlines()[-1] and again.splitlines()[1] in printed
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["experiment", "nowhere.toml"], ["nowhere.toml", "no such file"]),
+        (["experiment", "report", "nowhere"], ["nowhere", "no results"]),
+        (["experiment", "report"], ["which folder"]),
+        (["tune", "nowhere.toml"], ["nowhere.toml"]),
+    ],
+)
+def test_refusals_are_one_line(arguments, words, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert not captured.out and captured.err.count("\n") == 1 and all(word in captured.err for word in words)
+
+
+TUNED = """
+[space]
+solver.damping = { low = 1e-6, high = 1e-2, log = true }
+solver.iterations.4 = { low = 8, high = 9 }
+alignment.robust_scale = [true, false]
+"""
+
+
+@pytest.fixture
+def tuned(small) -> Path:
+    path = small.with_name("tuned.toml")
+    sequences = small.read_text().partition("[[methods]]")[0].partition("[[")[2]
+    path.write_text(f'method = "gauss-newton"\npreset = "fast"\ntrials = 2\n[[{sequences}{TUNED}')
+    return path
+
+
+def test_tune(tuned, tmp_path, capsys, monkeypatch):
+    def measured(sequences, preset, seeds):
+        assert len(sequences[0]) == 34 and seeds == (0,)
+        return preset.solver.damping, 1.0 / preset.solver.damping
+
+    monkeypatch.setattr(tuning, "measure", measured)
+    out = tmp_path / "study"
+    assert main(["tune", str(tuned), "--output", str(out)]) == 0
+    assert "Pareto front" in capsys.readouterr().out and (out / "study.db").exists()
+    assert main(["tune", str(tuned), "--output", str(out), "--trials", "5"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("trial ") == 3 + 1  # three more, and the table's heading
+    front = json.loads((out / "front.json").read_text())
+    assert len(front) == 5 and [f["milliseconds"] for f in front] == sorted(f["milliseconds"] for f in front)
+    assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
+
+
+def test_what_a_trial_measures(tuned):
+    preset = override(get_preset("gauss-newton"), {"solver.iterations": [0, 0, 6, 6, 8]})
+    drift, milliseconds = measure([read_tuning(tuned).parts[0].open()], preset, (0,))
+    assert 0 < drift < 0.5 and milliseconds > 0
+
+
+@pytest.mark.parametrize(
+    "space, words",
+    [
+        ("solver.dampng = [1.0]", ["'dampng'", "'damping'"]),
+        ("solver.damping = { low = 1.0 }", ["low and high"]),
+        ("solver.damping = { low = 0.0, high = 1.0, log = true }", ["log"]),
+        ("solver.damping = { low = 0.1, high = 1.0, stp = 1 }", ["'stp'", "'step'"]),
+        ("solver.damping = 3", ["space.solver.damping"]),
+        ("", ["nothing to tune"]),
+    ],
+)
+def test_what_tuning_refuses(write_experiment, space, words):
+    path = write_experiment('method = "gauss-newton"', f"[space]\n{space}", name="t.toml")
+    with pytest.raises(GavoError) as refused:
+        read_tuning(path)
+    assert all(word in str(refused.value) for word in (str(path), *words))
+
+
+def test_an_unusable_storage_is_refused(tuned):
+    with pytest.raises(GavoError, match="storage"):
+        tune(read_tuning(tuned), "nosuchdatabase://x", 1)

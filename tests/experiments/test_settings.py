@@ -1,0 +1,66 @@
+"""Hyperparameters by name."""
+
+import optax
+import pytest
+
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.settings import flatten, override
+from gavo_jax.objective import huber
+from gavo_jax.presets import get_preset
+
+
+def test_values_of_every_kind():
+    values = {
+        "solver.mutation_decay": 1,
+        "solver.population": [0, 8, 8, 8, 8],
+        "solver.iterations.4": 3,
+        "solver.spread": 2.5,
+        "solver.mutation_step": "none",
+        "solver.surrogate": False,
+        "alignment.loss": "huber",
+        "alignment.outside_cost": 0.5,
+        "alignment.bounds": [0.1, 0.2],
+        "odometry.on_lost": "stop",
+    }
+    preset = override(get_preset("ga", "default"), values)
+    assert preset.solver.mutation_decay == 1.0 and isinstance(preset.solver.mutation_decay, float)
+    assert preset.solver.population == (0, 8, 8, 8, 8) and preset.solver.iterations[3:] == (10, 3)
+    assert preset.solver.spread == (2.5,) * 5 and preset.solver.mutation_step is None
+    assert preset.solver.surrogate is False and preset.alignment.loss is huber
+    assert preset.alignment.outside_cost == 0.5 and preset.alignment.bounds == (0.1, 0.2)
+    assert preset.odometry.on_lost == "stop"
+    assert override(get_preset("adam"), {"solver.optimizer": "lion"}).solver.optimizer is optax.lion
+
+
+@pytest.mark.parametrize(
+    "name, value, words",
+    [
+        ("solver.mutaton_rate", 0.1, ["'mutaton_rate'", "'mutation_rate'"]),
+        ("slover.patience", 1, ["'slover'", "'solver'"]),
+        ("alignment.loss", "hubert", ["'hubert'", "'huber'"]),
+        ("solver.mutation_rate", "high", ["mutation_rate", "number"]),
+        ("solver.mutation_rate", True, ["mutation_rate", "number"]),
+        ("solver.mutation_rate", float("nan"), ["mutation_rate", "number"]),
+        ("solver.mutation_rate", "none", ["mutation_rate", "cannot be left out"]),
+        ("solver.patience", 2.5, ["patience", "whole"]),
+        ("solver.patience", -1, ["patience", "at least 0"]),
+        ("solver.population", 16, ["population", "list of 5"]),
+        ("solver.population", [16, 16], ["population", "5 entries"]),
+        ("solver.population", [0, 16, 20, 24, 2], ["population", "level 4"]),
+        ("solver.population.5", 16, ["population.5", "no such entry"]),
+        ("solver.iterations", [0, 0, 0, 0, 0], ["iterations"]),
+        ("odometry.on_lost", "panic", ["on_lost", "hold, predict, stop"]),
+        ("odometry.prior", 1, ["prior", "true or false"]),
+    ],
+)
+def test_what_is_refused(name, value, words):
+    with pytest.raises(GavoError) as refused:
+        override(get_preset("ga", "default"), {name: value}, "file.toml: methods[1]")
+    assert all(word in str(refused.value) for word in ("file.toml: methods[1]", *words))
+
+
+def test_nested_tables_have_dotted_names():
+    assert flatten("", {"solver": {"population": {"4": 8}, "patience": 3}}) == {
+        "solver.population.4": 8,
+        "solver.patience": 3,
+    }

@@ -1,0 +1,52 @@
+"""Medians, spreads and tests from rows whose answers are known."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from gavo_jax.experiments.summary import ALL, compare, summarise
+
+
+def rows(sequence: str, label: str, drifts: list[float | None], seeds: Sequence[int | None] | None = None):
+    return [
+        {
+            "sequence": sequence,
+            "label": label,
+            "seed": seed,
+            "rpe_translation_rmse_m_per_s": drift,
+            "rpe_rotation_rmse_deg_per_s": None if drift is None else 100 * drift,
+            "lost_pairs": i,
+            "milliseconds_per_pair_median": 10.0,
+            "runs_together": 4,
+        }
+        for i, (drift, seed) in enumerate(zip(drifts, seeds or range(len(drifts)), strict=True))
+    ]
+
+
+def test_median_and_quartiles():
+    (found,) = summarise(rows("a", "ga", [0.01, 0.02, 0.03, 0.04, 0.05]))
+    assert found.drift == pytest.approx((0.02, 0.03, 0.04)) and found.rotation == pytest.approx(3.0)
+    assert (found.runs, found.lost, found.together) == (5, 4, 4)
+    (unknown,) = summarise(rows("a", "ga", [None, None]))
+    assert unknown.drift is None and unknown.rotation is None
+
+
+def test_a_clear_difference_is_significant_and_none_is_not():
+    better = np.linspace(0.01, 0.02, 12)
+    worse = better * np.linspace(1.1, 1.3, 12)
+    (found,) = compare(rows("a", "x", better.tolist()) + rows("a", "y", worse.tolist()[::-1], list(range(12))[::-1]))
+    assert found.pairs == 12 and found.ratio == pytest.approx(1 / 1.2, rel=0.02)
+    assert found.p == pytest.approx(2 * 0.5**12, rel=1e-6)  # every sign alike: the exact test's smallest p
+    (same,) = compare(rows("a", "x", better.tolist()) + rows("a", "y", better.tolist()))
+    assert same.p is None and same.ratio == 1.0
+
+
+def test_pairs_are_matched_by_seed_and_over_sequences():
+    table = rows("a", "x", [0.1, 0.2], [0, 1]) + rows("a", "y", [0.1, 0.3], [1, 2])
+    table += rows("b", "x", [0.4, 0.2], [0, 1]) + rows("b", "y", [0.1], [None])
+    found = {comparison.sequence: comparison for comparison in compare(table)}
+    assert list(found) == ["a", "b", ALL]
+    assert (found["a"].pairs, found["a"].ratio, found["a"].p) == (1, 2.0, None)
+    assert (found["b"].pairs, found["b"].ratio) == (2, 3.0)  # the one run of y stands against both seeds
+    assert found[ALL].pairs == 3

@@ -1,0 +1,73 @@
+"""The results table under several writers."""
+
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gavo_jax.errors import GavoError
+from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
+
+
+def row(run: str, drift: float | None = 0.01) -> dict[str, Any]:
+    values: dict[str, Any] = {name: {TEXT: "", REAL: 1.5, FLAG: True}.get(kind, 2) for name, kind in COLUMNS.items()}
+    return values | {"run": run, "rpe_translation_rmse_m_per_s": drift, "configuration": {"a": [1, None]}, "seed": None}
+
+
+def write_many(folder: Path, start: Any, name: str) -> None:
+    start.wait()
+    for i in range(40):
+        Table(folder).append(row(f"{name}{i}"))
+        Table(folder).append(row(f"shared{i}"))
+
+
+def test_a_row_comes_back(tmp_path):
+    table = Table(tmp_path)
+    assert table.done() == set()
+    table.append(row("b", None))
+    table.append(row("a"))
+    assert table.done() == {"a", "b"}
+    rows = table.read()
+    assert [found["run"] for found in rows] == ["a", "b"] and tuple(rows[0]) == tuple(COLUMNS)
+    assert rows[1]["rpe_translation_rmse_m_per_s"] is None and rows[0]["seed"] is None
+    assert rows[0]["configuration"] == '{"a": [1, null]}' and rows[0]["git_modified"] is True
+
+
+def test_two_writers_lose_nothing_and_double_nothing(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    start = context.Event()
+    writers = [context.Process(target=write_many, args=(tmp_path, start, name)) for name in "xy"]
+    for writer in writers:
+        writer.start()
+    start.set()
+    for writer in writers:
+        writer.join(60)
+        assert writer.exitcode == 0
+    runs = [found["run"] for found in Table(tmp_path).read()]
+    assert len(runs) == len(set(runs)) == 120
+    assert not [path for path in Table(tmp_path).folder.iterdir() if path.suffix != ".parquet"]
+
+
+def test_a_torn_file_is_named_and_a_partial_one_is_no_row(tmp_path):
+    table = Table(tmp_path)
+    table.append(row("a"))
+    (table.folder / ".b.partial").write_bytes(b"PAR1")
+    assert len(table.read()) == 1
+    whole = (table.folder / "a.parquet").read_bytes()
+    (table.folder / "a.parquet").write_bytes(whole[:100])
+    with pytest.raises(GavoError, match="a.parquet"):
+        table.read()
+
+
+def test_no_table(tmp_path):
+    with pytest.raises(GavoError, match="no results"):
+        Table(tmp_path / "nowhere").read()
+
+
+def test_any_parquet_reader_sees_one_table(tmp_path):
+    dataset = pytest.importorskip("pyarrow.dataset")
+    for run in "abc":
+        Table(tmp_path).append(row(run))
+    (Table(tmp_path).folder / ".d.partial").write_bytes(b"")
+    assert dataset.dataset(Table(tmp_path).folder).to_table().num_rows == 3

@@ -1,0 +1,163 @@
+"""Many runs together are the single runs, and compile once."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
+from gavo_jax.experiments.executors import LocalExecutor
+from gavo_jax.experiments.plan import read_plan
+from gavo_jax.experiments.runner import run_experiment
+from gavo_jax.experiments.settings import override
+from gavo_jax.experiments.table import Table
+from gavo_jax.experiments.together import track_stacked, track_together
+from gavo_jax.odometry import Odometry, Step, run_odometry, track
+from gavo_jax.presets import Preset, get_preset
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+FRAMES = 5
+
+
+def frames(count: int = FRAMES) -> SyntheticSequence:
+    return SyntheticSequence(count, noise=KINECT, camera=CAMERA)
+
+
+class Damaged(SyntheticSequence):
+    """Frame 2 cannot be read, frame 4 is black."""
+
+    def __getitem__(self, index: Any) -> Any:
+        frame = super().__getitem__(index)
+        if index == 2:
+            raise FrameError("frame 2: torn")
+        if index == 4 and isinstance(frame, Frame):
+            return replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        return frame
+
+
+def drivers(presets: list[Preset]) -> list[Odometry]:
+    return [Odometry(CAMERA, p.solver, p.alignment, p.odometry, seed) for seed, p in enumerate(presets)]
+
+
+def poses(steps: list[Step]) -> np.ndarray:
+    return np.stack([step.world_T_camera for step in steps])
+
+
+@contextmanager
+def compilations() -> Iterator[list[str]]:
+    """Programs that XLA compiles (or loads from the cache) meanwhile."""
+    events: list[str] = []
+    counting = True
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if counting and event == "/jax/core/compile/backend_compile_duration":
+            events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        counting = False
+
+
+SMALL = {"solver.iterations": [0, 0, 6, 6, 8]}
+"""The three coarsest levels: 40 x 30 pixels are the finest."""
+
+
+def rates(count: int) -> list[Preset]:
+    """Gauss-Newton with a damping and a depth weight of its own for every run."""
+    preset = override(get_preset("gauss-newton"), SMALL)
+    return [
+        replace(
+            preset,
+            solver=replace(preset.solver, damping=1e-4 * (1 + i)),
+            alignment=replace(preset.alignment, depth_weight=1.0 + 0.01 * i),
+        )
+        for i in range(count)
+    ]
+
+
+def test_together_is_one_by_one_bit_for_bit():
+    preset = override(get_preset("ga"), SMALL | {"solver.population": [0, 0, 8, 8, 16]})
+    presets = [preset] * 2
+    presets += [replace(preset, solver=replace(preset.solver, mutation_decay=decay)) for decay in (0.6, 0.9)]
+    found = track_together(frames(), drivers(presets))
+    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
+        alone = list(track(frames(), preset.solver, preset.alignment, preset.odometry, seed=i))
+        assert np.array_equal(poses(steps), poses(alone))
+    assert len({steps[-1].alignment.error.tobytes() for steps in found}) == 4
+
+
+def test_lost_frames_together():
+    presets = rates(2)
+    stopping = [replace(p, odometry=replace(p.odometry, on_lost="stop", recover=False)) for p in presets[:1]]
+    staying = [replace(p, odometry=replace(p.odometry, recover=False)) for p in presets[1:]]
+    sequence = Damaged(7, camera=CAMERA)
+    found = track_together(sequence, drivers(stopping + staying))
+    assert [len(steps) for steps in found] == [2, 6]
+    assert [step.lost for step in found[1]] == [False, True, False, True, False, False]
+
+
+def test_stacked_runs_agree_with_single_ones():
+    presets = rates(4)
+    found = track_stacked(frames(), presets, range(4))
+    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
+        alone = list(track(frames(), preset.solver, preset.alignment, preset.odometry, seed=i))
+        np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
+        assert [step.index for step in steps] == [1, 2, 3, 4]
+    assert not np.array_equal(poses(found[0]), poses(found[3]))
+
+
+def test_stacked_runs_lose_and_find_themselves():
+    presets = [replace(p, odometry=replace(p.odometry, recover=False)) for p in rates(4)]
+    sequence = Damaged(7, camera=CAMERA)
+    found = track_stacked(sequence, presets, range(4))
+    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
+        alone = list(track(sequence, preset.solver, preset.alignment, preset.odometry, seed=i))
+        assert [step.lost for step in steps] == [step.lost for step in alone]
+        np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
+
+
+def test_other_rates_compile_nothing_more_stacked():
+    with compilations() as events:
+        track_stacked(frames(2), rates(4), range(4))
+        first = len(events)
+        track_stacked(frames(4), rates(4)[::-1], range(10, 14))
+        assert len(events) == first
+
+
+def test_64_runs_compile_once_and_are_the_single_runs_in_half_the_time(
+    write_experiment: Callable[..., Path], tmp_path: Path
+):
+    damping = ", ".join(f"{1e-4 * (1 + i)!r}" for i in range(8))
+    methods = (
+        f'[[methods]]\nname = "gauss-newton"\nsolver.iterations = [0, 0, 6, 6, 8]\nsweep.solver.damping = [{damping}]\n'
+    )
+    plan = read_plan(write_experiment("seeds = 8\nbatch = 64\n", methods, FRAMES), tmp_path / "out")
+    assert len(plan.runs) == 64 and plan.programs == 1
+    settings = plan.runs[0].settings
+    assert settings is not None
+    run_odometry(frames(), settings.solver, 0, settings.alignment, settings.odometry)
+    with compilations() as events:
+        start = time.perf_counter()
+        table = Table(plan.folder)
+        assert run_experiment(plan, table, LocalExecutor()) == (64, [])
+        together = time.perf_counter() - start
+        assert events == []
+    rows = {row["run"]: row for row in table.read()}
+    start = time.perf_counter()
+    for run in plan.runs:
+        assert run.settings is not None and run.seed is not None
+        preset = run.settings
+        alone = run_odometry(frames(), preset.solver, run.seed, preset.alignment, preset.odometry).metrics
+        for name in ("rpe_translation_rmse_m_per_frame", "ate_translation_rmse_m", "distance_error_final_m"):
+            assert rows[run.id][name] == alone[name]
+    single = time.perf_counter() - start
+    assert together < 0.5 * single, f"{together:.2f} s together, {single:.2f} s one by one"
