@@ -164,6 +164,11 @@ MAX_ROTATION_DEVIATION = 0.05
 """Radians, likewise for the rotation."""
 
 
+SHARED_ERRORS = 9.0
+"""Factor on the covariance for errors that the whole image shares (interpolation, the choice of points, the pyramid's
+rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
+
+
 class View(NamedTuple):
     """A frame that serves as reference, and where it stands."""
 
@@ -471,7 +476,7 @@ def _conclude(
     model, scatter, residuals = problem.examine(jnp.zeros(6))
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
     inverse = jnp.linalg.inv(model.hessian + ridge)
-    covariance = inverse @ scatter @ inverse.T
+    covariance = SHARED_ERRORS * inverse @ scatter @ inverse.T
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0

@@ -17,6 +17,8 @@ from gavo_jax.camera import Camera
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
 """1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a hundredth of the sensor's noise."""
+SAME_SURFACE = 0.1
+"""Neighbouring readings of inverse depth that differ by less than this share are of one surface."""
 SLOPE_STEP = 1.0 / 4096.0
 """1/m a pixel and unit of the packed inverse-depth slopes (signed 8 bits)."""
 
@@ -142,7 +144,7 @@ class Target(NamedTuple):
     grey: UInt32[Array, " m"]
     """Four 8-bit grey levels of the 2x2 block that starts at the pixel: (v, u), (v, u+1), (v+1, u), (v+1, u+1)."""
     depth: UInt32[Array, " m"]
-    """16 bits of inverse depth (0 = no reading) and its slopes along u and v, 8 bits each."""
+    """The same block as a plane: 16 bits of inverse depth in its middle (0 = no reading) and 8 bits for each slope."""
 
 
 def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera | ImagePlane) -> Warped:
@@ -167,7 +169,9 @@ def pack_grey(grey: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
     return pair | (below << 16)
 
 
-def inverse_depth_slopes(inverse_depth: Float[Array, "h w"], limit: float = 0.1) -> tuple[jax.Array, jax.Array]:
+def inverse_depth_slopes(
+    inverse_depth: Float[Array, "h w"], limit: float = SAME_SURFACE
+) -> tuple[jax.Array, jax.Array]:
     """∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from whichever neighbours lie on the same surface; 0 where none does.
 
     `limit` is the largest relative step between neighbours that is still one surface.
@@ -190,14 +194,34 @@ def inverse_depth_slopes(inverse_depth: Float[Array, "h w"], limit: float = 0.1)
 
 
 def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
-    """Inverse depth and its slopes in one word: a local plane, so that sampling between pixels needs no neighbours."""
-    along_u, along_v = inverse_depth_slopes(inverse_depth)
-    value = jnp.clip(jnp.round(inverse_depth / INVERSE_DEPTH_STEP), 0, 65535).astype(jnp.uint32)
+    """Inverse depth and its slopes in one word: a plane about the middle of the 2x2 block that starts at the pixel, so
+    that sampling between pixels needs no neighbours.
+
+    Each of the four readings says by its own slopes what lies in the middle; those on the nearest surface are averaged.
+    """
+    slopes = inverse_depth_slopes(inverse_depth)
+    width = [(0, 1), (0, 1)]
+
+    def taps(image: jax.Array) -> list[jax.Array]:
+        padded, (height, columns) = jnp.pad(image, width), image.shape
+        return [padded[i : i + height, j : j + columns] for i in (0, 1) for j in (0, 1)]
+
+    values, along_u, along_v = taps(inverse_depth), *map(taps, slopes)
+    nearest = jnp.max(jnp.stack(values), axis=0)
+    keep = [(value > 0) & (value > nearest * (1.0 - SAME_SURFACE)) for value in values]
+    count = jnp.maximum(sum(k.astype(jnp.float32) for k in keep), 1.0)
+
+    def mean(images: list[jax.Array]) -> jax.Array:
+        return sum(jnp.where(k, image, 0.0) for k, image in zip(keep, images, strict=True)) / count
+
+    places = [(i, j) for i in (0.5, -0.5) for j in (0.5, -0.5)]
+    middle = mean([q + j * u + i * v for q, u, v, (i, j) in zip(values, along_u, along_v, places, strict=True)])
+    value = jnp.clip(jnp.round(middle / INVERSE_DEPTH_STEP), 0, 65535).astype(jnp.uint32)
 
     def slope(s: jax.Array) -> jax.Array:
         return (jnp.clip(jnp.round(s / SLOPE_STEP), -127, 127) + 128).astype(jnp.uint32)
 
-    return value | (slope(along_u) << 16) | (slope(along_v) << 24)
+    return value | (slope(mean(along_u)) << 16) | (slope(mean(along_v)) << 24)
 
 
 def pack_target(*levels: tuple[Float[Array, "h w"], Float[Array, "h w"]]) -> Target:
@@ -255,9 +279,11 @@ class DepthSample(NamedTuple):
 
 
 def sample_depth(words: Words, warped: Warped) -> DepthSample:
-    """Inverse depth of the target's surface at the warped points, from the plane of the pixel that was looked up."""
+    """Inverse depth of the target's surface at the warped points, from the plane of the block that was looked up."""
     value = (words.depth & 65535).astype(jnp.int32).astype(jnp.float32) * INVERSE_DEPTH_STEP
     along_u = (_byte(words.depth, 16) - 128.0) * SLOPE_STEP
     along_v = (_byte(words.depth, 24) - 128.0) * SLOPE_STEP
     a, b = warped.u - jnp.floor(warped.u), warped.v - jnp.floor(warped.v)
-    return DepthSample(value + along_u * a + along_v * b, along_u, along_v, (value > 0).astype(jnp.float32))
+    return DepthSample(
+        value + along_u * (a - 0.5) + along_v * (b - 0.5), along_u, along_v, (value > 0).astype(jnp.float32)
+    )

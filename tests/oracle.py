@@ -66,15 +66,31 @@ class Terms(NamedTuple):
     margin: float
 
 
+def block_plane(
+    inverse_depth: np.ndarray, slopes: list[np.ndarray], row: int, column: int
+) -> tuple[float, float, float] | None:
+    """Inverse depth in the middle of a 2x2 block and its slopes, over the readings on its nearest surface."""
+    block = [(v, u) for v in (row, row + 1) for u in (column, column + 1)]
+    nearest = max(inverse_depth[tap] for tap in block)
+    kept = [tap for tap in block if inverse_depth[tap] > 0.9 * nearest]
+    if nearest <= 0:
+        return None
+    along_u, along_v = (float(np.mean([slope[tap] for tap in kept])) for slope in slopes)
+    said = [
+        inverse_depth[v, u] + slopes[0][v, u] * (column + 0.5 - u) + slopes[1][v, u] * (row + 0.5 - v) for v, u in kept
+    ]
+    middle = np.rint(np.mean(said) / INVERSE_DEPTH_STEP) * INVERSE_DEPTH_STEP
+    return middle, *(np.clip(np.rint(s / SLOPE_STEP), -127, 127) * SLOPE_STEP for s in (along_u, along_v))
+
+
 def residuals(pair: Pair, target_T_reference: np.ndarray, gain: float = 1.0, bias: float = 0.0) -> Terms:
     """Equation (1) point by point, and the depth residual as `gavo_jax.objective` defines it.
 
-    The depth residual is the difference in inverse depth between the target's surface (the plane of the pixel left of
-    and above the point) and the point, times the cosine of the reference surface's inclination.
+    The depth residual is the difference in inverse depth between the target's surface (the plane of the 2x2 block
+    about the point) and the point, times the cosine of the reference surface's inclination.
     """
     camera = pair.camera
-    q_target = np.rint(pair.target_inverse_depth / INVERSE_DEPTH_STEP) * INVERSE_DEPTH_STEP
-    slopes = [np.clip(np.rint(s / SLOPE_STEP), -127, 127) * SLOPE_STEP for s in slopes_of(pair.target_inverse_depth)]
+    target_slopes = slopes_of(pair.target_inverse_depth)
     own_slopes = slopes_of(pair.reference_inverse_depth)
     grey, depth, margins, readings = [], [], [np.inf], 0
     for v, u in np.ndindex(camera.height, camera.width):
@@ -96,9 +112,9 @@ def residuals(pair: Pair, target_T_reference: np.ndarray, gain: float = 1.0, bia
         top, low = (1 - a) * top_left + a * top_right, (1 - a) * low_left + a * low_right
         grey.append((1 - b) * top + b * low - (gain * pair.reference_grey[v, u] + bias))
         margins += [abs(u_t - round(u_t)), abs(v_t - round(v_t))]
-        if q_target[row, column] > 0:
-            surface = q_target[row, column]
-            surface += slopes[0][row, column] * (u_t - column) + slopes[1][row, column] * (v_t - row)
+        plane = block_plane(pair.target_inverse_depth, target_slopes, row, column)
+        if plane is not None:
+            surface = plane[0] + plane[1] * (a - 0.5) + plane[2] * (b - 0.5)
             tilt = (camera.fx * own_slopes[0][v, u] / q) ** 2 + (camera.fy * own_slopes[1][v, u] / q) ** 2
             depth.append((surface - 1 / z) / np.sqrt(1 + tilt))
     return Terms(np.array(grey), np.array(depth), len(grey) / max(readings, 1), min(margins))
