@@ -239,8 +239,8 @@ class Objective:
     scales: Scales
     min_overlap: Float[Array, ""]
     outside_cost: Float[Array, ""] = field(default_factory=lambda: jnp.float32(0.0))
-    """Cost of a reference point that leaves the view, in units of ρ(1). Positive, and a motion cannot win by pushing
-    pixels out of view; 0 averages over the points in view alone, as (2) does."""
+    """Cost of a reference point that leaves the view, in units of a typical point's. Positive, and a motion cannot win
+    by pushing pixels out of view; 0 averages over the points in view alone, as (2) does."""
     count: Integer[Array, ""] | None = None
     """Points a view that hold something, from the first on; None: all."""
     columns: Integer[Array, ""] | int = 1
@@ -304,7 +304,10 @@ class Objective:
         """Errors and overlaps from the sums over all points."""
         total, inside = sums
         valid = jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
-        outside = (valid - inside) * self.outside_cost * self.loss(jnp.float32(1.0))
+        typical = self.loss(jnp.float32(1.0))
+        if self.use_depth:
+            typical += self.scales.depth_weight * typical
+        outside = (valid - inside) * self.outside_cost * typical
         overlap = inside / valid
         error = self.scales.grey**2 * (total + outside) / self._divisor(inside)
         return jnp.where(overlap < self.min_overlap, jnp.inf, error), overlap

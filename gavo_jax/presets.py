@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from gavo_jax.alignment import AlignmentOptions
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import l2
+from gavo_jax.objective import l2, student_t
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -111,15 +111,17 @@ _WIDE = {
     "adam": GradientDescent(),
 }
 WIDE_OBJECTIVE = AlignmentOptions(
+    loss=student_t,
     islands=(1, 1, 4, 16, 96),
     scouts=8192,
     scout_spread=(0.1, 0.5),
     min_overlap=0.2,
-    outside_cost=0.5,
+    outside_cost=1.0,
     bounds=(0.5, 1.05),
 )
 """Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
-16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs half a typical residual."""
+16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
+so that leaving the view neither pays nor is shunned; the loss is wider than the default's."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:
