@@ -144,3 +144,13 @@ def test_throughput_measures_its_parts(load, tmp_path: Path) -> None:
     assert record["frames"] == 3 and record["frame_ms"] > 0 and record["row_kB"] > 1
     figures = record["gauss-newton"]
     assert min(figures["milliseconds_together"] + figures["milliseconds_alone"]) > 0
+
+
+def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> None:
+    calibration: ModuleType = load("calibration")
+    calibration.main(frames=3, seeds=1, clips=CLIP, json=tmp_path / "calibration.json")
+    *_, synthetic, clip = read(tmp_path / "calibration.json")["rows"]
+    assert synthetic["pairs"] == 2 * len(calibration.NOISE) and clip["pairs"] == 7
+    for row in (synthetic, clip):
+        assert 0.5 < row["mean"] < 30 and row["share_within"] > 0.5
+        assert 0 < row["millimetres"] < 5
