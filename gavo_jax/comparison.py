@@ -33,8 +33,8 @@ class PeerOdometry(Odometry):
     def _start(self, frame: Frame) -> Any:
         return self.peer.prepare(frame)
 
-    def _align(self, before: Progress, frame: Frame) -> tuple[Any, Alignment]:
+    def _align(self, before: Progress, frame: Frame) -> tuple[Any, Alignment, bool]:
         prepared = self.peer.prepare(frame)
         found = self.peer.align(before.tracker, prepared)
         status = AlignmentStatus.OK if found.success else AlignmentStatus.NOT_FINITE
-        return prepared, no_alignment(status)._replace(target_T_reference=found.target_T_reference)
+        return prepared, no_alignment(status)._replace(target_T_reference=found.target_T_reference), found.success

@@ -288,11 +288,12 @@ class Odometry:
         Returns:
             Where the driver stands now, the result, and whether the pair is lost.
         """
-        state, result = self._align(before, frame)
-        if result.status != AlignmentStatus.OK:
+        state, result, usable = self._align(before, frame)
+        if not usable:
             fit = frame if finding.use is Use.ALL else None
             return self._lose(before, fit, frame.timestamp), result, True
-        result = result._replace(status=finding.status)
+        if result.status == AlignmentStatus.OK:
+            result = result._replace(status=finding.status)
         world_T_camera = before.world_T_reference @ inverse(_rigid(result.target_T_reference))
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
@@ -328,20 +329,26 @@ class Odometry:
         key = jax.random.fold_in(self._key, before.last_index)
         return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay)), key
 
-    def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment]:
-        """Align with the references; a result that looks wrong is tried again by the wide search."""
+    def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment, bool]:
+        """Align with the references; a result that looks wrong is tried again by the wide search.
+
+        Returns:
+            The state afterwards, the result, and whether its motion can be used: it is ok, or its high error is all
+            that speaks against it and the wide search ends at the same motion (blur, or something that moves).
+        """
         assert before.tracker is not None
         clock, key = self.inputs(before, frame)
         state_after, result = self._run(before.tracker, frame, clock, key)
         if result.status == AlignmentStatus.OK or not self.options.recover:
-            return state_after, result
+            return state_after, result, result.status == AlignmentStatus.OK
         wide = self._wide()
         state_wide, second = self._run(
             before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
         if second.status == AlignmentStatus.OK:
-            return state_wide, second
-        return state_after, result
+            return state_wide, second, True
+        confirmed = result.status == second.status == AlignmentStatus.HIGH_ERROR and _agree(result, second)
+        return state_after, result, confirmed
 
     def _wide(self) -> Preset:
         """The wide search on the points that the references hold."""
@@ -377,6 +384,16 @@ class Odometry:
 def _traced(options: OdometryOptions) -> OdometryOptions:
     """The options that shape the program; the others are reset, so that they cause no second compilation."""
     return replace(options, recover=True, on_lost="hold")
+
+
+AGREEMENT = (0.02, 0.02)
+"""Metres and radians within which two searches ended at the same motion."""
+
+
+def _agree(first: Alignment, second: Alignment) -> bool:
+    between = inverse(_rigid(first.target_T_reference)) @ _rigid(second.target_T_reference)
+    angle = np.arccos(np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    return bool(np.linalg.norm(between[:3, 3]) < AGREEMENT[0] and angle < AGREEMENT[1])
 
 
 def _rigid(transform: Float[Array | np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:

@@ -15,7 +15,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry, OdometryRun, Step, run_odometry, track
+from gavo_jax.odometry import Odometry, OdometryRun, Step, no_alignment, run_odometry, track
 from gavo_jax.presets import OdometryOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.trajectory import Trajectory
@@ -433,3 +433,17 @@ def test_the_wide_search_recovers_what_the_default_loses() -> None:
     jump = SyntheticSequence(frames=60, camera=CAMERA)[::25]
     lost = run_odometry(jump, GaussNewton(), options=PLAIN).metrics["lost_pairs"]
     assert run_odometry(jump, GaussNewton()).metrics["lost_pairs"] < max(lost, 1)
+
+
+def test_a_high_error_is_used_if_the_wide_search_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    still = no_alignment(AlignmentStatus.HIGH_ERROR)
+    near, far = (np.eye(4, dtype=np.float32) for _ in range(2))
+    near[0, 3], far[0, 3] = 0.01, 0.1
+    sequence = Rendered(frames=2, camera=CAMERA, noise=NONE)
+    for wide, lost in ((near, False), (far, True)):
+        odometry = Odometry(CAMERA, GaussNewton())
+        state, attempts = odometry.blank_state(), [still, still._replace(target_T_reference=wide)]
+        monkeypatch.setattr(odometry, "_run", lambda *_, s=state, a=attempts: (s, a.pop(0)))
+        odometry.register(sequence[0], 0.0)
+        step = odometry.register(sequence[1], 1 / 30)
+        assert step is not None and step.lost is lost and step.alignment.status is AlignmentStatus.HIGH_ERROR
