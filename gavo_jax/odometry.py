@@ -431,13 +431,25 @@ def track(
     if odometry is None:
         odometry = Odometry(sequence.camera, solver, alignment, options, seed)
 
+    first = odometry.progress.last_index + 1
+    for index, frame in enumerate(decoded(sequence, first), start=first):
+        step = odometry.register(frame, float(sequence.timestamps[index]))
+        watch(frame if isinstance(frame, Frame) else None, step)
+        if step is not None:
+            yield step
+            if step.lost and odometry.options.on_lost == "stop":
+                return
+
+
+def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
+    """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
+
     def read(index: int) -> Frame | FrameError:
         try:
             return sequence[index]
         except FrameError as error:
             return error
 
-    first = odometry.progress.last_index + 1
     if first >= len(sequence):
         return
     with ThreadPoolExecutor(max_workers=1) as decoder:
@@ -446,12 +458,7 @@ def track(
             frame = coming.result()
             if index + 1 < len(sequence):
                 coming = decoder.submit(read, index + 1)
-            step = odometry.register(frame, float(sequence.timestamps[index]))
-            watch(frame if isinstance(frame, Frame) else None, step)
-            if step is not None:
-                yield step
-                if step.lost and odometry.options.on_lost == "stop":
-                    return
+            yield frame
 
 
 @dataclass(frozen=True)

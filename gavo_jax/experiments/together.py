@@ -7,7 +7,7 @@ solvers and options, the runs laid out over all local devices; a rate that diffe
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.odometry import Clock, Odometry, Progress, Step, TrackerState, _traced, _track
+from gavo_jax.odometry import Clock, Odometry, Progress, Step, TrackerState, _traced, _track, decoded
 from gavo_jax.presets import OdometryOptions, Preset
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
@@ -93,7 +93,7 @@ def _drive(
 ) -> list[list[Step]]:
     steps: list[list[Step]] = [[] for _ in odometries]
     stopped = [False] * len(odometries)
-    for index, frame in enumerate(_decoded(sequence)):
+    for index, frame in enumerate(decoded(sequence)):
         for i, step in enumerate(register(frame, float(sequence.timestamps[index]))):
             if step is not None and not stopped[i]:
                 steps[i].append(step)
@@ -103,24 +103,6 @@ def _drive(
         if all(stopped):
             break
     return steps
-
-
-def _decoded(sequence: FrameSequence) -> Iterator[Frame | FrameError]:
-    """Frame after frame, the next one decoded in a thread meanwhile."""
-
-    def read(index: int) -> Frame | FrameError:
-        try:
-            return sequence[index]
-        except FrameError as error:
-            return error
-
-    with ThreadPoolExecutor(max_workers=1) as decoder:
-        coming = decoder.submit(read, 0)
-        for index in range(len(sequence)):
-            frame = coming.result()
-            if index + 1 < len(sequence):
-                coming = decoder.submit(read, index + 1)
-            yield frame
 
 
 @partial(jax.jit, static_argnames=("odometry",))
