@@ -48,6 +48,17 @@ def names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+def counts(text: str) -> list[int]:
+    """Return the whole numbers between the commas.
+
+    Raises:
+        GavoError: something else is between them.
+    """
+    if not all(name.isdecimal() for name in names(text)):
+        raise GavoError(f"{text}: not whole numbers with commas between")
+    return [int(name) for name in names(text)]
+
+
 def open_clip(text: str) -> FrameSequence:
     """Return the frames of a clip.
 

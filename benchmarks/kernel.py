@@ -244,7 +244,7 @@ def main(levels: str = "0,1,2,3,4", population: int = 64, rounds: int = 7, json:
     pyramids = (pyramid_of(sequence[0], camera), pyramid_of(sequence[1], camera))
     motions = random_motions(population)
     by_size: dict[str, dict[str, float]] = {}
-    for level in map(int, common.names(levels)):
+    for level in common.counts(levels):
         scene = make_scene(pyramids, camera, level, motions)
         objective = make_objective(pyramids, camera, level, GREY_ONLY)
         full = make_objective(pyramids, camera, level, AlignmentOptions(points=None, min_overlap=0.0))

@@ -1,13 +1,18 @@
-"""What a run costs, part by part: the figures that docs/scaling.md reckons with.
+"""Frames per second from PNG files on disk to poses, of every method and preset and of other libraries.
 
-Prints, for one clip: bytes a frame on disk and the processor's milliseconds to read, decode and undistort one; for each
-method, a pair's milliseconds by the clock and on the processor (all cores' time added up, which a busy machine changes
-little) of a run alone and of runs together on one decoded stream; and what a row of results takes.
+Prints a row a contender. End to end: read, decoded and undistorted in a thread ahead as `gavo run` does it, aligned,
+the pose on the host; by the clock and on the processor (all cores' time added up, which a busy machine changes
+little). Beside it the median time of a pair whose frames are decoded already, the time that compilation took before
+(or loading from the cache), and the end-to-end time over that of each of `--over`. Contenders take turns (A B C A B C
+...), so that a slow spell meets all; figures are medians over the rounds, ratios medians of each round's ratio; a
+first round does not count. Below it what decoding costs; with `--together N` also a pair of N runs on one decoded
+stream, and what a row of an experiment's table takes: the figures that docs/scaling.md reckons with.
 
     python benchmarks/throughput.py
-    python benchmarks/throughput.py --clip fr1_desk --methods ga:fast,gauss-newton --frames 30 --together 8
+    python benchmarks/throughput.py --methods ga:fast,opencv-rgb --frames 90 --rounds 7 --json throughput.json
+    python benchmarks/throughput.py --methods ga,ga:fast,gauss-newton --together 4
 
-Clips and methods as for the other benchmarks. The defaults take about two minutes on two cores.
+Clips and methods as for the other benchmarks. The defaults take about three minutes on two cores, with Open3D five.
 """
 
 import tempfile
@@ -19,55 +24,126 @@ import common
 import numpy as np
 
 from gavo_jax.cli.screen import number, print_table
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry import Odometry, track
 
+METHODS = "ga,ga:fast,ga:wide,ga:paper,pso,gauss-newton,adam"
+OVER = "opencv-rgb,opencv-rgbd,open3d-color"
+PARTS = ("rgb", "depth")
+
 
 def main(
     clip: str = "fr1_xyz",
-    methods: str = "ga,ga:fast,gauss-newton",
-    frames: int = 20,
-    together: int = 4,
+    methods: str = f"{METHODS},{common.installed_peers()}",
+    frames: int = 30,
+    rounds: int = 3,
+    over: str = OVER,
+    together: int = 0,
     json: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, print and return the figures.
 
     Args:
         clip: one clip.
-        methods: METHOD or METHOD:PRESET with commas between.
+        methods: METHOD, METHOD:PRESET or peers with commas between.
         frames: how many of the clip's.
-        together: runs on one decoded stream.
+        rounds: measurements of each contender.
+        over: contenders whose time the others' is divided by; those that do not take part are left out.
+        together: runs on one decoded stream; 0 leaves them out, and the table's row.
         json: file for the figures.
+
+    Raises:
+        GavoError: unknown method, no such clip, fewer than two frames or no round.
     """
     sequence = common.open_clip(clip)[:frames]
-    results: dict[str, Any] = {"clip": clip, "frames": len(sequence), **_reading(sequence), **_row()}
+    contenders = common.parse_methods(methods)
+    if len(sequence) < 2 or rounds < 1:
+        raise GavoError("throughput needs at least two frames and one round")
+    measured = measure(sequence, contenders, rounds)
+    references = [name for name in common.names(over) if name in measured]
     rows = []
-    for name in common.names(methods):
-        preset = common.preset_of(name)
-        drivers = [
-            Odometry(sequence.camera, preset.solver, preset.alignment, preset.odometry, seed)
-            for seed in range(together + 1)
-        ]
-        drivers[0].warm_up()
-        pairs = len(sequence) - 1
-        start = _now()
-        list(track(sequence, odometry=drivers[0]))
-        alone = (_now() - start) / pairs * 1e3
-        start = _now()
-        track_together(sequence, drivers[1:])
-        shared = (_now() - start) / pairs / together * 1e3
-        results[name] = {"milliseconds_alone": alone, "milliseconds_together": shared}
-        rows.append((name, *(number(value, 1) for value in (*alone, *shared))))
-    print_table(f"a frame of {clip}", ("", "MB", "ms"), [_reading_row(results)])
-    columns = ("ms/pair", "alone", "on cores", f"{together} together", "on cores")
-    print_table(f"{len(sequence)} frames, decoding included", columns, rows)
-    print_table(
-        "a row of results", ("", "kB", "ms"), [("", number(results["row_kB"], 1), number(results["row_ms"], 1))]
-    )
+    for name, figures in measured.items():
+        ratios = {other: _ratio(figures, measured[other]) for other in references}
+        figures["over"] = ratios
+        cells = [number(figures["frames_per_second"], 1)]
+        cells += [number(figures[key], 1) for key in COLUMNS_OF_TIME.values()]
+        rows.append((name, *cells, *(number(ratio, 2) for ratio in ratios.values())))
+    columns = ("", "frames/s", *COLUMNS_OF_TIME, *(f"/ {name}" for name in references))
+    print_table(f"{len(sequence)} frames of {clip}, from files to poses", columns, rows)
+    results = {"clip": clip, "frames": len(sequence), "rounds": rounds, "contenders": measured, **_reading(sequence)}
+    megabytes, milliseconds = results["frame_MB"], results["frame_ms"]
+    row = ("read, decoded, undistorted", number(megabytes, 2), number(milliseconds, 1))
+    print_table("a frame", ("", "MB", "ms on a core"), [row])
+    if together:
+        own = [name for name in common.names(methods) if name not in common.PEERS]
+        results |= {"together": {name: _together(sequence, name, together) for name in own}, **_row()}
+        rows = [(name, *(number(value, 1) for value in times.values())) for name, times in results["together"].items()]
+        print_table(f"{together} runs together, decoding included", ("", "ms/pair", "on cores"), rows)
+        row = ("", number(results["row_kB"], 1), number(results["row_ms"], 1))
+        print_table("a row of results", ("", "kB", "ms"), [row])
     common.record(json, "throughput", results)
     return results
+
+
+COLUMNS_OF_TIME = {
+    "ms/frame": "milliseconds",
+    "on cores": "core_milliseconds",
+    "ms/pair, decoded": "milliseconds_decoded",
+    "compilation, s": "compile_seconds",
+}
+"""Columns of the table and their names in the JSON file."""
+
+
+def measure(sequence: Sequence, contenders: list[common.Contender], rounds: int) -> dict[str, dict[str, Any]]:
+    """Time each contender over the sequence; the first time does not count.
+
+    Returns:
+        For each contender `seconds` of every round, and the medians.
+    """
+    frames = [sequence[i] for i in range(len(sequence))]
+    compilation = {contender.name: contender.make(sequence.camera, 0).warm_up() for contender in contenders}
+    whole = {contender.name: [] for contender in contenders}
+    pair = {contender.name: [] for contender in contenders}
+    for round_ in range(rounds + 1):
+        for contender in contenders:
+            seconds = _from_files(sequence, contender.make(sequence.camera, 0))
+            milliseconds = _from_frames(frames, contender.make(sequence.camera, 0))
+            if round_:
+                whole[contender.name].append(seconds)
+                pair[contender.name].append(milliseconds)
+    measured = {}
+    for name, times in whole.items():
+        clock, cores = np.median(times, axis=0)
+        measured[name] = {
+            "seconds": [float(seconds) for seconds, _ in times],
+            "frames_per_second": len(sequence) / clock,
+            "milliseconds": clock / len(sequence) * 1e3,
+            "core_milliseconds": cores / len(sequence) * 1e3,
+            "milliseconds_decoded": float(np.median(pair[name])),
+            "compile_seconds": compilation[name],
+        }
+    return measured
+
+
+def _ratio(figures: dict[str, Any], others: dict[str, Any]) -> float:
+    return float(np.median(np.array(figures["seconds"]) / np.array(others["seconds"])))
+
+
+def _from_files(sequence: Sequence, odometry: Odometry) -> np.ndarray:
+    """Seconds of a run, by the clock and on the processor."""
+    start = _now()
+    for _ in track(sequence, odometry=odometry):
+        pass
+    return _now() - start
+
+
+def _from_frames(frames: list[Frame], odometry: Odometry) -> float:
+    """Median milliseconds of a pair."""
+    steps = [odometry.register(frame, frame.timestamp) for frame in frames]
+    return float(np.median([step.milliseconds for step in steps if step is not None]))
 
 
 def _now() -> np.ndarray:
@@ -75,20 +151,26 @@ def _now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
 
 
+def _together(sequence: Sequence, name: str, count: int) -> dict[str, float]:
+    """Milliseconds a pair of that many runs on one decoded stream, by the clock and on the processor."""
+    preset = common.preset_of(name)
+    settings = (sequence.camera, preset.solver, preset.alignment, preset.odometry)
+    drivers = [Odometry(*settings, seed) for seed in range(count)]
+    start = _now()
+    track_together(sequence, drivers)
+    clock, cores = (_now() - start) / (len(sequence) - 1) / count * 1e3
+    return {"milliseconds": clock, "core_milliseconds": cores}
+
+
 def _reading(sequence: Sequence) -> dict[str, float]:
-    """Size of a frame's two files where there are files, and the time to make a `Frame` of them."""
-    sequence[0]
+    """Size of a frame's two files where there are files, and a core's time to make a `Frame` of them."""
     start = time.process_time()
     for i in range(len(sequence)):
         sequence[i]
     milliseconds = (time.process_time() - start) / len(sequence) * 1e3
-    paths = [path for pair in getattr(sequence, "_paths", []) for path in pair]
-    megabytes = sum(path.stat().st_size for path in paths) / len(sequence) / 1e6
-    return {"frame_MB": megabytes, "frame_ms": milliseconds}
-
-
-def _reading_row(results: dict[str, Any]) -> tuple[str, str, str]:
-    return "read, decoded, undistorted", number(results["frame_MB"], 2), number(results["frame_ms"], 1)
+    folder = getattr(sequence, "folder", None)
+    sizes = {} if folder is None else {part: [p.stat().st_size for p in folder.glob(f"{part}/*.png")] for part in PARTS}
+    return {"frame_MB": sum(float(np.mean(size)) for size in sizes.values()) / 1e6, "frame_ms": milliseconds}
 
 
 def _row() -> dict[str, float]:

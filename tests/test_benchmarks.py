@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 
@@ -138,12 +140,97 @@ def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path
             open_clip(text)
 
 
-def test_throughput_measures_its_parts(load, tmp_path: Path) -> None:
-    load("throughput").main(clip=CLIP, methods="gauss-newton", frames=3, together=2, json=tmp_path / "throughput.json")
+def test_throughput_counts_frames_from_files_to_poses(load, tmp_path: Path) -> None:
+    throughput: ModuleType = load("throughput")
+    throughput.main(
+        clip=CLIP,
+        methods="gauss-newton,opencv-rgb",
+        frames=3,
+        rounds=2,
+        together=2,
+        json=tmp_path / "throughput.json",
+    )
     record = read(tmp_path / "throughput.json")
     assert record["frames"] == 3 and record["frame_ms"] > 0 and record["row_kB"] > 1
-    figures = record["gauss-newton"]
-    assert min(figures["milliseconds_together"] + figures["milliseconds_alone"]) > 0
+    assert min(record["together"]["gauss-newton"].values()) > 0
+    ours, peer = (record["contenders"][name] for name in ("gauss-newton", "opencv-rgb"))
+    assert ours["compile_seconds"] > peer["compile_seconds"] == 0
+    assert ours["frames_per_second"] == pytest.approx(3 / np.median(ours["seconds"]))
+    ratios = np.array(ours["seconds"]) / np.array(peer["seconds"])
+    assert ours["over"] == {"opencv-rgb": pytest.approx(np.median(ratios))}
+    assert peer["over"] == {"opencv-rgb": 1.0}
+    with pytest.raises(GavoError, match="two frames"):
+        throughput.main(clip=CLIP, methods="gauss-newton", frames=1)
+
+
+def test_scaling_fits_the_exponent_of_the_large_calls(load, tmp_path: Path) -> None:
+    scaling: ModuleType = load("scaling")
+    file = tmp_path / "scaling.json"
+    scaling.main(levels="3,2", populations="8,64", batches="1,2", methods="gauss-newton", rounds=1, json=file)
+    record = read(file)
+    sizes = [(row["size"], row["candidates"]) for row in record["scoring"]]
+    assert sizes == [("80x60", 8), ("80x60", 64), ("160x120", 8), ("160x120", 64)]
+    assert record["exponent"] is None
+    for row in record["batches"]["gauss-newton"]:
+        assert row["per_second"] == pytest.approx(row["pairs"] / row["milliseconds"] * 1e3)
+    rows = [{"pixels": 10**k, "candidates": 9, "milliseconds": 3.0 * 10 ** (1.1 * k)} for k in (6, 7, 8)]
+    small = {"pixels": 10, "candidates": 9, "milliseconds": 1.0}
+    assert scaling.exponent([small, *rows]) == pytest.approx(1.1)
+    with pytest.raises(GavoError, match="8,x"):
+        scaling.main(populations="8,x")
+
+
+def test_gpu_reports_on_a_cpu_too(
+    load, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gpu: ModuleType = load("gpu")
+    monkeypatch.setattr(gpu, "COPIED", 2**16)
+    gpu.main(clip=CLIP, methods="gauss-newton", batches="2", populations="8", rounds=1, json=tmp_path / "gpu.json")
+    record = read(tmp_path / "gpu.json")
+    assert capsys.readouterr().out.startswith("no GPU here")
+    assert set(record["agreement"]["gauss-newton"].values()) == {0.0}
+    assert min(record["latency"]["gauss-newton"].values()) > 0
+    [row] = record["memory"]["scoring"]
+    limit = 28 * 640 * 480 * 8 / (record["memory"]["gigabytes_per_second"] * 1e9)
+    assert row["share"] == pytest.approx(limit * 1e3 / row["milliseconds"])
+
+
+GROWING = """
+import pathlib, sys, time
+held = bytearray(b"x") * (int(sys.argv[1]) * 2**20)
+time.sleep(0.1)
+run = pathlib.Path(sys.argv[2])
+run.mkdir(exist_ok=True)
+(run / "trajectory.txt").write_text("# header\\n0\\n1\\n")
+"""
+
+
+def test_footprint_tells_a_process_that_grows(load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    footprint: ModuleType = load("footprint")
+
+    def growing(scratch: Path, name: str, frames: int) -> list[str]:
+        return [sys.executable, "-c", GROWING, str(frames), str(scratch / "run")]
+
+    monkeypatch.setattr(footprint, "gavo_run", growing)
+    footprint.main(clip=CLIP, methods="gauss-newton", starts=2, lengths="200,700", json=tmp_path / "footprint.json")
+    figures = read(tmp_path / "footprint.json")["methods"]["gauss-newton"]
+    for times in figures["start"].values():
+        assert len(times) == 2 and min(times) > 0.1
+    short, long = figures["megabytes"].values()
+    assert short < 300 and long > 700 and figures["ratio"] == pytest.approx(long / short) and figures["ratio"] > 1.5
+
+
+@pytest.mark.slow
+def test_footprint_times_and_weighs_processes(load, tmp_path: Path) -> None:
+    footprint: ModuleType = load("footprint")
+    camera = Camera(fx=130.0, fy=130.0, cx=79.5, cy=59.5, width=160, height=120)
+    footprint.common.open_clip = lambda _: SyntheticSequence(4, camera=camera, speed=0.2)
+    footprint.main(clip=CLIP, methods="gauss-newton", starts=1, lengths="3,9", json=tmp_path / "footprint.json")
+    figures = read(tmp_path / "footprint.json")["methods"]["gauss-newton"]
+    [empty], [filled] = figures["start"].values()
+    assert empty > filled > 0.5
+    short, long = figures["megabytes"].values()
+    assert 100 < short < 4000 and figures["ratio"] == pytest.approx(long / short)
 
 
 def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> None:
