@@ -54,7 +54,7 @@ def counts(text: str) -> list[int]:
     Raises:
         GavoError: something else is between them.
     """
-    if not all(name.isdecimal() for name in names(text)):
+    if not names(text) or not all(name.isdecimal() for name in names(text)):
         raise GavoError(f"{text}: not whole numbers with commas between")
     return [int(name) for name in names(text)]
 

@@ -113,7 +113,7 @@ code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subproces
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 sys.exit(code)
 """
-"""A small process that starts the one to be weighed: a process's peak counts what its parent held when it was started."""
+"""A small process starts the one to be weighed, whose peak counts what its parent held when it was started."""
 
 
 def peak_megabytes(scratch: Path, name: str, frames: int) -> float:

@@ -2,10 +2,13 @@
 
 Prints a row a formulation and a column an image size (the five pyramid levels of 640x480): `Objective.score` as the
 solvers call it, its two forms (one candidate after the other in a fused loop; all side by side), the same with the
-default preset's robust loss and depth term; a plain version with [N, 4] points, `vmap` and `map_coordinates`; and the
-references outside JAX, a hand-written numba loop (`prange`, `fastmath`) and SciPy's `map_coordinates`. All but the
-robust one compute the same errors, which is checked. Below it the ratios of the plain version to `score` and of `score`
-to the numba loop. Medians of runs in turn (A B C A B C ...), so that a slow spell meets all.
+default preset's robust loss and depth term; `score` without two things that XLA needs (the barrier behind the look-up,
+without which it may read a word anew for each of its bytes; one array that holds both the costs and the mark of the
+points outside, without which it may pass over the points twice); a plain version with [N, 4] points, `vmap` and
+`map_coordinates`; and the references outside JAX, a hand-written numba loop (`prange`, `fastmath`) and SciPy's
+`map_coordinates`. All but the robust one compute the same errors, which is checked. Below it the ratios of the plain
+version to `score` and of `score` to the numba loop. Medians of runs in turn (A B C A B C ...), so that a slow spell
+meets all.
 
     python benchmarks/kernel.py
     python benchmarks/kernel.py --levels 2,3 --population 16 --rounds 3 --json kernel.json
@@ -16,8 +19,10 @@ On 2 cores the defaults take about 2 minutes. SciPy's figure is taken from 4 can
 import importlib.util
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import common
 import jax
@@ -37,11 +42,12 @@ from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import Objective, l2
+from gavo_jax.objective import Objective, Residuals, _lane_sum, l2
 from gavo_jax.pyramid import Pyramid, build_pyramid
 from gavo_jax.warp import exp
 
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
+NO_BARRIER, TWO_MARKS = "score, no barrier", "score, two marks"
 PLAIN, NUMBA, SCIPY = "plain vmap", "numba", "scipy"
 GREY_ONLY = AlignmentOptions(loss=l2, depth=False, brightness=False, robust_scale=False, points=None, min_overlap=0.0)
 SCIPY_CANDIDATES = 4
@@ -61,6 +67,29 @@ class Scene(NamedTuple):
     """[h, w] grey of the target, whole grey levels."""
     motions: np.ndarray
     """[P, 4, 4] target_T_reference."""
+
+
+def score_without_barrier(objective: Objective, motions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`Objective.score` traced without `warp.look_up`'s barrier."""
+    with mock.patch.object(jax.lax, "optimization_barrier", lambda words: words):
+        return objective.score(motions)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class TwoMarks(Objective):
+    """The objective with costs [0] and marks of the points inside [1] in two arrays."""
+
+    @classmethod
+    def of(cls, objective: Objective) -> "TwoMarks":
+        """The same objective."""
+        return cls(**{field.name: getattr(objective, field.name) for field in fields(objective)})
+
+    def _cost_of(self, r: Residuals) -> jax.Array:
+        return jnp.stack([jnp.where(r.inside > 0, super()._cost_of(r), 0.0), r.inside])
+
+    def _sums(self, cost: jax.Array) -> jax.Array:
+        return jnp.stack([_lane_sum(cost[0]), _lane_sum(cost[1])])
 
 
 @jax.jit
@@ -181,6 +210,8 @@ def formulations(scene: Scene, objective: Objective, full: Objective) -> dict[st
         SCORE: Formulation(ours(Objective.score), count, True),
         MAPPED: Formulation(ours(lambda o, m: jax.lax.map(o.error, m)), count, True),
         SIDE_BY_SIDE: Formulation(ours(lambda o, m: jax.vmap(o.error)(m)), count, True),
+        NO_BARRIER: Formulation(ours(score_without_barrier), count, True),
+        TWO_MARKS: Formulation(ours(Objective.score, TwoMarks.of(objective)), count, True),
         FULL: Formulation(ours(Objective.score, full), count, False),
         PLAIN: Formulation(lambda: np.asarray(plain_score(*arrays)), count, True),
     }

@@ -1,12 +1,14 @@
 """The driver: poses chained, lost frames survived, the same bits for the same seed, nothing kept that is not needed."""
 
 import threading
+import tracemalloc
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -363,6 +365,25 @@ def test_streams(sequence: SyntheticSequence) -> None:
     assert threading.get_ident() not in threads
     assert most[0] <= 4
     assert told == result.steps
+
+
+def test_memory_does_not_grow_with_the_frames(sequence: SyntheticSequence) -> None:
+    """From frame to frame the device holds as much as before, and the host less than a hundredth of a frame more."""
+    device: list[int] = []
+    host: list[int] = []
+
+    def weigh(_: Step) -> None:
+        device.append(sum(array.nbytes for array in jax.live_arrays()))
+        host.append(tracemalloc.get_traced_memory()[0])
+
+    run(sequence)
+    tracemalloc.start()
+    try:
+        run(Altered(sequence, lambda _, frame: replace(frame, grey=frame.grey.copy())), on_step=weigh)
+    finally:
+        tracemalloc.stop()
+    assert max(device[3:]) == min(device[3:])
+    assert (host[-1] - host[3]) / len(host[4:]) < 0.01 * CAMERA.width * CAMERA.height * 3
 
 
 def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> None:
