@@ -243,6 +243,7 @@ def measure(candidates: dict[str, Formulation], pixels: int, rounds: int) -> dic
         repeats[name] = max(1, round(LEAST_SECONDS / (time.perf_counter() - start)))
     for _ in range(rounds):
         for name, formulation in candidates.items():
+            formulation.run()  # memory and threads are then its own, not the last one's
             start = time.perf_counter()
             for _ in range(repeats[name]):
                 formulation.run()
