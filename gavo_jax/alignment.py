@@ -96,12 +96,15 @@ class AlignmentOptions:
         loss: ρ of the squared normalised residual (static); see `objective.LOSSES`, or any callable.
         depth: Whether the depth residual joins the grey one (static).
         brightness: Whether a gain and a bias between the frames are estimated (static).
+        centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
+            (static); see `Objective`.
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels (static); None takes every
             pixel.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
-        depth_weight: Factor on the depth cost's weight, which comes from the data; see `objective.estimate_scales`.
+        depth_weight: Factor on the depth cost's weight, which comes from the data, an entry a level; see
+            `objective.estimate_scales`.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -115,11 +118,12 @@ class AlignmentOptions:
     loss: Loss = static(geman_mcclure)
     depth: bool = static(True)
     brightness: bool = static(True)
+    centred: bool = static(False)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: int | None = static(4800)
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
-    depth_weight: float = 1.0
+    depth_weight: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0)
     min_overlap: float = 0.35
     outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
@@ -149,6 +153,26 @@ class Alignment(NamedTuple):
     history: Float[Array, " iterations"]
     """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
 
+    @property
+    def undetermined(self) -> str:
+        """Of a pair that is `LOW_TEXTURE` the direction of motion that the images constrain least, in the axes of the
+        reference camera: one or two of ξ's six, as words. Else empty.
+        """
+        covariance = np.asarray(self.covariance, np.float64)
+        if self.status != AlignmentStatus.LOW_TEXTURE or not np.isfinite(covariance).all():
+            return ""
+        tolerable = np.repeat([MAX_TRANSLATION_DEVIATION, MAX_ROTATION_DEVIATION], 3)
+        _, vectors = np.linalg.eigh(covariance / np.outer(tolerable, tolerable))
+        share = vectors[:, -1] ** 2
+        main = [axis for axis in np.argsort(-share)[:2] if share[axis] > share.max() / 4]
+        return " with ".join(f"{('translation along', 'rotation about')[axis // 3]} {'xyz'[axis % 3]}" for axis in main)
+
+    @property
+    def sentence(self) -> str:
+        """What is known of the result, in one sentence for people."""
+        words = self.status.sentence
+        return f"{words[:-1]}, above all {self.undetermined}." if self.undetermined else words
+
 
 MIN_DEPTH_SHARE = 0.05
 """Share of the reference's points with a reading below which a pair is `NO_DEPTH`."""
@@ -167,6 +191,8 @@ MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
 """Radians, likewise for the rotation."""
+MAX_RIVAL = 1.05
+"""Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only islands that compete can tell."""
 
 
 SHARED_ERRORS = 9.0
@@ -210,6 +236,13 @@ class Level(NamedTuple):
     """Points a row."""
     islands: Integer[Array, ""]
     """Independent populations."""
+    depth_weight: Float[Array, ""]
+    """Factor on the depth cost's weight."""
+
+    @property
+    def is_undecided(self) -> Bool[Array, ""]:
+        """Whether the motion that the level starts from may be far off: nothing is aligned yet, or several compete."""
+        return self.is_first | (self.islands > 1)
 
 
 def stack_levels(views: tuple[View, ...], camera: Camera, levels: tuple[int, ...], options: AlignmentOptions) -> Level:
@@ -227,6 +260,7 @@ def stack_levels(views: tuple[View, ...], camera: Camera, levels: tuple[int, ...
         jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
         jnp.array(columns),
         jnp.array([options.islands[level] for level in levels]),
+        jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
     )
 
 
@@ -251,6 +285,7 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         jnp.float32(charge),
         level.points,
         level.columns,
+        level.is_undecided if options.centred else None,
         options.loss,
         options.depth,
     )
@@ -261,9 +296,10 @@ def fit_objective(
 ) -> tuple[Objective, Brightness]:
     """E of one level with everything that is estimated from the data at the motion that it starts from.
 
-    On the first level nothing is aligned yet. A regression of one image on the other would only tell that they differ,
-    its gain would fall towards 0 and reward motions that hide contrast; and residuals of a wrong motion say nothing of
-    how much depth is worth. So brightness is left alone there, and depth has its largest weight.
+    On the first level nothing is aligned yet, and while several islands compete the leader may be wrong. A regression
+    of one image on the other would only tell that they differ, its gain would fall towards 0 and reward motions that
+    hide contrast; and residuals of a wrong motion say nothing of how much depth is worth. So brightness is left alone
+    there (`Objective.centred` takes care of exposure), and depth has its largest weight on the first level.
     """
     brightness = unchanged_brightness(level)
     objective = level_objective(level, target, options, brightness)
@@ -273,12 +309,11 @@ def fit_objective(
             return Brightness(*estimate_brightness(replace(objective, reference=reference), guess))
 
         estimated = jax.vmap(estimate)(level.reference)
-        brightness = jax.tree.map(lambda a, b: jnp.where(level.is_first, a, b), brightness, estimated)
+        brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
     if options.robust_scale:
-        scales = estimate_scales(objective, guess, options.depth_weight)
-        largest_weight = options.depth_weight * DEPTH_WEIGHT_RANGE[1]
-        weight = jnp.where(level.is_first, largest_weight, scales.depth_weight)
+        scales = estimate_scales(objective, guess, level.depth_weight)
+        weight = jnp.where(level.is_first, level.depth_weight * DEPTH_WEIGHT_RANGE[1], scales.depth_weight)
         objective = replace(objective, scales=scales._replace(depth_weight=weight))
     return objective, brightness
 
@@ -328,6 +363,8 @@ class Search(NamedTuple):
     box: Float[Array, " 6"]
     """Half-widths of the search box, metres and radians."""
     brightness: Brightness
+    rival: Float[Array, ""]
+    """Error of the second-best mode over that of the best one, where several islands competed last; +inf without one."""
 
 
 def align_views(
@@ -365,6 +402,7 @@ def align_views(
         origins,
         jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
         unchanged_brightness(first),
+        jnp.float32(jnp.inf),
     )
 
     def search_level(search: Search, level: Level) -> tuple[Search, tuple[jax.Array, Population | None]]:
@@ -386,13 +424,15 @@ def align_views(
             motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
             population = Population(level.number, log(motions), error, log(centre), search.box)
         order = _best_distinct(found, errors, places)
-        return Search(found[order], search.box * options.bounds_factor, brightness), (history[order[0]], population)
+        rival = search.rival if places == 1 else jnp.where(level.islands > 1, _rival(found, errors), search.rival)
+        search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
+        return search, (history[order[0]], population)
 
     search, (histories, populations) = jax.lax.scan(search_level, start, levels)
     iterations = [solver.iterations[level] for level in solver.levels]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness)
-    return _conclude(objective, search.islands[0], options, history), populations
+    return _conclude(objective, search, finest, options, history), populations
 
 
 def _search_island(
@@ -445,6 +485,16 @@ NICHE = (0.08, 0.08)
 """Metres and radians of ξ within which two motions count as one mode."""
 
 
+def _niches(motions: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
+    """ξ in units of `NICHE`: what lies less than 1 apart counts as one mode."""
+    return log(motions) / jnp.repeat(jnp.stack([jnp.float32(radius) for radius in NICHE]), 3)
+
+
+def _near(places: Float[Array, "n 6"], index: Integer[Array, ""]) -> Bool[Array, " n"]:
+    """Which motions share the mode of one of them."""
+    return jnp.sum((places - places[index]) ** 2, axis=1) < 1.0
+
+
 def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
     """Indices of the `count` best motions with no two of one mode, best first (clearing, Petrowski 1996).
 
@@ -452,16 +502,21 @@ def _best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], c
     """
     if count == 1:
         return jnp.argmin(errors)[None]
-    scale = jnp.repeat(jnp.stack([jnp.float32(radius) for radius in NICHE]), 3)
-    places = log(motions) / scale
+    places = _niches(motions)
 
     def pick(cleared: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
         best = jnp.argmin(cleared)
-        near = jnp.sum((places - places[best]) ** 2, axis=1) < 1.0
-        return jnp.where(near, cleared + CLEARED, cleared).at[best].set(jnp.inf), best
+        return jnp.where(_near(places, best), cleared + CLEARED, cleared).at[best].set(jnp.inf), best
 
     worthless = jnp.where(jnp.isfinite(errors), jnp.minimum(errors, CLEARED / 2), 10 * CLEARED)
     return jax.lax.scan(pick, worthless, length=count)[1]
+
+
+def _rival(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"]) -> Float[Array, ""]:
+    """Error of the best motion outside the winner's mode, over the winner's; +inf where there is none."""
+    best = jnp.argmin(errors)
+    others = jnp.where(_near(_niches(motions), best), jnp.inf, errors)
+    return jnp.min(others) / jnp.maximum(errors[best], 1e-6)
 
 
 CLEARED = 1e9
@@ -469,13 +524,14 @@ CLEARED = 1e9
 
 
 def _conclude(
-    objective: Objective, target_T_reference: Float[Array, "4 4"], options: AlignmentOptions, history: jax.Array
+    objective: Objective, search: Search, finest: Level, options: AlignmentOptions, history: jax.Array
 ) -> Alignment:
     """Error, covariance and status at the motion that the search ended with.
 
     The scales are estimated there once more, so that errors of different solvers can be compared.
     """
-    scales = estimate_scales(objective, target_T_reference, options.depth_weight)
+    target_T_reference = search.islands[0]
+    scales = estimate_scales(objective, target_T_reference, finest.depth_weight)
     if options.robust_scale:
         objective = replace(objective, scales=scales)
     problem = Problem(objective, target_T_reference, jnp.eye(6))
@@ -494,6 +550,7 @@ def _conclude(
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
+        (search.rival < MAX_RIVAL, AlignmentStatus.AMBIGUOUS),
         (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
         (unexplained | (scales.depth > MAX_DEPTH_SCALE), AlignmentStatus.HIGH_ERROR),
         (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),

@@ -203,7 +203,7 @@ class Residuals(NamedTuple):
     """Residuals of one motion at every reference point, with what a derivative needs."""
 
     grey: Float[Array, "*n"]
-    """Grey levels; equation (1) after the brightness model."""
+    """Grey levels; equation (1) after the brightness model, about their mean where the objective is `centred`."""
     depth: Float[Array, "*n"]
     """Inverse depth, 1/m, along the surface normal; 0 where `depth_valid` is 0."""
     inside: Float[Array, "*n"]
@@ -220,6 +220,8 @@ CHUNK = 1200
 cache (`benchmarks/kernel.py`)."""
 LINEARIZED_CHUNK = 4800
 """Points a view that are linearised at a time; there is only one candidate then."""
+CENTRING_POINTS = 480
+"""Points, spread evenly, that tell a motion's mean residual."""
 MOST_CHUNKS = 16
 """On large images chunks grow so that there are no more than these."""
 
@@ -245,9 +247,11 @@ class Objective:
     """Points a view that hold something, from the first on; None: all."""
     columns: Integer[Array, ""] | int = 1
     """Reference points a row: they come from a grid, row after row."""
+    centred: Bool[Array, ""] | None = None
+    """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
+    larger than any contrast, says nothing against the true motion. None: never, at no cost."""
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
-
     def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
         """Sum of `part` over chunks of the reference's points, as far as there are any."""
         points = self.reference.grey.shape[-1]
@@ -265,13 +269,30 @@ class Objective:
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: part(chunk(0))))
         return jax.lax.fori_loop(0, used, lambda k, total: jax.tree.map(jnp.add, total, part(chunk(k))), zero)
 
-    def residuals(self, target_T_reference: Float[Array, "4 4"], reference: Reference | None = None) -> Residuals:
-        """r_i(ξ) of one motion, equation (1); at all points or at some of them."""
+    def mean_residual(self, target_T_reference: Float[Array, "4 4"]) -> Float[Array, ""]:
+        """Mean grey residual of one motion over points inside; 0 unless `centred`."""
+        if self.centred is None:
+            return jnp.float32(0.0)
+        points = self.reference.grey.shape[-1]
+        size = min(CENTRING_POINTS, points)
+        places = jnp.arange(size) * (points if self.count is None else self.count) // size
+        some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
+        r = self.residuals(target_T_reference, some, jnp.float32(0.0))
+        return jnp.where(self.centred, jnp.sum(r.grey) / jnp.maximum(jnp.sum(r.inside), 1.0), 0.0)
+
+    def residuals(
+        self,
+        target_T_reference: Float[Array, "4 4"],
+        reference: Reference | None = None,
+        mean: Float[Array, ""] | None = None,
+    ) -> Residuals:
+        """r_i(ξ) of one motion, equation (1); at all points or at some of them, about a mean that is known already."""
         reference = self.reference if reference is None else reference
+        mean = self.mean_residual(target_T_reference) if mean is None else mean
         warped = warp(reference.points, target_T_reference, self.plane)
         words = look_up(self.target, warped, self.plane)
         grey_sample, depth_sample = sample_grey(words, warped), sample_depth(words, warped)
-        grey = grey_sample.value - reference.grey
+        grey = grey_sample.value - reference.grey - mean
         depth = reference.facing * (depth_sample.value - warped.inverse_depth)
         depth_valid = depth_sample.valid * warped.inside
         return Residuals(
@@ -284,11 +305,8 @@ class Objective:
             depth_sample,
         )
 
-    def _cost(self, reference: Reference, target_T_reference: Float[Array, "4 4"]) -> Float[Array, "*n"]:
-        """Cost of every point under one motion; −1 marks those outside, so that one pass over the points does."""
-        return self._cost_of(self.residuals(target_T_reference, reference))
-
-    def _cost_of(self, r: Residuals) -> Float[Array, "*n"]:
+    def _cost(self, r: Residuals) -> Float[Array, "*n"]:
+        """Cost of every point; −1 marks those outside, so that one pass over the points does."""
         scales = self.scales
         cost = self.loss(r.grey**2 * (1.0 / scales.grey**2))
         if self.use_depth:
@@ -319,7 +337,7 @@ class Objective:
 
     def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
         """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
-        return self._conclude(self._sums(self._cost(self.reference, target_T_reference)))
+        return self._conclude(self._sums(self._cost(self.residuals(target_T_reference))))
 
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
@@ -339,7 +357,7 @@ def _lane_sum(values: Float[Array, "*n"]) -> Float[Array, ""]:
 
 def _score_side_by_side(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
     """All candidates and points at once: what a GPU wants."""
-    sums = jax.vmap(lambda motion: objective._sums(objective._cost(objective.reference, motion)), out_axes=1)(motions)
+    sums = jax.vmap(lambda motion: objective._sums(objective._cost(objective.residuals(motion))), out_axes=1)(motions)
     error, overlap = objective._conclude(sums)
     return jnp.where(counted, error, jnp.inf), overlap
 
@@ -355,9 +373,13 @@ def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Arra
     def score_group(i: jax.Array, sums: jax.Array) -> jax.Array:
         members = jax.lax.dynamic_slice_in_dim(order, i * group, group)
         chosen = motions.at[members].get(mode="clip")
+        means = jax.vmap(objective.mean_residual)(chosen)
 
         def chunk_sums(chunk: Reference) -> jax.Array:
-            return jax.vmap(lambda motion: objective._sums(objective._cost(chunk, motion)), out_axes=1)(chosen)
+            def sums(motion: jax.Array, mean: jax.Array) -> jax.Array:
+                return objective._sums(objective._cost(objective.residuals(motion, chunk, mean)))
+
+            return jax.vmap(sums, out_axes=1)(chosen, means)
 
         return sums.at[:, members].set(objective.sum_over_points(chunk_sums, CHUNK), mode="drop")
 
@@ -478,10 +500,13 @@ class Problem:
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
 
+        motion = self.transform(x)
+        mean = self.objective.mean_residual(motion)
+
         def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
-            r = self.objective.residuals(self.transform(x), reference)
+            r = self.objective.residuals(motion, reference, mean)
             gradient, hessian = _normal_equations(self._weighted_terms(x, reference, r))
-            return self.objective._sums(self.objective._cost_of(r)), gradient, hessian
+            return self.objective._sums(self.objective._cost(r)), gradient, hessian
 
         return self._linearization(*self.objective.sum_over_points(part, LINEARIZED_CHUNK))
 
@@ -495,7 +520,7 @@ class Problem:
         objective, plane = self.objective, self.objective.plane
         r = objective.residuals(self.transform(x))
         terms = self._weighted_terms(x, objective.reference, r)
-        sums = objective._sums(objective._cost_of(r))
+        sums = objective._sums(objective._cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
         tile = jax.nn.one_hot((row * TILES[0] + column).reshape(-1), TILES[0] * TILES[1])

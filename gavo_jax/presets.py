@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from gavo_jax.alignment import AlignmentOptions
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import l2, student_t
+from gavo_jax.objective import DEPTH_WEIGHT_RANGE, l2
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -110,8 +110,10 @@ _WIDE = {
     "gauss-newton": GaussNewton(),
     "adam": GradientDescent(),
 }
+_EQUAL = 1.0 / DEPTH_WEIGHT_RANGE[1]
 WIDE_OBJECTIVE = AlignmentOptions(
-    loss=student_t,
+    centred=True,
+    depth_weight=(_EQUAL, _EQUAL, _EQUAL, 1.0, 1.0),
     islands=(1, 1, 4, 16, 96),
     scouts=8192,
     scout_spread=(0.1, 0.5),
@@ -121,7 +123,8 @@ WIDE_OBJECTIVE = AlignmentOptions(
 )
 """Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
 16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
-so that leaving the view neither pays nor is shunned; the loss is wider than the default's."""
+so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
+their mean, and once few modes are left depth may count as much as grey does."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:

@@ -32,14 +32,12 @@ Pyramid = tuple[PyramidLevel, ...]
 def halve_grey(grey: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     """Halve an image with the binomial kernel [1 3 3 1]/8, which is centred on the 2x2 block; borders replicate."""
 
-    def along_rows(image: jax.Array) -> jax.Array:
-        image = image[: image.shape[0] // 2 * 2]
-        even, odd = image[0::2], image[1::2]
-        before = jnp.concatenate([even[:1], odd[:-1]])
-        after = jnp.concatenate([even[1:], odd[-1:]])
-        return 0.375 * (even + odd) + 0.125 * (before + after)
-
-    return along_rows(along_rows(grey).T).T
+    height, width = (size // 2 * 2 for size in grey.shape)
+    padded = jnp.pad(grey[:height, :width], 1, mode="edge")
+    rows = [padded[k : k + height : 2] for k in range(4)]
+    along_v = 0.375 * (rows[1] + rows[2]) + 0.125 * (rows[0] + rows[3])
+    columns = [along_v[:, k : k + width : 2] for k in range(4)]
+    return 0.375 * (columns[1] + columns[2]) + 0.125 * (columns[0] + columns[3])
 
 
 def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:

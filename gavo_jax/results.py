@@ -38,13 +38,13 @@ VIEW = "view.rrd"
 
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
-    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "lost", "on_lost")
+    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "undetermined", "lost", "on_lost")
     + DEVIATIONS
     + ("milliseconds",)
 )
-"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, what was recorded
-for a lost pair (`OdometryOptions.on_lost`), deviations of the motion's translation (m) and rotation (rad) along the
-axes of the reference camera."""
+"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction that
+a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations of
+the motion's translation (m) and rotation (rad) along the axes of the reference camera."""
 
 
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
@@ -322,6 +322,7 @@ def frame_row(step: Step) -> list[Any]:
         _digits(alignment.error),
         _digits(alignment.overlap),
         alignment.status.name.lower(),
+        alignment.undetermined,
         int(step.lost),
         step.policy,
         *map(_digits, deviations),

@@ -34,7 +34,7 @@ def align(options: Align) -> int:
         "overlap": found.overlap,
         "covariance": found.covariance,
         "status": found.status.name.lower(),
-        "status_sentence": found.status.sentence,
+        "status_sentence": found.sentence,
     }
     print(json.dumps(describe(answer), indent=2, allow_nan=False))
     return 0

@@ -78,7 +78,7 @@ def rates(count: int) -> list[Preset]:
         replace(
             preset,
             solver=replace(preset.solver, damping=1e-4 * (1 + i)),
-            alignment=replace(preset.alignment, depth_weight=1.0 + 0.01 * i),
+            alignment=replace(preset.alignment, depth_weight=(1.0 + 0.01 * i,) * 5),
         )
         for i in range(count)
     ]
