@@ -180,7 +180,7 @@ MIN_CONTRAST = 2.0
 """Grey levels: a smaller standard deviation over the reference makes a pair `LOW_TEXTURE`."""
 MIN_FINAL_OVERLAP = 0.3
 """Overlap of the result below which a pair is `LOW_OVERLAP`."""
-MIN_EXPLAINED = 0.8
+MIN_EXPLAINED = 0.85
 """Share of the reference's grey variance that a result must explain; below, a pair is `HIGH_ERROR`, unless its grey
 residuals are as small as"""
 SMALL_GREY_SCALE = 8.0
