@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -166,8 +167,10 @@ def _bounds(place: str, spec: Any) -> list[Any]:
     step, log = spec.get("step"), spec.get("log", False)
     if not isinstance(log, bool) or (log and (step is not None or ends[0] <= 0)):
         raise GavoError(f"{place}: log: true or false; a logarithmic range starts above 0 and has no step")
-    if step is not None and (isinstance(step, bool) or not isinstance(step, int | float) or step <= 0):
-        raise GavoError(f"{place}: step: must be a number above 0, not {step!r}")
+    if step is not None and (isinstance(step, bool) or not isinstance(step, int | float)):
+        raise GavoError(f"{place}: step: must be a number, not {short(step)}")
+    if step is not None and not 0 < step <= ends[1] - ends[0]:
+        raise GavoError(f"{place}: step: must be above 0 and at most high - low, not {short(step)}")
     return ends
 
 

@@ -46,7 +46,7 @@ class Interrupted(LocalExecutor):
 
 def test_interrupted_and_resumed(small, tmp_path):
     plan, table = read_plan(small, tmp_path / "out"), Table(tmp_path / "out")
-    assert len(missing(plan, table)) == 4 and estimate_seconds(plan, plan.runs, [], 1) > 0
+    assert len(missing(plan, table)) == 4 and estimate_seconds(plan.runs, [], 1) > 0
     with pytest.raises(KeyboardInterrupt):
         run_experiment(plan, table, Interrupted())
     kept = {row["run"]: row["finished"] for row in table.read()}
