@@ -1,8 +1,8 @@
 """The same pairs on one device, on eight, and on two processes with four each.
 
 XLA compiles a program for each number of pairs and orders its sums as suits it, so results are equal to rounding, not
-to the last bit. A random search enlarges that with every generation: two of them are compared, which differ wholly where
-the random numbers do.
+to the last bit. A random search enlarges that with every generation: two of them are compared, which differ wholly
+where the random numbers do.
 """
 
 import os
