@@ -3,7 +3,8 @@
 The runs differ in their seeds and in a rate of the solver (`ga`: mutation_decay, `pso`: constriction, `gauss-newton`:
 damping, `adam`: decay). For each method: programs compiled for one run and then for all the others, seconds of the 64
 runs as 64 calls of `run_odometry`, as bare loops over the frames (without its warm-up and figures), and together; the
-ratios of these times; and how many of the 64 trajectories are the same bit for bit.
+ratios of these times; milliseconds a pair on the processor (all cores' time added up) bare and together; and how many
+of the trajectories are the same bit for bit.
 
     python benchmarks/together.py
     python benchmarks/together.py --clip fr1_xyz:10 --methods ga --runs 8
@@ -36,6 +37,7 @@ from gavo_jax.presets import Preset
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SMALL = "small"
+WAYS = ("run_odometry", "bare", "together")
 RATES = {"ga": "mutation_decay", "pso": "constriction", "gauss-newton": "damping", "adam": "decay"}
 
 
@@ -63,7 +65,8 @@ def main(
         for name in common.names(methods):
             results[name] = _measure(sequence, _presets(name, runs), repeats)
     rows = [_row(name, results[name]) for name in common.names(methods)]
-    columns = ("", "programs", "more", "run_odometry, s", "bare, s", "together, s", "ratio", "to bare", "equal")
+    columns = ("", "programs", "more", "run_odometry, s", "bare, s", "together, s", "ratio", "to bare")
+    columns += ("bare, core-ms", "together, core-ms", "equal")
     print_table(f"{runs} runs over {len(sequence)} frames of {clip}", columns, rows)
     common.record(json, "together", results)
     return results
@@ -101,22 +104,25 @@ def _measure(sequence: Sequence, presets: list[Preset], repeats: int) -> dict[st
         run_odometry(sequence, presets[0].solver, 0, presets[0].alignment, presets[0].odometry)
     with _compilations() as others:
         found = [[_timed(way) for way in (single, bare, together)] for _ in range(repeats)]
-    seconds = np.median([[time for time, _ in ways] for ways in found], axis=0).tolist()
+    clock, cores = np.median([[times for times, _ in ways] for ways in found], axis=0).T.tolist()
+    pairs = len(presets) * (len(sequence) - 1)
     equal = sum(_same(a, b) for a, b in zip(found[0][0][1], found[0][2][1], strict=True))
     return {
         "programs": len(first),
         "more_programs": len(others),
-        "seconds": dict(zip(("run_odometry", "bare", "together"), seconds, strict=True)),
-        "ratio": seconds[2] / seconds[0],
-        "ratio_to_bare": seconds[2] / seconds[1],
+        "seconds": dict(zip(WAYS, clock, strict=True)),
+        "core_milliseconds_a_pair": {way: 1e3 * time / pairs for way, time in zip(WAYS, cores, strict=True)},
+        "ratio": clock[2] / clock[0],
+        "ratio_to_bare": clock[2] / clock[1],
         "equal": equal,
     }
 
 
-def _timed(run: Callable[[], list[list[Step]]]) -> tuple[float, list[list[Step]]]:
-    start = time.perf_counter()
+def _timed(run: Callable[[], list[list[Step]]]) -> tuple[tuple[float, float], list[list[Step]]]:
+    """Seconds by the clock and of the processor, and what came of it."""
+    start = time.perf_counter(), time.process_time()
     steps = run()
-    return time.perf_counter() - start, steps
+    return (time.perf_counter() - start[0], time.process_time() - start[1]), steps
 
 
 def _same(first: list[Step], second: list[Step]) -> bool:
@@ -141,7 +147,8 @@ def _compilations() -> Iterator[list[str]]:
 
 
 def _row(name: str, found: dict[str, Any]) -> tuple[Any, ...]:
-    figures = (*found["seconds"].values(), found["ratio"], found["ratio_to_bare"])
+    cores = found["core_milliseconds_a_pair"]
+    figures = (*found["seconds"].values(), found["ratio"], found["ratio_to_bare"], cores["bare"], cores["together"])
     return name, found["programs"], found["more_programs"], *(number(f, 2) for f in figures), found["equal"]
 
 

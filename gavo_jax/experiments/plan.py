@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from gavo_jax.camera import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, read_text, shown
 from gavo_jax.experiments.settings import MAX_REAL, flatten, override, refuse_unknown
 from gavo_jax.experiments.together import program_of
 from gavo_jax.peers import PEERS
@@ -349,7 +348,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
-            raise GavoError(f"{place}: sweep: {short(name)}: not a list of values")
+            raise GavoError(f"{place}: sweep: {shown(name)}: not a list of values")
     variants = []
     for preset in presets:
         for choice in itertools.product(*swept.values()):
@@ -400,33 +399,33 @@ def _tables(place: str, value: Any) -> list[dict[str, Any]]:
 def text_of(place: str, value: Any) -> str:
     """Return a text that is not empty, or raise GavoError."""
     if not isinstance(value, str) or not value:
-        raise GavoError(f"{place}: must be text, not {short(value)}")
+        raise GavoError(f"{place}: must be text, not {shown(value)}")
     return value
 
 
 def _flag(place: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise GavoError(f"{place}: must be true or false, not {short(value)}")
+        raise GavoError(f"{place}: must be true or false, not {shown(value)}")
     return value
 
 
 def whole_of(place: str, value: Any, least: int) -> int:
     """Return a whole number of at least so much, or raise GavoError."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise GavoError(f"{place}: must be a whole number of at least {least}, not {short(value)}")
+        raise GavoError(f"{place}: must be a whole number of at least {least}, not {shown(value)}")
     return value
 
 
 def _real(place: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= MAX_REAL:
-        raise GavoError(f"{place}: must be a number of at least 0, not {short(value)}")
+        raise GavoError(f"{place}: must be a number of at least 0, not {shown(value)}")
     return float(value)
 
 
 def _refuse_repeated(place: str, values: Sequence[Any]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise GavoError(f"{place}: {short(value)} is given twice")
+            raise GavoError(f"{place}: {shown(value)} is given twice")
 
 
 def _line(words: Any) -> str:

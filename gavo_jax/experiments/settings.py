@@ -4,12 +4,11 @@ import dataclasses
 import difflib
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from reprlib import repr as short
 from typing import Any
 
 import optax
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 from gavo_jax.objective import LOSSES
 from gavo_jax.presets import Preset
 
@@ -27,8 +26,8 @@ def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> Non
     for key in keys:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise GavoError(f"{place}: unknown key {short(key)}{hint}")
+            hint = f"; did you mean {shown(near[0])}?" if near else ""
+            raise GavoError(f"{place}: unknown key {shown(key)}{hint}")
 
 
 def override(preset: Preset, values: Mapping[str, Any], place: str = "settings") -> Preset:
@@ -97,17 +96,17 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
     if isinstance(current, str):
         allowed = typing.get_args(typing.get_type_hints(owner)[field])
         if value not in allowed:
-            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {short(value)}")
+            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {shown(value)}")
         return value
     if isinstance(current, bool):
         if not isinstance(value, bool):
-            raise GavoError(f"{where}: must be true or false, not {short(value)}")
+            raise GavoError(f"{where}: must be true or false, not {shown(value)}")
         return value
     if isinstance(current, tuple):
         whole = all(isinstance(entry, int) for entry in current)
         if not isinstance(value, list):
             if whole:
-                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {short(value)}")
+                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {shown(value)}")
             return (_number(where, value, whole),) * len(current)
         if len(value) != len(current):
             raise GavoError(f"{where}: must have {len(current)} entries, not {len(value)}")
@@ -120,7 +119,7 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
 def _callable(where: str, field: str, value: Any) -> Any:
     known = LOSSES if field == "loss" else {name: getattr(optax, name) for name in OPTIMIZERS}
     if not isinstance(value, str):
-        raise GavoError(f"{where}: must be a name, not {short(value)}")
+        raise GavoError(f"{where}: must be a name, not {shown(value)}")
     refuse_unknown(where, [value], known)
     return known[value]
 
@@ -129,7 +128,7 @@ def _number(where: str, value: Any, whole: bool) -> int | float:
     kinds = (int,) if whole else (int, float)
     largest = MAX_WHOLE if whole else MAX_REAL
     if isinstance(value, bool) or not isinstance(value, kinds) or not abs(value) <= largest:
-        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {short(value)}")
+        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {shown(value)}")
     if whole and value < 0:
         raise GavoError(f"{where}: must be at least 0, not {value}")
     return int(value) if whole else float(value)

@@ -28,7 +28,8 @@ def align_batch_sharded(
     """`align_batch` with its B pairs laid out over all devices, one program for all (`shard_map`).
 
     Under `jax.distributed` every process calls it with the same arguments and gets the whole result. The pairs' results
-    agree with those of `align_batch` to rounding, which a random search may enlarge.
+    agree with those of `align_batch` to rounding, since XLA orders the sums of another number of pairs otherwise; a
+    random search enlarges that, within what another seed would change.
 
     Args:
         references: As in `align_batch`.

@@ -15,6 +15,8 @@ from gavo_jax.presets import Preset, get_preset
 
 PAIRS = 11
 """Eight devices do not divide it."""
+GUESS = 0.1
+"""Metres to the side: no search ends where it starts."""
 FIGURES = ("xi", "error", "covariance")
 
 
@@ -36,9 +38,11 @@ def pairs(seed: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, n
 def figures_of(align: Callable[..., Alignment], seed: int = 5) -> dict[str, np.ndarray]:
     """The figures of every pair by every method."""
     references, targets, camera, keys = pairs(seed)
+    guesses = np.tile(np.eye(4, dtype=np.float32), (PAIRS, 1, 1))
+    guesses[:, 0, 3] = GUESS
     figures = {}
     for name, preset in methods().items():
-        found = align(references, targets, camera, preset.solver, keys, options=preset.alignment)
+        found = align(references, targets, camera, preset.solver, keys, guesses, preset.alignment)
         figures |= {f"{name}_{figure}": np.asarray(getattr(found, figure)) for figure in FIGURES}
     return figures
 
