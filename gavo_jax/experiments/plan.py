@@ -348,7 +348,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
-            raise GavoError(f"{place}: sweep: {shown(name)}: not a list of values")
+            raise GavoError(f"{place}: sweep.{_line(name)}: not a list of values")
     variants = []
     for preset in presets:
         for choice in itertools.product(*swept.values()):

@@ -53,7 +53,8 @@ def main(out: str, *distributed: str) -> None:
         address, processes, process = distributed
         jax.distributed.initialize(address, int(processes), int(process))
     figures = figures_of(align_batch_sharded)
-    np.savez(out, devices=np.array([jax.device_count(), jax.local_device_count()]), **figures)
+    figures["devices"] = np.array([jax.device_count(), jax.local_device_count()])
+    np.savez(out, **figures)  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":
