@@ -1,12 +1,23 @@
 """Bad input as one kind of exception, and the text files that users hand in."""
 
+import reprlib
 from pathlib import Path
+from typing import Any
 
 MAX_TEXT_BYTES = 128 * 2**20
+MAX_SHOWN = 100
+"""Characters of a value that a message shows."""
 
 
 class GavoError(ValueError):
     """Input that cannot be used. The message is one line that names the file and says what is wrong with it."""
+
+
+def shown(value: Any) -> str:
+    """Return a value as code would write it, cut to what fits into a message."""
+    cutter = reprlib.Repr()
+    cutter.maxstring = cutter.maxother = cutter.maxlong = MAX_SHOWN
+    return cutter.repr(value)
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -233,6 +233,13 @@ def test_footprint_times_and_weighs_processes(load, tmp_path: Path) -> None:
     assert 100 < short < 4000 and figures["ratio"] == pytest.approx(long / short)
 
 
+def test_together_counts_programs_and_equal_runs(load, tmp_path: Path) -> None:
+    load("together").main(clip=CLIP, methods="gauss-newton", runs=2, repeats=1, json=tmp_path / "together.json")
+    figures = read(tmp_path / "together.json")["gauss-newton"]
+    assert (figures["more_programs"], figures["equal"]) == (0, 2) and figures["ratio"] > 0
+    assert min(figures["core_milliseconds_a_pair"].values()) > 0
+
+
 def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> None:
     calibration: ModuleType = load("calibration")
     calibration.main(frames=3, seeds=1, clips=CLIP, json=tmp_path / "calibration.json")

@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 from gavo_jax.camera import MAX_SIDE, Camera, load_camera
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.experiments.plan import batches, read_plan
+from gavo_jax.experiments.tuning import read_tuning
 from gavo_jax.trajectory import Trajectory
 
 NUMBERS = st.one_of(
@@ -76,6 +78,76 @@ def cameras(sign: str) -> st.SearchStrategy[bytes]:
     return st.one_of(lines(row), st.dictionaries(KEYS, VALUES, max_size=3).map(text))
 
 
+def tables(*sections: tuple[str, dict[str, str]], keys: st.SearchStrategy[str]) -> st.SearchStrategy[bytes]:
+    """TOML files: good ones of which a few values are replaced and a few keys added, and any rows at all."""
+
+    def text(changes: tuple[dict[str, str], ...]) -> bytes:
+        parts = []
+        for (heading, good), changed in zip(sections, changes, strict=True):
+            parts += [heading, *(f"{key} = {value}" for key, value in {**good, **changed}.items() if value)]
+        return "\n".join(parts).encode("utf-8", "surrogatepass")
+
+    rows = st.tuples(keys, SETTINGS).map(lambda pair: f"{pair[0]} = {pair[1]}")
+    headings = st.sampled_from(
+        [heading for heading, _ in sections] + ["[sequences]", "[[methods", "[[ray]]", "[[a.b]]"]
+    )
+    few = [st.dictionaries(st.one_of(st.sampled_from([*good]), keys), SETTINGS, max_size=2) for _, good in sections]
+    one = [st.tuples(*(few[j] if i == j else st.just({}) for j in range(len(few)))) for i in range(len(sections))]
+    return st.one_of(*[changes.map(text) for changes in (*one, st.tuples(*few))], lines(st.one_of(rows, headings)))
+
+
+WORDS = st.sampled_from(
+    """ga pso gauss-newton adam opencv-rgb default fast paper wide none huber l2 synthetic nowhere fr1 auto keyframe
+    *""".split()
+)
+SCALARS = st.one_of(
+    WORDS.map(lambda word: f'"{word}"'),
+    st.integers(0, 12).map(str),
+    st.sampled_from(
+        ["2000000", "-1", "1e-3", "0.5", "true", "false", str(2**70), "nan", "inf", "1979-05-27", "07:32:00"]
+    ),
+    VALUES,
+    st.sampled_from(['"' + "x" * 5000 + '"', r'"a\u0000b"', r'"a\nb"', '"../.."', '"/dev/zero"']),
+    st.text(max_size=8).map(lambda text: f"'{text}'"),
+)
+SETTINGS = st.one_of(
+    SCALARS,
+    st.lists(SCALARS, max_size=5).map(lambda items: "[" + ", ".join(items) + "]"),
+    st.dictionaries(
+        st.sampled_from(["low", "high", "step", "log", "a", "cpus"]), st.one_of(st.integers(0, 12).map(str), SCALARS)
+    ).map(lambda table: "{ " + ", ".join(f"{key} = {value}" for key, value in table.items()) + " }"),
+    st.just(""),
+)
+DOTTED = st.sampled_from(
+    """solver.population solver.population.4 solver.iterations solver.iterations.9 solver.mutation_decay solver.damping
+    solver.patience solver.spread alignment.loss alignment.depth_weight alignment.robust_scale odometry.reference
+    odometry.on_lost odometry sweep.solver.damping sweep.alignment.loss sweep printed printed.synthetic seeds presets
+    name optional camera start frames stride path batch output cpus gpus trials space methods sequences ray "" x solver
+    solver.population.x solver.iterations.² alignment.optimizer""".split()
+)
+PLANS = tables(
+    ("", {"seeds": "2"}),
+    ("[[sequences]]", {"path": '"synthetic"', "frames": "3", "name": '"a"'}),
+    ("[[methods]]", {"name": '"ga"', "presets": '["fast"]', "solver.patience": "5", "sweep.alignment.loss": '["l2"]'}),
+    ("[[methods]]", {"name": '"opencv-rgb"', "printed.a": "0.1"}),
+    ("[ray]", {"cpus": "1"}),
+    keys=DOTTED,
+)
+TUNINGS = tables(
+    ("", {"method": '"gauss-newton"', "preset": '"fast"', "trials": "2"}),
+    ("[[sequences]]", {"path": '"synthetic"', "frames": "3"}),
+    (
+        "[space]",
+        {
+            "solver.damping": "{ low = 1e-6, high = 1e-2, log = true }",
+            "solver.iterations.4": "{ low = 8, high = 9 }",
+            "alignment.loss": '["huber", "l2"]',
+        },
+    ),
+    keys=DOTTED,
+)
+
+
 def read_trajectory(folder: Path, content: bytes) -> None:
     (folder / "file.txt").write_bytes(content)
     trajectory = Trajectory.read_tum(folder / "file.txt")
@@ -103,11 +175,27 @@ def read_camera(suffix: str) -> Callable[[Path, bytes], None]:
     return read
 
 
+def read_experiment(folder: Path, content: bytes) -> None:
+    (folder / "experiment.toml").write_bytes(content)
+    plan = read_plan(folder / "experiment.toml")
+    assert plan.runs and len({run.id for run in plan.runs}) == len(plan.runs) and plan.batch >= 1
+    assert all(run.pairs >= 1 for run in plan.runs) and 0 <= plan.programs <= len(plan.runs)
+    assert sum(len(batch.runs) for batch in batches(plan.runs, plan.batch)) == len(plan.runs)
+
+
+def read_study(folder: Path, content: bytes) -> None:
+    (folder / "tuning.toml").write_bytes(content)
+    tuning = read_tuning(folder / "tuning.toml")
+    assert tuning.parts and tuning.space and tuning.trials >= 1 and tuning.seeds
+
+
 READERS: dict[str, tuple[st.SearchStrategy[Any], Callable[[Path, Any], None]]] = {
     "trajectory": (TRAJECTORIES, read_trajectory),
     "lists": (LISTS, read_lists),
     "toml": (cameras("="), read_camera(".toml")),
     "yaml": (cameras(":"), read_camera(".yaml")),
+    "experiment": (PLANS, read_experiment),
+    "tuning": (TUNINGS, read_study),
 }
 
 

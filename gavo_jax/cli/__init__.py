@@ -42,8 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except GavoError as error:
         return _refuse(str(error))
-    except KeyboardInterrupt:
-        print("gavo: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"gavo: interrupted{interrupt}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         _silence_output()

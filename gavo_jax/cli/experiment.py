@@ -11,11 +11,11 @@ import numpy as np
 from gavo_jax import plots
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Experiment
-from gavo_jax.cli.screen import number, pair_progress, print_table
+from gavo_jax.cli.screen import markdown_table, number, pair_progress, print_table
 from gavo_jax.cli.tracking import save_figure
 from gavo_jax.errors import GavoError, read_text
-from gavo_jax.experiments.executors import LocalExecutor, RayExecutor
-from gavo_jax.experiments.plan import Plan, Run, read_plan
+from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
+from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
@@ -27,11 +27,11 @@ from gavo_jax.results import environment, prepare_folder, write_json
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"
-SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/pair", "together")
+SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/frame", "together")
 COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
 DEFINITION = (
     "Drift: relative pose error over 1 s, RMSE (m/s, deg/s): median over the runs, its quartiles, and what a "
-    "publication prints. Time a pair: median; together: runs that shared the machine while it was taken."
+    "publication prints. Time a frame, decoding included: median; together: runs that shared the machine and its time."
 )
 TEST = (
     "Methods paired by sequence and seed: median of the ratio of their drifts, and p of the two-sided Wilcoxon "
@@ -45,7 +45,7 @@ def experiment(options: Experiment) -> int:
     if options.file == REPORT:
         if options.folder is None:
             raise GavoError("report: which folder? gavo experiment report DIR")
-        return report(options.folder)
+        return report(options.folder, options.markdown)
     if options.folder is not None:
         raise GavoError(f"unexpected argument {str(options.folder)!r}: the folder for results is --output DIR")
     plan = read_plan(options.file, options.output)
@@ -60,14 +60,26 @@ def experiment(options: Experiment) -> int:
         _print_plan(plan, table, runs, executor.slots())
         write_json(plan.folder / PLAN, _record(plan))
         with pair_progress(plan.name, sum(run.pairs for run in runs)) as bar:
-            finished = run_experiment(plan, table, executor, bar.advance)
+            try:
+                finished = run_experiment(plan, table, executor, bar.advance, lambda found: bar.say(_news(found)))
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt(
+                    f": {len(plan.runs) - len(missing(plan, table))} of {len(plan.runs)} runs are in {table.folder}; "
+                    "the same command goes on from there"
+                ) from None
     if finished.faults:
         raise GavoError(f"{len(finished.faults)} batches of runs failed: {'; '.join(finished.faults)}")
-    return report(plan.folder)
+    return report(plan.folder, options.markdown)
 
 
-def report(folder: Path) -> int:
-    """Print the tables of an experiment's folder and write report.html and the figure there."""
+def _news(outcome: Outcome) -> str:
+    runs = outcome.batch.runs
+    labels = ", ".join(dict.fromkeys(run.label for run in runs))
+    return f"{outcome.batch.part.name}: {labels}: {outcome.fault or f'{len(runs)} done'}"
+
+
+def report(folder: Path, markdown: bool = False) -> int:
+    """Print the tables of an experiment's folder, as Markdown if so asked; write report.html and the figure there."""
     rows = Table(folder).read()
     printed, order = _read_record(folder)
     rows.sort(key=lambda row: (order.get((row["sequence"], row["label"]), len(order)), row["seed"] or 0))
@@ -77,11 +89,11 @@ def report(folder: Path) -> int:
     for name in sequences:
         cells = [_summary_row(summary, printed) for summary in summaries if summary.sequence == name]
         tables.append(ReportTable(f"{name}. {DEFINITION}", SUMMARY_COLUMNS, cells))
-        print_table(name, SUMMARY_COLUMNS, cells)
+        _show(name, SUMMARY_COLUMNS, cells, markdown)
     for name in dict.fromkeys(comparison.sequence for comparison in comparisons):
         cells = [_comparison_row(found) for found in comparisons if found.sequence == name]
         tables.append(ReportTable(f"{name}. {TEST}.", COMPARISON_COLUMNS, cells))
-        print_table(f"{name}: first / second", COMPARISON_COLUMNS, cells)
+        _show(f"{name}: first / second", COMPARISON_COLUMNS, cells, markdown)
     states = {_state(row) for row in rows}
     note = "" if len(states) == 1 else f"The rows come from {len(states)} versions of the software or of what it uses."
     print(f"{DEFINITION}\n{TEST}.{' ' if note else ''}{note}")
@@ -92,6 +104,13 @@ def report(folder: Path) -> int:
     )
     print(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
     return 0
+
+
+def _show(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]], markdown: bool) -> None:
+    if markdown:
+        print(f"{title}\n\n{markdown_table(columns, cells)}\n")
+    else:
+        print_table(title, columns, cells)
 
 
 def _state(row: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -111,10 +130,10 @@ def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
     print_table(f"experiment {plan.name}", ("", "runs", "to do", "pairs"), rows)
     for line in plan.skipped:
         print(line)
-    seconds = estimate_seconds(plan, runs, table.read() if table.done() else [], slots)
+    seconds = estimate_seconds(runs, table.read() if table.done() else [], slots)
     print(
         f"{len(plan.runs)} runs, {len(plan.runs) - len(runs)} of them done; {len(runs)} to do in {len(todo)} batches, "
-        f"{plan.programs} compiled programs, about {_duration(seconds)}; results in {plan.folder}"
+        f"{programs(runs)} compiled programs, about {_duration(seconds)}; results in {plan.folder}"
     )
 
 

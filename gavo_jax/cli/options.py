@@ -136,6 +136,8 @@ class Experiment:
         None
     )
     """Folder for the table and the report; what it has already is not run again."""
+    markdown: bool = False
+    """Print the tables of the report as Markdown."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,10 @@ class PairProgress:
         """Count a pair, or several."""
         self._progress.update(self._task, advance=pairs, description=self._label)
 
+    def say(self, line: str) -> None:
+        """Print a line above the bar; also where there is no bar."""
+        self._progress.console.print(Text(line), soft_wrap=True)
+
 
 @contextmanager
 def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgress]:
@@ -59,6 +63,12 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     needed = Measurement.get(unlimited, unlimited.options, table).maximum
     print(title)
     Console(width=max(Console().width, needed)).print(table)
+
+
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a Markdown table whose first column is text and whose others are numbers."""
+    rule = ["---", *["---:"] * (len(columns) - 1)]
+    return "\n".join("| " + " | ".join(map(str, cells)) + " |" for cells in (columns, rule, *rows))
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from gavo_jax.camera import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
-from gavo_jax.errors import GavoError, read_text
-from gavo_jax.experiments.settings import flatten, override, refuse_unknown
+from gavo_jax.errors import GavoError, read_text, shown
+from gavo_jax.experiments.settings import MAX_REAL, flatten, override, refuse_unknown
 from gavo_jax.experiments.together import program_of
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
@@ -114,7 +113,6 @@ class Plan:
         name: Of the experiment.
         folder: Where the results go.
         runs: All runs, sequence by sequence.
-        programs: Number of distinct compiled programs.
         skipped: A line for each optional sequence that is not here.
         printed: Drift that a publication gives, by (sequence, method's label), m/s.
         batch: Most runs that are tracked together.
@@ -124,11 +122,15 @@ class Plan:
     name: str
     folder: Path
     runs: tuple[Run, ...]
-    programs: int
     skipped: tuple[str, ...]
     printed: Mapping[tuple[str, str], float]
     batch: int
     ray: RayOptions
+
+    @property
+    def programs(self) -> int:
+        """Number of compiled programs that all runs take."""
+        return programs(self.runs)
 
 
 def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
@@ -159,15 +161,15 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
             skipped[str(entry["name"])] = lacking
     _refuse_repeated(f"{path}: methods", [variant.label for variant in variants])
     runs: list[Run] = []
-    programs = set()
     if len(parts) * sum(len(variant.seeds) for variant in variants) > MAX_RUNS:
         raise GavoError(f"{path}: more than {MAX_RUNS} runs")
     for part in parts:
-        sequence = part.open()
+        try:
+            sequence = part.open()
+        except GavoError as error:
+            raise GavoError(f"{path}: {_line(error)}") from None
         for variant in variants:
             runs += _runs(part, sequence, variant)
-            if variant.settings is not None:
-                programs.add((jax.tree.structure(sequence.camera), program_of(variant.settings)))
     names = [part.name for part in parts]
     for variant in variants:
         refuse_unknown(f"{path}: printed figures of {variant.label}", variant.printed, (*names, *skipped))
@@ -176,7 +178,7 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     }
     folder = Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}")))
     batch = whole_of(f"{path}: batch", table.get("batch", BATCH), 1)
-    return Plan(name, folder, tuple(runs), len(programs), tuple(skipped.values()), printed, batch, _ray(path, table))
+    return Plan(name, folder, tuple(runs), tuple(skipped.values()), printed, batch, _ray(path, table))
 
 
 def read_toml(path: Path, keys: Sequence[str]) -> dict[str, Any]:
@@ -188,7 +190,7 @@ def read_toml(path: Path, keys: Sequence[str]) -> dict[str, Any]:
     try:
         table = tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise GavoError(f"{path}: not TOML: {' '.join(str(error).split())}") from None
+        raise GavoError(f"{path}: not TOML: {_line(error)}") from None
     refuse_unknown(str(path), table, keys)
     return table
 
@@ -204,6 +206,11 @@ def batches(runs: Iterable[Run], size: int) -> list[Batch]:
         for group in groups.values()
         for first in range(0, len(group), size)
     ]
+
+
+def programs(runs: Iterable[Run]) -> int:
+    """Number of distinct compiled programs that the runs take."""
+    return len({(run.pixels, program_of(run.settings)) for run in runs if run.settings is not None})
 
 
 def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
@@ -244,10 +251,10 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
         patterns = [text_of(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
         found = _find(path.parent, patterns)
         if not found:
-            line = f"{', '.join(patterns)}: no such folder here, beside {path.name}, or in {DATA}"
+            line = f"{_line(', '.join(patterns))}: no such folder here, beside {path.name}, or in {DATA}"
             if not _flag(f"{place}: optional", entry.get("optional", False)):
                 raise GavoError(f"{place}: {line}")
-            name = entry.get("name", patterns[0])
+            name = text_of(f"{place}: name", entry.get("name", patterns[0]))
             skipped[name] = f"skipped {name}: {line} (gavo download gets TUM's sequences)"
         if len(found) > 1 and "name" in entry:
             raise GavoError(f"{place}: name: {len(found)} sequences cannot have one name")
@@ -276,10 +283,13 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
     frames = None if "frames" not in entry else whole_of(f"{place}: frames", entry["frames"], 2)
     stride = whole_of(f"{place}: stride", entry.get("stride", 1), 1)
     camera = text_of(f"{place}: camera", entry.get("camera", "auto"))
-    if (beside / camera).is_file():
-        camera = str(beside / camera)
-    if camera != "auto":
-        load_camera(camera)
+    try:
+        if os.path.isfile(beside / camera):
+            camera = str(beside / camera)
+        if camera != "auto":
+            load_camera(camera)
+    except GavoError as error:
+        raise GavoError(f"{place}: camera: {_line(error)}") from None
     name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
     if "name" not in entry and (start, frames, stride) != (0, None, 1):
         name = f"{name}[{start}:{'' if frames is None else start + frames * stride}:{stride}]"
@@ -338,7 +348,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
-            raise GavoError(f"{place}: sweep.{name}: not a list of values")
+            raise GavoError(f"{place}: sweep.{_line(name)}: not a list of values")
     variants = []
     for preset in presets:
         for choice in itertools.product(*swept.values()):
@@ -389,33 +399,38 @@ def _tables(place: str, value: Any) -> list[dict[str, Any]]:
 def text_of(place: str, value: Any) -> str:
     """Return a text that is not empty, or raise GavoError."""
     if not isinstance(value, str) or not value:
-        raise GavoError(f"{place}: must be text, not {value!r}")
+        raise GavoError(f"{place}: must be text, not {shown(value)}")
     return value
 
 
 def _flag(place: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise GavoError(f"{place}: must be true or false, not {value!r}")
+        raise GavoError(f"{place}: must be true or false, not {shown(value)}")
     return value
 
 
 def whole_of(place: str, value: Any, least: int) -> int:
     """Return a whole number of at least so much, or raise GavoError."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise GavoError(f"{place}: must be a whole number of at least {least}, not {value!r}")
+        raise GavoError(f"{place}: must be a whole number of at least {least}, not {shown(value)}")
     return value
 
 
 def _real(place: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
-        raise GavoError(f"{place}: must be a number of at least 0, not {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= MAX_REAL:
+        raise GavoError(f"{place}: must be a number of at least 0, not {shown(value)}")
     return float(value)
 
 
 def _refuse_repeated(place: str, values: Sequence[Any]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise GavoError(f"{place}: {value} is given twice")
+            raise GavoError(f"{place}: {shown(value)} is given twice")
+
+
+def _line(words: Any) -> str:
+    """What fits into a line of a message."""
+    return " ".join(str(words).split())[:400]
 
 
 def _short(value: Any) -> str:

@@ -5,15 +5,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gavo_jax.experiments.executors import Executor
-from gavo_jax.experiments.plan import Batch, Plan, Run, batches
+from gavo_jax.experiments.executors import Executor, Outcome
+from gavo_jax.experiments.plan import Batch, Plan, Run, batches, programs
 from gavo_jax.experiments.table import Table
 
-MILLISECONDS = {"ga": 110.0, "pso": 110.0, "gauss-newton": 50.0, "adam": 90.0}
-"""A pair at 640 x 480 by the default preset on two cores, for a plan's estimate before anything was measured."""
-PRESET_FACTOR = {"default": 1.0, "fast": 0.5, "paper": 20.0, "wide": 6.0}
-PEER_MILLISECONDS = 40.0
-COMPILE_SECONDS = 25.0
+MILLISECONDS = {"ga": 40.0, "pso": 60.0, "gauss-newton": 40.0, "adam": 60.0}
+"""A frame of 640 x 480 by the default preset on two cores, for a plan's estimate before anything was measured."""
+PRESET_FACTOR = {"default": 1.0, "fast": 0.8, "paper": 12.0, "wide": 6.0}
+PEER_MILLISECONDS = 120.0
+COMPILE_SECONDS = 20.0
 PIXELS = 640 * 480
 
 
@@ -37,13 +37,13 @@ def fitted_batches(runs: Sequence[Run], largest: int, slots: int) -> list[Batch]
     return batches(runs, max(1, min(largest, -(-len(runs) // slots))))
 
 
-def estimate_seconds(plan: Plan, runs: Sequence[Run], rows: Iterable[Mapping[str, Any]], slots: int) -> float:
+def estimate_seconds(runs: Sequence[Run], rows: Iterable[Mapping[str, Any]], slots: int) -> float:
     """How long the runs will take, roughly: by the table's own times of the same label, else by `MILLISECONDS`."""
     measured: dict[str, list[float]] = {}
     for row in rows:
         if row["frames_per_second"]:
             measured.setdefault(row["label"], []).append(1e3 / row["frames_per_second"] * PIXELS / row["pixels"])
-    seconds = COMPILE_SECONDS * (plan.programs if runs else 0)
+    seconds = COMPILE_SECONDS * programs(runs)
     for run in runs:
         typical = MILLISECONDS.get(run.method, PEER_MILLISECONDS) * PRESET_FACTOR.get(run.preset, 1.0)
         milliseconds = float(np.median(measured[run.label])) if run.label in measured else typical
@@ -52,7 +52,11 @@ def estimate_seconds(plan: Plan, runs: Sequence[Run], rows: Iterable[Mapping[str
 
 
 def run_experiment(
-    plan: Plan, table: Table, executor: Executor, on_pairs: Callable[[int], None] = lambda _: None
+    plan: Plan,
+    table: Table,
+    executor: Executor,
+    on_pairs: Callable[[int], None] = lambda _: None,
+    on_outcome: Callable[[Outcome], None] = lambda _: None,
 ) -> Finished:
     """Run what the table does not have yet and append each row as soon as it is known.
 
@@ -61,6 +65,7 @@ def run_experiment(
         table: Where it goes; other processes may append to it meanwhile.
         executor: Who runs it.
         on_pairs: Hears of pairs that are done.
+        on_outcome: Hears of each batch when its rows are in the table.
 
     Raises:
         GavoError: the table cannot be written.
@@ -74,4 +79,5 @@ def run_experiment(
         if outcome.fault is not None:
             labels = ", ".join(dict.fromkeys(run.label for run in outcome.batch.runs))
             faults.append(f"{outcome.batch.part.name}: {labels}: {outcome.fault}")
+        on_outcome(outcome)
     return Finished(rows, faults)

@@ -2,14 +2,13 @@
 
 import dataclasses
 import difflib
-import math
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import optax
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 from gavo_jax.objective import LOSSES
 from gavo_jax.presets import Preset
 
@@ -17,6 +16,8 @@ ROOMS = tuple(field.name for field in dataclasses.fields(Preset))
 """First part of a dotted name: the parts of a preset."""
 OPTIMIZERS = ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 """optax's optimisers that need nothing but a learning rate."""
+MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
+"""What the device's numbers hold."""
 
 
 def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> None:
@@ -25,8 +26,8 @@ def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> Non
     for key in keys:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise GavoError(f"{place}: unknown key {key!r}{hint}")
+            hint = f"; did you mean {shown(near[0])}?" if near else ""
+            raise GavoError(f"{place}: unknown key {shown(key)}{hint}")
 
 
 def override(preset: Preset, values: Mapping[str, Any], place: str = "settings") -> Preset:
@@ -95,17 +96,17 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
     if isinstance(current, str):
         allowed = typing.get_args(typing.get_type_hints(owner)[field])
         if value not in allowed:
-            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {value!r}")
+            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {shown(value)}")
         return value
     if isinstance(current, bool):
         if not isinstance(value, bool):
-            raise GavoError(f"{where}: must be true or false, not {value!r}")
+            raise GavoError(f"{where}: must be true or false, not {shown(value)}")
         return value
     if isinstance(current, tuple):
         whole = all(isinstance(entry, int) for entry in current)
         if not isinstance(value, list):
             if whole:
-                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {value!r}")
+                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {shown(value)}")
             return (_number(where, value, whole),) * len(current)
         if len(value) != len(current):
             raise GavoError(f"{where}: must have {len(current)} entries, not {len(value)}")
@@ -118,15 +119,16 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
 def _callable(where: str, field: str, value: Any) -> Any:
     known = LOSSES if field == "loss" else {name: getattr(optax, name) for name in OPTIMIZERS}
     if not isinstance(value, str):
-        raise GavoError(f"{where}: must be a name, not {value!r}")
+        raise GavoError(f"{where}: must be a name, not {shown(value)}")
     refuse_unknown(where, [value], known)
     return known[value]
 
 
 def _number(where: str, value: Any, whole: bool) -> int | float:
     kinds = (int,) if whole else (int, float)
-    if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
-        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {value!r}")
+    largest = MAX_WHOLE if whole else MAX_REAL
+    if isinstance(value, bool) or not isinstance(value, kinds) or not abs(value) <= largest:
+        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {shown(value)}")
     if whole and value < 0:
         raise GavoError(f"{where}: must be at least 0, not {value}")
     return int(value) if whole else float(value)

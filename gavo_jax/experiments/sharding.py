@@ -1,12 +1,10 @@
 """The batch axis of one program over many devices: this machine's, or all that `jax.distributed` joins."""
 
-import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax._src import distributed
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
@@ -30,7 +28,8 @@ def align_batch_sharded(
     """`align_batch` with its B pairs laid out over all devices, one program for all (`shard_map`).
 
     Under `jax.distributed` every process calls it with the same arguments and gets the whole result. The pairs' results
-    agree with those of `align_batch` to rounding, which a random search may enlarge.
+    agree with those of `align_batch` to rounding, since XLA orders the sums of another number of pairs otherwise; a
+    random search enlarges that, within what another seed would change.
 
     Args:
         references: As in `align_batch`.
@@ -61,21 +60,8 @@ def align_batch_sharded(
 
     align_all = jax.jit(jax.shard_map(align_own, mesh=mesh, in_specs=PAIRS, out_specs=PAIRS, check_vma=False))
     rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), guesses)
-    found = jax.block_until_ready(align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows)))
-    _wait_for_all()
+    found = align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows))
     return jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found)
-
-
-_meetings = itertools.count()
-WAIT = 3600
-"""Seconds until a process that never comes is missed."""
-
-
-def _wait_for_all() -> None:
-    """Wait until all processes are here: collectives on CPUs miss one that compiles for half a minute longer."""
-    client = distributed.global_state.client
-    if client is not None:
-        client.wait_at_barrier(f"gavo_align_batch_sharded_{next(_meetings)}", WAIT * 1000)
 
 
 def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:

@@ -26,9 +26,9 @@ class Summary(NamedTuple):
     lost: int
     """Lost pairs of the worst run."""
     milliseconds: float
-    """Median over the runs of the median time a pair."""
+    """Median over the runs of the machine's time a frame, decoding included."""
     together: int
-    """Most runs that shared the machine while that time was taken."""
+    """Most runs that shared the machine, and its time."""
 
 
 class Comparison(NamedTuple):
@@ -41,8 +41,7 @@ class Comparison(NamedTuple):
     ratio: float
     """Median of first / second drift over the pairs."""
     p: float | None
-    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero or there is
-    a single pair."""
+    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Summary]:
@@ -64,13 +63,13 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
         None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
         float(np.median(turns)) if turns else None,
         max(row["lost_pairs"] for row in rows),
-        float(np.median([row["milliseconds_per_pair_median"] for row in rows])),
+        float(np.median([1e3 / row["frames_per_second"] for row in rows])),
         max(row["runs_together"] for row in rows),
     )
 
 
 def compare(rows: Sequence[Row]) -> list[Comparison]:
-    """Each two labels on each sequence, and over all where there are several.
+    """Each two labels on each sequence, and over all where there are several; a single pair is no comparison.
 
     A method that ran once on a sequence (it has no randomness) stands against every seed of the other.
     """
@@ -84,7 +83,7 @@ def compare(rows: Sequence[Row]) -> list[Comparison]:
         matched = {name: _matched(drifts[first].get(name, {}), drifts[second].get(name, {})) for name in sequences}
         if len(sequences) > 1:
             matched[ALL] = list(itertools.chain(*matched.values()))
-        found += [_test(name, first, second, pairs) for name, pairs in matched.items() if pairs]
+        found += [_test(name, first, second, pairs) for name, pairs in matched.items() if len(pairs) > 1]
     return sorted(found, key=lambda comparison: [*sequences, ALL].index(comparison.sequence))
 
 
@@ -100,6 +99,5 @@ def _test(sequence: str, first: str, second: str, pairs: Sequence[tuple[float, f
     from scipy.stats import wilcoxon
 
     a, b = np.array(pairs).T
-    differ = len(pairs) > 1 and bool(np.any(a != b))
-    p = float(np.asarray(wilcoxon(a, b))[1]) if differ else None
+    p = float(np.asarray(wilcoxon(a, b))[1]) if np.any(a != b) else None
     return Comparison(sequence, first, second, len(pairs), float(np.median(a / b)), p)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
 from gavo_jax.experiments.settings import flatten, override, refuse_unknown
 from gavo_jax.odometry import run_odometry
@@ -166,8 +166,10 @@ def _bounds(place: str, spec: Any) -> list[Any]:
     step, log = spec.get("step"), spec.get("log", False)
     if not isinstance(log, bool) or (log and (step is not None or ends[0] <= 0)):
         raise GavoError(f"{place}: log: true or false; a logarithmic range starts above 0 and has no step")
-    if step is not None and (isinstance(step, bool) or not isinstance(step, int | float) or step <= 0):
-        raise GavoError(f"{place}: step: must be a number above 0, not {step!r}")
+    if step is not None and (isinstance(step, bool) or not isinstance(step, int | float)):
+        raise GavoError(f"{place}: step: must be a number, not {shown(step)}")
+    if step is not None and not 0 < step <= ends[1] - ends[0]:
+        raise GavoError(f"{place}: step: must be above 0 and at most high - low, not {shown(step)}")
     return ends
 
 

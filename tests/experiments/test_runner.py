@@ -44,9 +44,15 @@ class Interrupted(LocalExecutor):
         raise KeyboardInterrupt
 
 
+def test_an_interrupted_command_says_what_is_kept(small, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gavo_jax.cli.experiment.LocalExecutor", Interrupted)
+    assert main(["experiment", str(small), "--output", str(tmp_path / "out")]) == 130
+    assert "gavo: interrupted: 2 of 4 runs are in" in capsys.readouterr().err
+
+
 def test_interrupted_and_resumed(small, tmp_path):
     plan, table = read_plan(small, tmp_path / "out"), Table(tmp_path / "out")
-    assert len(missing(plan, table)) == 4 and estimate_seconds(plan, plan.runs, [], 1) > 0
+    assert len(missing(plan, table)) == 4 and estimate_seconds(plan.runs, [], 1) > 0
     with pytest.raises(KeyboardInterrupt):
         run_experiment(plan, table, Interrupted())
     kept = {row["run"]: row["finished"] for row in table.read()}
@@ -98,9 +104,12 @@ def test_command(small, tmp_path, capsys):
     planned = capsys.readouterr().out
     assert "4 runs, 0 of them done; 4 to do in 3 batches, 1 compiled programs" in planned and not out.exists()
     assert main(["experiment", str(small), "--output", str(out)]) == 0
-    printed = capsys.readouterr().out
+    printed, news = capsys.readouterr()
     assert "0.04000" in printed and "Wilcoxon" in printed
+    assert news.splitlines()[0] == "synthetic: gauss-newton, iterations=[0, 0, 6, 6, 8]: 2 done"
     assert (out / "report.html").stat().st_size and (out / "drift.svg").stat().st_size
+    assert main(["experiment", "report", str(out), "--markdown"]) == 0
+    assert "| gauss-newton, iterations=[0, 0, 6, 6, 8] | 3 | 0.0" in capsys.readouterr().out
     assert main(["experiment", "report", str(out)]) == 0
     again = capsys.readouterr().out
     assert again.splitlines()[-1] == printed.splitlines()[-1] and again.splitlines()[1] in printed
