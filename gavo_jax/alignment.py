@@ -191,7 +191,7 @@ MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
 """Radians, likewise for the rotation."""
-MAX_RIVAL = 1.05
+MAX_RIVAL = 1.1
 """Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only islands that compete can tell."""
 
 

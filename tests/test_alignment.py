@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -264,6 +265,45 @@ def test_an_undetermined_direction_is_named(sequence: SyntheticSequence) -> None
     assert result.undetermined.startswith("translation along y") and result.undetermined in result.sentence
     textured = run("gauss-newton", sequence[0], sequence[1], sequence.camera)
     assert textured.undetermined == "" and textured.sentence == textured.status.sentence
+
+
+def wide_search(reference: Any, target: Any, camera: Camera, **changes: Any) -> Alignment:
+    preset = get_preset("ga", "wide")
+    return align(reference, target, camera, solver=preset.solver, options=replace(preset.alignment, **changes))
+
+
+def wallpaper(sequence: SyntheticSequence, shift: float, repeats: bool) -> tuple[Any, Any]:
+    """A wall 1 m ahead, moved by some pixels to the side; its pattern may repeat every 160 pixels."""
+    height, width = sequence.camera.height, sequence.camera.width
+    u, v = np.arange(width) - shift, np.arange(height)[:, None]
+    phase = 2 * np.pi * u / 160 + 2 * np.sin(v / 60)
+    grey = 110 + 50 * np.sin(phase) + (0.0 if repeats else 60 * np.sin(u / 200 + v / 90))
+    clouds = np.random.default_rng(int(shift)).normal(0, 5, (24, 32))
+    grey = grey + cv2.resize(clouds, (width, height), interpolation=cv2.INTER_CUBIC)
+    depth = np.full((height, width), sequence.camera.depth_scale)
+    return np.clip(grey, 0, 255).astype(np.uint8), depth.astype(np.uint16)
+
+
+def test_a_pattern_that_repeats_is_ambiguous(sequence: SyntheticSequence) -> None:
+    near = {"scout_spread": (0.15, 0.02)}
+    results = [
+        wide_search(wallpaper(sequence, 0, repeats), wallpaper(sequence, shift, repeats), sequence.camera, **near)
+        for repeats, shift in ((True, 80), (False, 40))
+    ]
+    assert results[0].status is AlignmentStatus.AMBIGUOUS
+    assert results[1].status is AlignmentStatus.OK
+    assert abs(results[1].xi[0] - 40 / sequence.camera.fx) < 0.005
+
+
+def test_exposure_does_not_hide_a_large_motion(sequence: SyntheticSequence) -> None:
+    bright = frame_with(sequence[0], 40.0)
+    result = wide_search(bright, sequence[14], sequence.camera)
+    metres, degrees = difference(result.target_T_reference, target_T_reference(sequence, 0, 14))
+    assert metres < 0.01 and degrees < 0.3
+
+
+def frame_with(frame: Frame, brighter: float) -> Frame:
+    return replace(frame, grey=np.clip(frame.grey + brighter, 0, 255).astype(np.uint8))
 
 
 def test_statuses_say_a_sentence() -> None:
