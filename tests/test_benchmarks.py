@@ -241,3 +241,11 @@ def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> 
     for row in (synthetic, clip):
         assert 0.5 < row["mean"] < 30 and row["share_within"] > 0.5
         assert 0 < row["millimetres"] < 5
+
+
+def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
+    load("viewer").main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
+    figures = read(tmp_path / "viewer.json")["methods"]["gauss-newton"]
+    [without], [saved] = figures["runs"]["none"], figures["runs"]["save"]
+    assert figures["ratio"] == pytest.approx(saved["milliseconds"] / without["milliseconds"])
+    assert without["megabytes"] == 0 < figures["megabytes"] < 1
