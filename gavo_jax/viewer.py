@@ -396,7 +396,9 @@ class Scene:
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
         self._shown: deque[Shown] = deque(maxlen=8)
         """The last frames that could be read; an older one is never a reference."""
+        # in the order of sending: particles, which are shown at their own frame alone, are there before the time moves on
         self._archetypes: dict[str, Any] = {
+            "search/particles": rr.Points3D,
             "world/camera": rr.Transform3D,
             "world/camera/image": rr.EncodedImage,
             "world/camera/cloud": rr.Points3D,
@@ -405,7 +407,6 @@ class Scene:
             "curves/rmse": rr.Scalars,
             "curves/distance_error": rr.Scalars,
             **{f"images/{name}": rr.EncodedImage for name in IMAGES},
-            "search/particles": rr.Points3D,
             "search/bounds": rr.Boxes3D,
             "search/error": rr.Arrows3D,
             "search/truth": rr.LineStrips3D,
