@@ -228,7 +228,9 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """
     paths = [Path(folder) / f"{name}.{suffix}" for suffix in FORMATS]
     for path in paths:
-        options = {"metadata": {"Date": None}} if path.suffix == ".svg" else {"pil_kwargs": {"optimize": True}}
+        options: dict[str, Any] = (
+            {"metadata": {"Date": None}} if path.suffix == ".svg" else {"pil_kwargs": {"optimize": True}}
+        )
         try:
             figure.savefig(path, dpi=120, **options)
         except OSError as error:

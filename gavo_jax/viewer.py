@@ -396,7 +396,7 @@ class Scene:
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
         self._shown: deque[Shown] = deque(maxlen=8)
         """The last frames that could be read; an older one is never a reference."""
-        # in the order of sending: particles, which are shown at their own frame alone, are there before the time moves on
+        # in the order of sending: particles, shown at their own frame alone, are there before the time moves on
         self._archetypes: dict[str, Any] = {
             "search/particles": rr.Points3D,
             "world/camera": rr.Transform3D,

@@ -183,8 +183,14 @@ def test_warping_back_gives_the_reference():
     assert seen.mean() > 0.7 and error(warped) < 0.5 * error(still)
     colors = viewer.color_residual(warped, reference.grey, seen)
     assert not colors[~seen].any()
-    far_above = seen & (warped.astype(float) - reference.grey > viewer.RESIDUAL_RANGE)
-    assert far_above.any() and np.all(colors[far_above] == viewer.VERMILION[::-1])
+
+
+def test_residuals_are_blue_below_and_vermilion_above():
+    bright, dark = np.full((2, 3), 200, np.uint8), np.full((2, 3), 100, np.uint8)
+    seen = np.array([[True, True, False]] * 2)
+    for warped, reference, color in ((bright, dark, viewer.VERMILION), (dark, bright, viewer.BLUE)):
+        colors = viewer.color_residual(warped, reference, seen)
+        assert np.all(colors[seen] == color[::-1]) and not colors[~seen].any()
 
 
 def test_no_viewer_asks_for_nothing(tmp_path):
