@@ -182,6 +182,7 @@ def main(
     seeds: int = 1,
     json: Path | None = None,
     figure: Path | None = None,
+    recorded: str = "",
 ) -> dict[str, Any]:
     """Measure, print and return the figures.
 
@@ -193,7 +194,13 @@ def main(
         seeds: tries of each of our methods.
         json: file for every attempt and the rates.
         figure: folder for basin.png and basin.svg.
+        recorded: files of earlier `json`, with commas between, to draw together; nothing is measured.
     """
+    if recorded:
+        found = common.read_records(recorded, "basin")
+        attempts = [attempt for one in found for attempt in one["attempts"]]
+        _draw(attempts, found[0]["clip"], figure or Path())
+        return {"attempts": attempts}
     sequence = common.open_clip(clip)
     sequence.check()
     aligners = {name: make_aligner(name, sequence.camera) for name in common.names(methods)}
@@ -220,10 +227,15 @@ def main(
     results = {"clip": clip, "success": rates, "status": agreement, "attempts": records}
     common.record(json, "basin", results)
     if figure is not None:
-        motion = np.array([row["motion_deg"] for row in rates])
-        success = {name: np.array([row["success"][name] for row in rates]) for name in aligners}
-        common.save_figure(plots.plot_basin(motion, success, clip), figure, "basin")
+        _draw(records, clip, figure)
     return results
+
+
+def _draw(records: list[dict[str, Any]], clip: str, folder: Path) -> None:
+    rates = success_rates(records)
+    motion = np.array([row["motion_deg"] for row in rates])
+    success = {name: np.array([row["success"][name] for row in rates]) for name in rates[0]["success"]}
+    common.save_figure(plots.plot_basin(motion, success, clip), folder, "basin")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What the benchmarks share: clips and methods by name, drift over seeds, tables and the record of a run."""
 
+import json
 import os
 import platform
 import sys
@@ -228,6 +229,24 @@ def record(path: Path | None, benchmark: str, results: dict[str, Any]) -> None:
     """Write the results as JSON beside what they depend on: date, machine, versions; nothing where path is None."""
     if path is not None:
         write_json(path, {"benchmark": benchmark, **machine(), **results})
+
+
+def read_records(paths: str, benchmark: str) -> list[dict[str, Any]]:
+    """Return what `record` wrote into files, with commas between.
+
+    Raises:
+        GavoError: a file cannot be read or is not of that benchmark.
+    """
+    records = []
+    for path in names(paths):
+        try:
+            found = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise GavoError(f"{path}: cannot be read: {error}") from None
+        if not isinstance(found, dict) or found.get("benchmark") != benchmark:
+            raise GavoError(f"{path}: was not written by {benchmark}.py --json")
+        records.append(found)
+    return records
 
 
 def save_figure(figure: Any, folder: Path, name: str) -> None:

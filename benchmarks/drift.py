@@ -8,6 +8,7 @@ which need not be the same one) and of the GA to Gauss-Newton, clip by clip, wit
     python benchmarks/drift.py
     python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
     python benchmarks/drift.py --figure docs
+    python benchmarks/drift.py --recorded ours.json,peers.json --figure docs
 
 Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
 METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
@@ -82,6 +83,7 @@ def main(
     seeds: int = 5,
     json: Path | None = None,
     figure: Path | None = None,
+    recorded: str = "",
 ) -> dict[str, Any]:
     """Measure, print and return the figures.
 
@@ -91,7 +93,12 @@ def main(
         seeds: runs of each of our methods.
         json: file for all runs and the summary.
         figure: folder for drift.png and drift.svg.
+        recorded: files of earlier `json`, with commas between, to draw together; nothing is measured.
     """
+    if recorded:
+        earlier = [run for found in common.read_records(recorded, "drift") for run in found["runs"]]
+        _draw(earlier, figure or Path())
+        return {"runs": earlier}
     runs = common.measure_drift(common.names(clips), common.parse_methods(methods), seeds)
     summaries = common.summarise(runs)
     for clip in common.names(clips):
@@ -111,9 +118,13 @@ def main(
     }
     common.record(json, "drift", results)
     if figure is not None:
-        ours = [contender for contender in common.names(methods) if contender not in PEERS]
-        common.save_figure(plots.plot_drift(drifts(runs), ours), figure, "drift")
+        _draw(runs, figure)
     return results
+
+
+def _draw(runs: list[dict[str, Any]], folder: Path) -> None:
+    ours = [name for name in dict.fromkeys(run["name"] for run in runs) if name not in PEERS]
+    common.save_figure(plots.plot_drift(drifts(runs), ours), folder, "drift")
 
 
 if __name__ == "__main__":

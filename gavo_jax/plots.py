@@ -179,7 +179,7 @@ def plot_basin(motion: Float[np.ndarray, " n"], success: Mapping[str, Float[np.n
         success: share of the pairs found, by method.
         title: what the pairs are of.
     """
-    figure = _figure(7.0, 4.6, "basin")
+    figure = _figure(9.0, 4.6, "basin")
     axes = figure.add_subplot()
     order = np.argsort(motion)
     for (name, rates), style in zip(success.items(), _styles(), strict=False):
@@ -187,7 +187,7 @@ def plot_basin(motion: Float[np.ndarray, " n"], success: Mapping[str, Float[np.n
     axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
     axes.set(ylim=(-0.03, 1.03), xlim=(0, None))
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    figure.legend(fontsize="small", loc="outside right upper")
     return figure
 
 
@@ -199,7 +199,7 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
         ours: which of the methods are the project's own.
     """
     rows = max(len(methods) for methods in clips.values())
-    figure = _figure(9.0, (0.9 + 0.26 * rows) * len(clips) + 0.6, "drift")
+    figure = _figure(9.0, (0.9 + 0.2 * rows) * len(clips) + 0.6, "drift")
     panels = figure.subplots(len(clips), 2, squeeze=False)
     for (clip, methods), pair in zip(clips.items(), panels, strict=True):
         for column, (axes, label) in enumerate(zip(pair, ("translation (m/s)", "rotation (deg/s)"), strict=True)):
@@ -209,8 +209,9 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
                 style = {"color": COLORS[0]} if name in ours else {"color": "#DDDDDD", "hatch": "//"}
                 spread = [[middle - values.min()], [values.max() - middle]] if len(values) > 1 else None
                 axes.barh(place, middle, xerr=spread, edgecolor="black", linewidth=0.5, capsize=2, **style)
-                axes.annotate(f" {middle:.3g}", (values.max(), place), va="center", fontsize=7)
-            axes.set_yticks(range(len(methods)), list(methods) if column == 0 else [""] * len(methods))
+                axes.annotate(f" {middle:#.3g}", (values.max(), place), va="center", fontsize=7)
+            names = list(methods) if column == 0 else [""] * len(methods)
+            axes.set_yticks(range(len(methods)), names, fontsize="small")
             axes.invert_yaxis()
             axes.margins(x=0.15)
             axes.set(xlabel=label, title=clip)
@@ -227,9 +228,11 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """
     paths = [Path(folder) / f"{name}.{suffix}" for suffix in FORMATS]
     for path in paths:
-        metadata = {"Date": None} if path.suffix == ".svg" else None
+        options: dict[str, Any] = (
+            {"metadata": {"Date": None}} if path.suffix == ".svg" else {"pil_kwargs": {"optimize": True}}
+        )
         try:
-            figure.savefig(path, dpi=150, metadata=metadata)
+            figure.savefig(path, dpi=120, **options)
         except OSError as error:
             raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
     return paths

@@ -17,13 +17,13 @@ import time
 import webbrowser
 from collections import deque
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8, UInt32
 
 from gavo_jax.alignment import Population
 from gavo_jax.camera import Camera
@@ -49,14 +49,20 @@ RESIDUAL_RANGE = 40.0
 """Grey levels at which the residual image's colours saturate."""
 MILLIMETRES = 1e3
 """Of the search space: its particles lie millimetres apart."""
-WAITING_FRAMES = 4
+WAITING_FRAMES = 8
 """Frames that wait to be shown before the run waits for them."""
+SECONDS_TOGETHER = 0.25
+"""What is shown within this time is sent together; a window lags behind the run by at most this."""
 MEMORY = "512MiB"
 """What the server of the web viewer keeps for browsers that come later."""
 HOST, GRPC_PORT, WEB_PORT = "127.0.0.1", 9876, 9090
 """Where the web viewer is found: on this machine only; at other ports where something else is at these."""
+WINDOW_SECONDS = 1.0
+"""After which a window that found no screen would have ended."""
 PATIENCE = 60.0
 """Seconds for the server to start, and for the last frames to arrive."""
+NOTHING_NEW: Any = ()
+"""In place of a frame, where none came for a while."""
 GUARD = """
 import os, signal, subprocess, sys
 subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
@@ -64,6 +70,14 @@ sys.stdin.read()
 os.killpg(0, signal.SIGTERM)
 """
 """Serves until its standard input closes, which it does however the run ends; Ctrl-C does not reach it."""
+
+IMAGES = {
+    "reference": "Reference",
+    "target": "Target",
+    "warped": "Target, warped",
+    "residual": "Residual (blue below, orange above)",
+}
+"""Entities below `images`, and the titles of their views."""
 
 BLUE, WHITE, VERMILION, GREEN = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115)
 GREY, DARK = (120, 120, 120), (24, 26, 32)
@@ -142,7 +156,7 @@ class RerunViewer(Viewer):
         self._queue: Queue[Any] = Queue(WAITING_FRAMES)
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
-        self._server: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
 
     def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         """Open window, server or file, send the layout, and start the thread.
@@ -202,12 +216,27 @@ class RerunViewer(Viewer):
             if self.mode == "save":
                 stream.save(self.recording)
             elif self.mode == "spawn":
-                stream.spawn(hide_welcome_screen=True)
+                self._open_window(stream)
             else:
                 self._serve(stream)
         except (OSError, RuntimeError) as error:
             where = f"{self.recording}: cannot be written" if self.mode == "save" else f"--viewer {self.mode}"
             raise GavoError(f"{where}: {error}") from None
+
+    def _open_window(self, stream: RecordingStream) -> None:
+        """Start Rerun's own program, which stays when the run ends; unlike Rerun's call, for this machine alone."""
+        port, quiet = _free_port(GRPC_PORT), subprocess.DEVNULL
+        command = [sys.executable, "-m", "rerun", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
+        self._process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        try:
+            _await_port(port, self._process)
+            self._process.wait(timeout=WINDOW_SECONDS)
+        except subprocess.TimeoutExpired:
+            stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
+            return
+        except RuntimeError:
+            pass
+        raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
 
     def _serve(self, stream: RecordingStream) -> None:
         """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
@@ -216,11 +245,11 @@ class RerunViewer(Viewer):
         command = [sys.executable, "-c", GUARD]
         command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
         quiet = subprocess.DEVNULL
-        self._server = subprocess.Popen(
+        self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
         )
         for served in (port, page):
-            _await_port(served)
+            _await_port(served, self._process)
         address = f"rerun+http://{HOST}:{port}/proxy"
         stream.connect_grpc(address)
         self.url = f"http://{HOST}:{page}/?url={quote(address, safe='')}"
@@ -229,12 +258,21 @@ class RerunViewer(Viewer):
             webbrowser.open(self.url)
 
     def _work(self, scene: Scene) -> None:
-        while (item := self._queue.get()) is not None:
-            if self._fault is None:
-                try:
+        """Add what is queued to the scene, and send it every `SECONDS_TOGETHER`, until None comes."""
+        sent, item = time.monotonic(), NOTHING_NEW
+        while item is not None:
+            try:
+                item = self._queue.get(timeout=SECONDS_TOGETHER)
+            except Empty:
+                item = NOTHING_NEW
+            try:
+                if item and self._fault is None:
                     scene.add(*item)
-                except Exception as fault:
-                    self._fault = fault
+                if not item or time.monotonic() - sent > SECONDS_TOGETHER:
+                    scene.send()
+                    sent = time.monotonic()
+            except Exception as fault:
+                self._fault = fault
 
     def _raise_fault(self) -> None:
         if self._fault is not None:
@@ -245,19 +283,19 @@ def _has_screen() -> bool:
     return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
 
 
-def _await_port(port: int) -> None:
-    """Wait until something answers at a port.
+def _await_port(port: int, process: subprocess.Popen[bytes]) -> None:
+    """Wait until a process that was started answers at a port.
 
     Raises:
-        GavoError: nothing does for `PATIENCE` seconds.
+        RuntimeError: it has ended, or does not answer for `PATIENCE` seconds.
     """
     deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
+    while time.monotonic() < deadline and process.poll() is None:
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)) == 0:
                 return
         time.sleep(0.05)
-    raise GavoError("--viewer web: Rerun's server does not start")
+    raise RuntimeError("Rerun does not start")
 
 
 def _free_port(wanted: int) -> int:
@@ -311,15 +349,7 @@ def make_blueprint() -> Blueprint:
         layout.TimeSeriesView(origin="curves/rmse", name="RMSE of the best particle (grey levels)"),
         layout.TimeSeriesView(origin="curves/distance_error", name="Distance error (m)"),
     )
-    images = [
-        layout.Spatial2DView(origin=f"images/{name}", name=title)
-        for name, title in (
-            ("reference", "Reference"),
-            ("target", "Target"),
-            ("warped", "Target, warped"),
-            ("residual", "Residual (blue below, orange above)"),
-        )
-    ]
+    images = [layout.Spatial2DView(origin=f"images/{name}", name=title) for name, title in IMAGES.items()]
     return layout.Blueprint(
         layout.Vertical(
             layout.Horizontal(search, world, curves, column_shares=[3, 3, 2]),
@@ -331,69 +361,135 @@ def make_blueprint() -> Blueprint:
     )
 
 
+class Rows(NamedTuple):
+    """Rows of one entity that belong to one frame."""
+
+    generations: list[int]
+    """Where each stands on that time line."""
+    sizes: list[int]
+    """Number of instances (points, boxes, …) of each."""
+    values: dict[str, Any]
+    """Components of all instances: arrays, or lists of text or bytes."""
+    frame: int
+
+
 class Scene:
-    """Turns frames, steps and populations into what Rerun shows; remembers what a segment or a warp starts from."""
+    """Turns frames, steps and populations into what Rerun shows; remembers what a segment or a warp starts from.
+
+    What is to be shown gathers until `send`: a call to Rerun costs much the same for one row as for hundreds.
+    """
 
     def __init__(
         self, stream: RecordingStream, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None
     ) -> None:
-        import rerun
+        import rerun as rr
 
-        self._rr, self._stream = rerun, stream
+        self._stream = stream
         self._camera = shown_camera(camera)
         self._shrink = camera.width // self._camera.width
         self._depth_scale = camera.depth_scale
-        self._rays = rays(self._camera)
+        self._cloud = np.s_[CLOUD_STRIDE // 2 :: CLOUD_STRIDE, CLOUD_STRIDE // 2 :: CLOUD_STRIDE]
+        self._rays = rays(self._camera)[self._cloud]
         self._truth = Truth(stamps, truth)
         self._frame, self._generation = 0, 0
         self._world_T_camera = np.eye(4)
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
         self._shown: deque[Shown] = deque(maxlen=8)
         """The last frames that could be read; an older one is never a reference."""
+        # in the order of sending: particles, shown at their own frame alone, are there before the time moves on
+        self._archetypes: dict[str, Any] = {
+            "search/particles": rr.Points3D,
+            "world/camera": rr.Transform3D,
+            "world/camera/image": rr.EncodedImage,
+            "world/camera/cloud": rr.Points3D,
+            "world/estimate": rr.LineStrips3D,
+            "world/truth": rr.LineStrips3D,
+            "curves/rmse": rr.Scalars,
+            "curves/distance_error": rr.Scalars,
+            **{f"images/{name}": rr.EncodedImage for name in IMAGES},
+            "search/bounds": rr.Boxes3D,
+            "search/error": rr.Arrows3D,
+            "search/truth": rr.LineStrips3D,
+            "state": rr.TextDocument,
+        }
+        self._waiting: dict[str, list[Rows]] = {path: [] for path in self._archetypes}
         self._send_static()
 
     def add(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...]) -> None:
-        """Send one frame."""
+        """Add one frame to what is to be sent."""
         self._frame = 0 if step is None else step.index
-        self._stream.set_time("frame", sequence=self._frame)
-        self._stream.set_time("generation", sequence=self._generation)
         world_T_camera = np.eye(4) if step is None else step.world_T_camera
         truth = self._truth.at(self._frame, world_T_camera)
         shown = None if frame is None else self._shrunk(frame)
         if shown is not None:
-            self._send_camera(world_T_camera, shown)
+            self._add_camera(world_T_camera, shown)
         if step is not None:
-            self._send_trajectory(world_T_camera, truth)
-            self._send_images(shown, step)
+            self._add_trajectory(world_T_camera, truth)
+            self._add_images(shown, step)
         generations = 0
         if step is not None and populations:
-            generations = self._send_search(populations, self._truth.motion(step))
+            search = [level for level in map(level_of, populations) if level is not None]
+            generations = self._add_search(search, self._truth.motion(step))
         self._generation += max(generations, 1)
         self._world_T_camera, self._last_truth = world_T_camera, truth
         if shown is not None:
             self._shown.append(shown)
 
+    def send(self) -> None:
+        """Send what was added since the last time, each entity's in one call."""
+        import rerun as rr
+
+        for path, rows in self._waiting.items():
+            if not rows:
+                continue
+            frames = np.repeat([part.frame for part in rows], [len(part.generations) for part in rows])
+            times = [
+                rr.TimeColumn("frame", sequence=frames),
+                rr.TimeColumn("generation", sequence=sum((part.generations for part in rows), [])),
+            ]
+            values = {name: _joined([part.values[name] for part in rows]) for name in rows[0].values}
+            columns = self._archetypes[path].columns(**values)
+            self._stream.send_columns(path, times, columns.partition(sum((part.sizes for part in rows), [])))
+            rows.clear()
+
+    def _add(self, path: str, generations: list[int] | None = None, sizes: list[int] | None = None, **values: Any):
+        """Add rows of an entity, one or one for each of some generations, each of one instance or of `sizes`."""
+        generations = [self._generation] if generations is None else generations
+        sizes = [1] * len(generations) if sizes is None else sizes
+        self._waiting[path].append(Rows(generations, sizes, values, self._frame))
+
     def _send_static(self) -> None:
-        rr, log = self._rr, self._stream.log
-        camera = self._camera
-        log("world", rr.ViewCoordinates.RDF, static=True)
-        log("search", rr.ViewCoordinates.RDF, static=True)
+        """Send what stays as it is, among it the looks of what does not."""
+        import rerun as rr
+
+        camera, points = self._camera, rr.Radius.ui_points
         pinhole = rr.Pinhole(
             focal_length=[camera.fx, camera.fy],
             principal_point=[camera.cx + 0.5, camera.cy + 0.5],
             resolution=[camera.width, camera.height],
             image_plane_distance=0.4,
         )
-        log("world/camera/image", pinhole, static=True)
-        for path, color, name in (
-            ("curves/rmse", BLUE, "RMSE of the pair"),
-            ("curves/distance_error", VERMILION, "distance error"),
-        ):
-            log(path, rr.SeriesLines(colors=[color], widths=[2], names=[name]), static=True)
-        last = rr.Points3D(
-            [[0, 0, 0]], radii=[rr.Radius.ui_points(5)], colors=[WHITE], labels=["last camera"], show_labels=False
-        )
-        log("search/last_camera", last, static=True)
+        last = rr.Points3D([[0, 0, 0]], radii=points(5), colors=[WHITE], labels=["last camera"], show_labels=False)
+        jpeg = rr.EncodedImage.from_fields(media_type="image/jpeg")
+        looks = {
+            "world": [rr.ViewCoordinates.RDF],
+            "search": [rr.ViewCoordinates.RDF],
+            "world/camera/image": [pinhole, jpeg],
+            "world/camera/cloud": [rr.Points3D.from_fields(radii=points(1.5))],
+            "world/estimate": [rr.LineStrips3D.from_fields(colors=[BLUE], radii=points(2))],
+            "world/truth": [rr.LineStrips3D.from_fields(colors=[WHITE], radii=points(2))],
+            "curves/rmse": [rr.SeriesLines(colors=[BLUE], widths=[2], names=["RMSE of the pair"])],
+            "curves/distance_error": [rr.SeriesLines(colors=[VERMILION], widths=[2], names=["distance error"])],
+            **{f"images/{name}": [jpeg] for name in IMAGES},
+            "search/particles": [rr.Points3D.from_fields(radii=points(2.5))],
+            "search/bounds": [rr.Boxes3D.from_fields(colors=[GREY])],
+            "search/error": [rr.Arrows3D.from_fields(colors=[VERMILION], radii=points(1.5))],
+            "search/truth": [rr.LineStrips3D.from_fields(colors=[GREEN], radii=points(2))],
+            "search/last_camera": [last],
+            "state": [rr.TextDocument.from_fields(media_type="text/markdown")],
+        }
+        for path, archetypes in looks.items():
+            self._stream.log(path, *archetypes, static=True)
 
     def _shrunk(self, frame: Frame) -> Shown:
         size, k = (self._camera.width, self._camera.height), self._shrink
@@ -401,95 +497,79 @@ class Scene:
         if k > 1:
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         raw = np.asarray(frame.depth)[k // 2 :: k, k // 2 :: k][: size[1], : size[0]]
-        return Shown(frame.timestamp, grey, raw.astype(np.float32) / np.float32(self._depth_scale))
+        return Shown(frame.timestamp, grey, raw.astype(np.float32) * np.float32(1 / self._depth_scale), _jpeg(grey))
 
-    def _image(self, image: UInt8[np.ndarray, "h w *channels"]) -> Any:
-        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        return self._rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+    def _add_camera(self, world_T_camera: Float64[np.ndarray, "4 4"], shown: Shown) -> None:
+        self._add("world/camera", translation=world_T_camera[None, :3, 3], mat3x3=world_T_camera[None, :3, :3])
+        self._add("world/camera/image", blob=[shown.jpeg])
+        self._add("images/target", blob=[shown.jpeg])
+        depth = shown.depth[self._cloud]
+        seen = depth > 0
+        points = self._rays[seen] * depth[seen][:, None]
+        grey = shown.grey[self._cloud][seen]
+        self._add("world/camera/cloud", sizes=[len(points)], positions=points, colors=GREYS[grey])
 
-    def _send_camera(self, world_T_camera: Float64[np.ndarray, "4 4"], shown: Shown) -> None:
-        rr, log = self._rr, self._stream.log
-        log("world/camera", rr.Transform3D(translation=world_T_camera[:3, 3], mat3x3=world_T_camera[:3, :3]))
-        picture = self._image(shown.grey)
-        log("world/camera/image", picture)
-        log("images/target", picture)
-        every = np.s_[CLOUD_STRIDE // 2 :: CLOUD_STRIDE, CLOUD_STRIDE // 2 :: CLOUD_STRIDE]
-        points = self._rays[every] * shown.depth[every][..., None]
-        seen = points[..., 2] > 0
-        grey = np.repeat(shown.grey[every][seen][:, None], 3, axis=1)
-        log("world/camera/cloud", rr.Points3D(points[seen], colors=grey, radii=rr.Radius.ui_points(1.5)))
-
-    def _send_trajectory(
+    def _add_trajectory(
         self, world_T_camera: Float64[np.ndarray, "4 4"], truth: Float64[np.ndarray, "4 4"] | None
     ) -> None:
-        """Send this frame's piece of either path; the view gathers the pieces."""
-        rr, log = self._rr, self._stream.log
-        for path, start, end, color in (
-            ("world/estimate", self._world_T_camera, world_T_camera, BLUE),
-            ("world/truth", self._last_truth, truth, WHITE),
+        """Add this frame's piece of either path; the view gathers the pieces."""
+        for path, start, end in (
+            ("world/estimate", self._world_T_camera, world_T_camera),
+            ("world/truth", self._last_truth, truth),
         ):
             if start is not None and end is not None:
-                piece = np.stack([start[:3, 3], end[:3, 3]])
-                log(path, rr.LineStrips3D([piece], colors=[color], radii=rr.Radius.ui_points(2)))
+                self._add(path, strips=np.stack([start[:3, 3], end[:3, 3]])[None])
         if truth is not None:
             error = float(np.linalg.norm(world_T_camera[:3, 3] - truth[:3, 3]))
-            log("curves/distance_error", rr.Scalars(error))
+            self._add("curves/distance_error", scalars=[error])
 
-    def _send_images(self, shown: Shown | None, step: Step) -> None:
-        rr, log = self._rr, self._stream.log
+    def _add_images(self, shown: Shown | None, step: Step) -> None:
         if np.isfinite(step.alignment.error):
-            log("curves/rmse", rr.Scalars(float(np.sqrt(step.alignment.error))))
+            self._add("curves/rmse", scalars=[float(np.sqrt(step.alignment.error))])
         reference = next((s for s in reversed(self._shown) if s.timestamp == step.reference_timestamp), None)
         if shown is None or reference is None:
             return
-        motion = np.asarray(step.alignment.target_T_reference)
-        warped, seen = warp_target(reference, shown, motion, self._camera, self._rays)
-        log("images/reference", self._image(reference.grey))
-        log("images/warped", self._image(warped))
-        log("images/residual", self._image(color_residual(warped, reference.grey, seen)))
+        warped, seen = warp_target(reference, shown, np.asarray(step.alignment.target_T_reference), self._camera)
+        self._add("images/reference", blob=[reference.jpeg])
+        self._add("images/warped", blob=[_jpeg(warped)])
+        self._add("images/residual", blob=[_jpeg(color_residual(warped, reference.grey, seen))])
 
-    def _send_search(self, populations: tuple[Population, ...], motion: Float64[np.ndarray, "4 4"] | None) -> int:
-        """Send every generation of a frame, each entity's in one call; return how many there are."""
-        generations = [g for population in populations for g in generations_of(population)]
-        if not generations:
+    def _add_search(self, search: list[Level], motion: Float64[np.ndarray, "4 4"] | None) -> int:
+        """Add every generation of a frame; return how many there are."""
+        if not search:
             return 0
-        rr, count = self._rr, len(generations)
-        times = [
-            rr.TimeColumn("frame", sequence=np.full(count, self._frame)),
-            rr.TimeColumn("generation", sequence=self._generation + np.arange(count)),
-        ]
-
-        def send(path: str, columns: Any) -> None:
-            self._stream.send_columns(path, times, columns)
-
-        sizes = [len(g.positions) for g in generations]
-        positions, colors = (np.concatenate([g[i] for g in generations]) for i in (0, 1))
-        points = rr.Points3D.columns(positions=positions, colors=colors, radii=np.full(len(colors), -2.5))
-        send("search/particles", points.partition(sizes))
-        send("state", rr.TextDocument.columns(text=[g.text for g in generations], media_type=["text/markdown"] * count))
-        boxes = rr.Boxes3D.columns(
-            centers=[g.centre for g in generations],
-            half_sizes=[g.half_sizes for g in generations],
-            colors=[GREY] * count,
+        sizes = [level.positions.shape[1] for level in search for _ in level.texts]
+        count = len(sizes)
+        generations = list(range(self._generation, self._generation + count))
+        positions = np.concatenate([level.positions.reshape(-1, 3) for level in search])
+        colors = np.concatenate([level.colors.ravel() for level in search])
+        self._add("search/particles", generations, sizes, positions=positions, colors=colors)
+        self._add("state", generations, text=[text for level in search for text in level.texts])
+        starts = np.cumsum([0, *(len(level.texts) for level in search[:-1])]) + self._generation
+        self._add(
+            "search/bounds",
+            starts.tolist(),
+            centers=np.stack([level.centre for level in search]),
+            half_sizes=np.stack([level.half_sizes for level in search]),
         )
-        send("search/bounds", boxes)
         if motion is None:
             return count
         true = motion[:3, 3] * MILLIMETRES
-        best = np.stack([g.positions[0] for g in generations])
-        errors = np.linalg.norm(true - best, axis=1)
-        arrows = rr.Arrows3D.columns(
-            origins=best,
-            vectors=true - best,
-            colors=[VERMILION] * count,
-            radii=np.full(count, -1.5),
-            labels=[f"error {error:.1f} mm" for error in errors],
-        )
-        send("search/error", arrows)
-        size = max(0.05 * float(np.linalg.norm(true)), 0.5)
-        star = rr.LineStrips3D(star_strips(true, size), colors=[GREEN], radii=rr.Radius.ui_points(2))
-        self._stream.log("search/truth", star)
+        best = np.concatenate([level.positions[:, 0] for level in search])
+        arrows = true - best
+        labels = [f"error {error:.1f} mm" for error in np.linalg.norm(arrows, axis=1)]
+        self._add("search/error", generations, origins=best, vectors=arrows, labels=labels)
+        strips = star_strips(true, max(0.05 * float(np.linalg.norm(true)), 0.5))
+        self._add("search/truth", sizes=[len(strips)], strips=strips)
         return count
+
+
+def _joined(parts: list[Any]) -> Any:
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else sum(parts, [])
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w *channels"]) -> bytes:
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 class Shown(NamedTuple):
@@ -499,6 +579,8 @@ class Shown(NamedTuple):
     grey: UInt8[np.ndarray, "h w"]
     depth: Float[np.ndarray, "h w"]
     """Metres; 0 = no reading."""
+    jpeg: bytes
+    """The grey image, encoded."""
 
 
 class Truth:
@@ -534,55 +616,59 @@ KEY = (
 )
 
 
-class Generation(NamedTuple):
-    """One iteration of a level's search, as it is shown."""
+class Level(NamedTuple):
+    """The search of a level as it is shown, g generations of p particles."""
 
-    positions: Float[np.ndarray, "p 3"]
+    positions: Float[np.ndarray, "g p 3"]
     """Where each particle puts the camera, seen from the last one, millimetres; the best first."""
-    colors: UInt8[np.ndarray, "p 3"]
+    colors: UInt32[np.ndarray, "g p"]
+    """RGBA, a byte each. Blue is the level's best error, vermilion that of its worst particles."""
     centre: Float[np.ndarray, " 3"]
     half_sizes: Float[np.ndarray, " 3"]
-    text: str
+    texts: list[str]
+    """A generation's state, as Markdown."""
 
 
-def generations_of(population: Population) -> list[Generation]:
-    """Return a level's generations. Blue is the level's best error, vermilion that of its worst particles."""
+def level_of(population: Population) -> Level | None:
+    """Return what is shown of a level's candidates, None where none of them is worth anything."""
     population = population.trimmed()
     xi, error = np.asarray(population.xi), np.asarray(population.error)
-    rmse = np.sqrt(np.where(np.isfinite(error), error, np.inf))
-    finite = rmse[np.isfinite(rmse)]
+    finite = np.sqrt(error[np.isfinite(error)])
     if finite.size == 0:
-        return []
-    iterations, count = rmse.shape
-    order = np.argsort(rmse, axis=1, kind="stable")[:, :: -(-count // MAX_PARTICLES)]
-    xi, rmse = np.take_along_axis(xi, order[..., None], axis=1), np.take_along_axis(rmse, order, axis=1)
-    low = finite.min()
-    high = max(np.quantile(finite, 0.95), low + 1e-6)
-    colors = blend(2 * (np.minimum(rmse, high) - low) / (high - low) - 1)
-    positions = camera_positions(xi) * MILLIMETRES
-    centre = camera_positions(np.asarray(population.centre)) * MILLIMETRES
-    half_sizes = np.asarray(population.half_widths)[:3] * MILLIMETRES
+        return None
+    iterations, count = error.shape
+    order = np.argsort(error, axis=1, kind="stable")[:, :: -(-count // MAX_PARTICLES)]
+    rows = np.arange(iterations)[:, None]
+    xi, rmse = xi[rows, order], np.sqrt(error[rows, order])
+    worst = int(0.95 * (finite.size - 1))
+    low, high = finite.min(), np.partition(finite, worst)[worst]
+    place = (np.minimum(rmse, high) - low) * (255 / max(high - low, 1e-6))
+    twists = np.concatenate([xi.reshape(-1, 6), np.asarray(population.centre)[None]])
+    positions = (camera_positions(twists) * MILLIMETRES).astype(np.float32)
     level = int(population.level)
     texts = [
         f"| particles | level | DSR | iteration | best RMSE |\n|---|---|---|---|---|\n"
-        f"| {count} | {level} | 1/{2**level} | {i + 1} of {iterations} | {rmse[i, 0]:.2f} grey levels |\n\n{KEY}"
-        for i in range(iterations)
+        f"| {count} | {level} | 1/{2**level} | {i} of {iterations} | {best:.2f} grey levels |\n\n{KEY}"
+        for i, best in enumerate(rmse[:, 0].tolist(), 1)
     ]
-    return [
-        Generation(place, color, centre, half_sizes, text)
-        for place, color, text in zip(positions, colors, texts, strict=True)
-    ]
+    return Level(
+        positions[:-1].reshape(*rmse.shape, 3),
+        PARTICLE_COLORS[place.astype(np.uint8)],
+        positions[-1],
+        np.asarray(population.half_widths)[:3] * np.float32(MILLIMETRES),
+        texts,
+    )
 
 
 def camera_positions(xi: Float[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 3"]:
     """Return where twists of target_T_reference put the target camera, seen from the reference: −V(−w) v, metres."""
-    v, w = np.moveaxis(np.asarray(xi, np.float64).reshape(*xi.shape[:-1], 2, 3), -2, 0)
-    angle = np.linalg.norm(w, axis=-1, keepdims=True)
-    safe = np.maximum(angle, 1e-4)
-    first = np.where(angle < 1e-4, 0.5, (1 - np.cos(safe)) / safe**2)
-    second = np.where(angle < 1e-4, 1 / 6, (safe - np.sin(safe)) / safe**3)
-    turned = np.cross(w, v)
-    return -(v - first * turned + second * np.cross(w, turned))
+    v, w = np.asarray(xi[..., :3], np.float64), np.asarray(xi[..., 3:], np.float64)
+    square = np.sum(w * w, axis=-1, keepdims=True)
+    safe = np.sqrt(np.maximum(square, 1e-8))
+    first = np.where(square < 1e-8, 0.5, (1 - np.cos(safe)) / safe**2)
+    second = np.where(square < 1e-8, 1 / 6, (safe - np.sin(safe)) / safe**3)
+    twice_turned = np.sum(w * v, axis=-1, keepdims=True) * w - square * v
+    return -(v - first * np.cross(w, v) + second * twice_turned)
 
 
 def blend(place: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
@@ -591,18 +677,26 @@ def blend(place: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
     return np.stack(channels, axis=-1).astype(np.uint8)
 
 
-RESIDUAL_COLORS = np.ascontiguousarray(blend(np.linspace(-1, 1, 256))[:, None, ::-1])
+def packed(rgb: UInt8[np.ndarray, "n 3"]) -> UInt32[np.ndarray, " n"]:
+    """Return colours as Rerun takes them without converting: opaque RGBA, a byte each."""
+    return (rgb.astype(np.uint32) << np.array([24, 16, 8], np.uint32)).sum(axis=1, dtype=np.uint32) | np.uint32(255)
+
+
+SCALE = blend(np.linspace(-1, 1, 256))
+PARTICLE_COLORS = packed(SCALE)
+"""From the best error to the worst."""
+RESIDUAL_COLORS = np.ascontiguousarray(SCALE[:, None, ::-1])
 """BGR, from −RESIDUAL_RANGE to RESIDUAL_RANGE."""
+GREYS = packed(np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1))
 
 
 def color_residual(
     warped: UInt8[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return BGR of the residuals warped − reference; black where nothing is seen."""
-    scaled = (warped.astype(np.float32) - reference) * np.float32(127.5 / RESIDUAL_RANGE) + np.float32(127.5)
-    colored = cv2.applyColorMap(np.clip(scaled, 0, 255).astype(np.uint8), RESIDUAL_COLORS)
-    colored[~seen] = 0
-    return colored
+    factor = 127.5 / RESIDUAL_RANGE
+    colored = cv2.applyColorMap(cv2.addWeighted(warped, factor, reference, -factor, 127.5), RESIDUAL_COLORS)
+    return cv2.bitwise_and(colored, colored, mask=seen.view(np.uint8))
 
 
 def shown_camera(camera: Camera) -> Camera:
@@ -620,11 +714,7 @@ def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
 
 
 def warp_target(
-    reference: Shown,
-    target: Shown,
-    target_T_reference: Float[np.ndarray, "4 4"],
-    camera: Camera,
-    rays: Float[np.ndarray, "h w 3"],
+    reference: Shown, target: Shown, target_T_reference: Float[np.ndarray, "4 4"], camera: Camera
 ) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return I_{t+1}(ω(ξ, p)) at every reference pixel, black where it is not defined, and where it is.
 
@@ -632,20 +722,22 @@ def warp_target(
         reference: with its depth.
         target: the image that is sampled.
         target_T_reference: g(ξ).
-        camera: of both.
-        rays: of the camera, see `rays`.
+        camera: of both, without distortion.
     """
-    moved = np.asarray(target_T_reference, np.float32)
-    points = (rays * reference.depth[..., None]) @ moved[:3, :3].T + moved[:3, 3]
-    z = points[..., 2]
-    before = (reference.depth > 0) & (z > 1e-3)
-    z = np.where(before, z, np.float32(1.0))
-    u = np.float32(camera.fx) * points[..., 0] / z + np.float32(camera.cx)
-    v = np.float32(camera.fy) * points[..., 1] / z + np.float32(camera.cy)
-    seen = before & (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
-    sampled = cv2.remap(target.grey, u, v, cv2.INTER_LINEAR)
-    sampled[~seen] = 0
-    return sampled, seen
+    height, width = reference.grey.shape
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    known = reference.depth > 0
+    inverse_depth = np.divide(1, reference.depth, out=np.zeros_like(reference.depth), where=known)
+    turn = (matrix @ target_T_reference[:3, :3] @ np.linalg.inv(matrix)).astype(np.float32)
+    shift = (matrix @ target_T_reference[:3, 3]).astype(np.float32)
+    x, y, z = (a * u + (b * v + c) + d * inverse_depth for (a, b, c), d in zip(turn, shift, strict=True))
+    seen = known & (z > 1e-3)
+    x /= z
+    y /= z
+    seen &= (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    sampled = cv2.remap(target.grey, x, y, cv2.INTER_LINEAR)
+    return cv2.bitwise_and(sampled, sampled, mask=seen.view(np.uint8)), seen
 
 
 def star_strips(centre: Float[np.ndarray, " 3"], size: float) -> list[Float[np.ndarray, "2 3"]]:

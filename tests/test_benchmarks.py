@@ -52,7 +52,13 @@ def test_drift_compares_methods_with_peers(load, tmp_path: Path, capsys: pytest.
     assert ratios["ga / best peer, rotation"] == pytest.approx(genetic["rotation"] / peer["rotation"])
     assert ratios["ga / gauss-newton, translation"] == pytest.approx(genetic["translation"] / newton["translation"])
     assert "ratios of the medians" in capsys.readouterr().out
-    assert drift.drifts(record["runs"])[CLIP]["ga"].shape == (2, 2) and (tmp_path / "drift.svg").exists()
+    assert drift.drifts(record["runs"])[CLIP]["ga"].shape == (2, 2)
+    first = (tmp_path / "drift.svg").read_text()
+    drift.main(recorded=str(tmp_path / "drift.json"), figure=tmp_path / "again")
+    assert (tmp_path / "again" / "drift.svg").read_text().count("<use") == first.count("<use")
+    for file in ("nowhere.json", "drift.svg"):
+        with pytest.raises(GavoError, match=file):
+            drift.main(recorded=str(tmp_path / file))
 
 
 def test_drift_refuses_unknown_methods(load) -> None:
@@ -84,6 +90,10 @@ def test_basin_counts_successes_and_flags(load, tmp_path: Path) -> None:
     assert [(row["gap"], row["pairs"]) for row in record["success"]] == [(1, 4), (3, 3)]
     assert record["success"][0]["success"] == {"gauss-newton": 1.0, "opencv-rgb": 1.0}
     assert (tmp_path / "basin.svg").exists()
+    basin.main(recorded=str(tmp_path / "basin.json"), figure=tmp_path / "again")
+    assert (tmp_path / "again" / "basin.svg").exists()
+    with pytest.raises(GavoError, match=r"drift\.py"):
+        load("drift").main(recorded=str(tmp_path / "basin.json"))
     assert record["success"][1]["motion_deg"] > record["success"][0]["motion_deg"]
     attempts = [dict(found=True, flagged=True), dict(found=False, flagged=True), dict(found=False, flagged=False)]
     [agreement] = basin.status_agreement([dict(method="x", milliseconds=1.0, **attempt) for attempt in attempts])
@@ -248,3 +258,11 @@ def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> 
     for row in (synthetic, clip):
         assert 0.5 < row["mean"] < 30 and row["share_within"] > 0.5
         assert 0 < row["millimetres"] < 5
+
+
+def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
+    load("viewer").main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
+    figures = read(tmp_path / "viewer.json")["methods"]["gauss-newton"]
+    [without], [saved] = figures["runs"]["none"], figures["runs"]["save"]
+    assert figures["ratio"] == pytest.approx(saved["milliseconds"] / without["milliseconds"])
+    assert without["megabytes"] == 0 < figures["megabytes"] < 1

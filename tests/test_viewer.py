@@ -1,5 +1,8 @@
 """The viewer: what it saves is read back with Rerun's own reader and compared with the run."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,8 @@ ENTITIES_OF_A_PAIR = (
     "/world/truth",
 )
 ENTITIES_OF_A_FRAME = ("/images/target", "/world/camera", "/world/camera/cloud", "/world/camera/image")
-ENTITIES_OF_A_GENERATION = ("/search/bounds", "/search/error", "/search/particles", "/state")
+ENTITIES_OF_A_GENERATION = ("/search/error", "/search/particles", "/state")
+LEVELS = 2
 
 
 def read_recording(path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -80,6 +84,7 @@ def test_every_entity_has_its_rows(rows):
         **dict.fromkeys(ENTITIES_OF_A_FRAME, FRAMES),
         **dict.fromkeys(ENTITIES_OF_A_PAIR, pairs),
         **dict.fromkeys(ENTITIES_OF_A_GENERATION, pairs * GENERATIONS),
+        "/search/bounds": pairs * LEVELS,
     }
     assert {path: len(own) for path, own in rows.items()} == expected
 
@@ -141,13 +146,17 @@ def test_generations_are_sorted_coloured_and_thinned():
     error[0, :5], error[2] = np.inf, np.nan
     xi = rng.normal(0, 0.01, (3, 2000, 6)).astype(np.float32)
     population = Population(np.int32(3), xi, error, np.zeros(6), np.full(6, 0.5))  # pyright: ignore[reportArgumentType]
-    first, second = viewer.generations_of(population)
-    assert len(first.positions) <= viewer.MAX_PARTICLES and np.allclose(first.half_sizes, 500.0)
+    level = viewer.level_of(population)
+    assert level is not None and level.positions.shape[0] == len(level.texts) == 2
+    assert level.positions.shape[1] <= viewer.MAX_PARTICLES and np.allclose(level.half_sizes, 500.0)
     best = xi[1, np.argmin(error[1])]
-    assert np.allclose(second.positions[0], viewer.camera_positions(best[None])[0] * 1e3)
-    overall = min((first, second), key=lambda generation: float(generation.text.split(" grey")[0].split("| ")[-1]))
-    assert np.array_equal(overall.colors[0], viewer.BLUE) and np.array_equal(first.colors[-1], viewer.VERMILION)
-    assert "| 2000 | 3 |" in first.text and f"{np.sqrt(error[1].min()):.2f} grey levels" in second.text
+    assert np.allclose(level.positions[1, 0], viewer.camera_positions(best[None])[0] * 1e3, atol=1e-3)
+    overall = int(np.argmin(error[:2].min(axis=1)))
+    blue, vermilion = viewer.packed(np.array([viewer.BLUE, viewer.VERMILION], np.uint8))
+    assert level.colors[overall, 0] == blue and level.colors[0, -1] == vermilion
+    assert f"{blue:08x}" == "".join(f"{value:02x}" for value in (*viewer.BLUE, 255))
+    assert "| 2000 | 3 |" in level.texts[0] and f"{np.sqrt(error[1].min()):.2f} grey levels" in level.texts[1]
+    assert viewer.level_of(population._replace(error=np.full_like(error, np.inf))) is None  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 2.0])
@@ -162,18 +171,26 @@ def test_warping_back_gives_the_reference():
     sequence = SyntheticSequence(frames=2, camera=CAMERA)
     truth = sequence.ground_truth.interpolate(sequence.timestamps)[0]
     reference, target = (
-        viewer.Shown(frame.timestamp, frame.grey, frame.depth / np.float32(CAMERA.depth_scale)) for frame in sequence
+        viewer.Shown(frame.timestamp, frame.grey, frame.depth / np.float32(CAMERA.depth_scale), b"")
+        for frame in sequence
     )
-    rays = viewer.rays(CAMERA)
-    warped, seen = viewer.warp_target(reference, target, np.linalg.inv(truth[1]) @ truth[0], CAMERA, rays)
-    still, _ = viewer.warp_target(reference, target, np.eye(4), CAMERA, rays)
+    warped, seen = viewer.warp_target(reference, target, np.linalg.inv(truth[1]) @ truth[0], CAMERA)
+    still, _ = viewer.warp_target(reference, target, np.eye(4), CAMERA)
 
     def error(image: np.ndarray) -> float:
         return float(np.mean(np.abs(image.astype(float) - reference.grey)[seen]))
 
     assert seen.mean() > 0.7 and error(warped) < 0.5 * error(still)
     colors = viewer.color_residual(warped, reference.grey, seen)
-    assert not colors[~seen].any() and colors[seen].min() >= 0
+    assert not colors[~seen].any()
+
+
+def test_residuals_are_blue_below_and_vermilion_above():
+    bright, dark = np.full((2, 3), 200, np.uint8), np.full((2, 3), 100, np.uint8)
+    seen = np.array([[True, True, False]] * 2)
+    for warped, reference, color in ((bright, dark, viewer.VERMILION), (dark, bright, viewer.BLUE)):
+        colors = viewer.color_residual(warped, reference, seen)
+        assert np.all(colors[seen] == color[::-1]) and not colors[~seen].any()
 
 
 def test_no_viewer_asks_for_nothing(tmp_path):
@@ -194,6 +211,25 @@ def test_missing_package_and_missing_screen_are_said(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(GavoError, match=r"pip install 'gavo-jax\[viewer\]'"):
         viewer.make_viewer("save", tmp_path / "run.rrd")
+
+
+def test_a_window_that_does_not_open_is_said_in_one_line(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "gavo_jax",
+        "run",
+        "--viewer",
+        "spawn",
+        "--frames",
+        "3",
+        "--method",
+        "gauss-newton",
+    ]
+    outside = {**os.environ, "DISPLAY": ":4711"}
+    outside.pop("WAYLAND_DISPLAY", None)
+    run = subprocess.run(command, cwd=tmp_path, env=outside, capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == 2 and run.stderr.startswith("gavo: --viewer spawn: ") and run.stderr.count("\n") == 1
 
 
 def test_a_fault_in_the_thread_reaches_the_user(tmp_path):

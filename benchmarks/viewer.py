@@ -1,0 +1,105 @@
+"""What it costs to watch: a run with the viewer that saves to a file against one without, in turn.
+
+Prints, for each method, the median time of a run without and with `--viewer save`, their ratio, the processor's
+milliseconds a frame that the viewer adds (all cores' time added up) and the recording's size a frame.
+
+    python benchmarks/viewer.py
+    python benchmarks/viewer.py --clip synthetic:20 --methods gauss-newton --rounds 2 --json viewer.json
+
+Clips and methods as for the other benchmarks. The defaults take about two minutes on two cores.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import common
+import numpy as np
+
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.cli.tracking import track_visibly
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.odometry import Odometry
+from gavo_jax.results import RECORDING
+from gavo_jax.viewer import ViewerMode, make_viewer
+
+MODES: tuple[ViewerMode, ...] = ("none", "save")
+
+
+class Cost(NamedTuple):
+    """Of one run, a frame."""
+
+    milliseconds: float
+    """By the clock, from the first frame to the viewer's last."""
+    processor_milliseconds: float
+    """Of all cores."""
+    megabytes: float
+    """Of the recording."""
+
+
+def watch(sequence: Sequence, name: str, mode: ViewerMode, folder: Path) -> Cost:
+    """Track a sequence before a viewer."""
+    preset, recording = common.preset_of(name), folder / RECORDING
+    viewer = make_viewer(mode, recording)
+    odometry = Odometry(
+        sequence.camera, preset.solver, preset.alignment, preset.odometry, record=viewer.wants_populations
+    )
+    odometry.warm_up()
+    viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
+    start = time.perf_counter(), time.process_time()
+    with viewer:
+        track_visibly(f"{name}, viewer {mode}", sequence, odometry, viewer=viewer)
+    wall, processor = time.perf_counter() - start[0], time.process_time() - start[1]
+    size = recording.stat().st_size if mode == "save" else 0
+    return Cost(*(value / len(sequence) for value in (wall * 1e3, processor * 1e3, size / 1e6)))
+
+
+def main(
+    clip: str = "fr1_xyz", methods: str = "ga,ga:fast", rounds: int = 5, json: Path | None = None
+) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clip: one clip.
+        methods: METHOD or METHOD:PRESET with commas between.
+        rounds: runs without and with the viewer, in turn.
+        json: file for the cost of every run.
+    """
+    sequence = common.open_clip(clip)
+    sequence.check()
+    results: dict[str, Any] = {"clip": clip, "frames": len(sequence), "methods": {}}
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in common.names(methods):
+            costs: dict[str, list[Cost]] = {mode: [] for mode in MODES}
+            for _ in range(rounds):
+                for mode in MODES:
+                    costs[mode].append(watch(sequence, name, mode, Path(folder)))
+            without, saved = (np.median(costs[mode], axis=0) for mode in MODES)
+            ratio = float(saved[0] / without[0])
+            added = float(saved[1] - without[1])
+            results["methods"][name] = {
+                "runs": {mode: [cost._asdict() for cost in own] for mode, own in costs.items()},
+                "ratio": ratio,
+                "added_processor_milliseconds": added,
+                "megabytes": float(saved[2]),
+            }
+            rows.append(
+                (
+                    name,
+                    number(without[0], 1),
+                    number(saved[0], 1),
+                    number(ratio, 3),
+                    number(added, 1),
+                    number(saved[2], 2),
+                )
+            )
+    columns = ("method", "ms/frame without", "with", "ratio", "on cores, ms/frame more", "MB/frame")
+    print_table(f"{len(sequence)} frames of {clip}, median of {rounds}", columns, rows)
+    common.record(json, "viewer", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)
