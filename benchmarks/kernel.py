@@ -85,8 +85,8 @@ class TwoMarks(Objective):
         """The same objective."""
         return cls(**{field.name: getattr(objective, field.name) for field in fields(objective)})
 
-    def _cost_of(self, r: Residuals) -> jax.Array:
-        return jnp.stack([jnp.where(r.inside > 0, super()._cost_of(r), 0.0), r.inside])
+    def _cost(self, r: Residuals) -> jax.Array:
+        return jnp.stack([jnp.where(r.inside > 0, super()._cost(r), 0.0), r.inside])
 
     def _sums(self, cost: jax.Array) -> jax.Array:
         return jnp.stack([_lane_sum(cost[0]), _lane_sum(cost[1])])

@@ -192,7 +192,7 @@ MAX_TRANSLATION_DEVIATION = 0.05
 MAX_ROTATION_DEVIATION = 0.05
 """Radians, likewise for the rotation."""
 MAX_RIVAL = 1.1
-"""Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only islands that compete can tell."""
+"""Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
 
 
 SHARED_ERRORS = 9.0
@@ -364,7 +364,7 @@ class Search(NamedTuple):
     """Half-widths of the search box, metres and radians."""
     brightness: Brightness
     rival: Float[Array, ""]
-    """Error of the second-best mode over that of the best one, where several islands competed last; +inf without one."""
+    """Error of the second-best mode over the best one's, where several islands competed last; +inf without one."""
 
 
 def align_views(

@@ -252,6 +252,7 @@ class Objective:
     larger than any contrast, says nothing against the true motion. None: never, at no cost."""
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
+
     def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
         """Sum of `part` over chunks of the reference's points, as far as there are any."""
         points = self.reference.grey.shape[-1]
@@ -499,7 +500,6 @@ class Problem:
 
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
-
         motion = self.transform(x)
         mean = self.objective.mean_residual(motion)
 

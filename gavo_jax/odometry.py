@@ -375,10 +375,11 @@ class Odometry:
         state, result, populations = _track(
             state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options), self.record
         )
+        result = on_host(result)
         if populations is not None:
-            levels = range(len(solver.levels))
-            self.populations = tuple(jax.tree.map(lambda leaf, k=k: leaf[k], populations) for k in levels)
-        return state, on_host(result)
+            host = jax.device_get(populations)
+            self.populations = tuple(jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(len(solver.levels)))
+        return state, result
 
 
 def _traced(options: OdometryOptions) -> OdometryOptions:

@@ -6,7 +6,6 @@ the middle of a 2x2 block of level k (`Camera.level` holds the same convention).
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
@@ -31,7 +30,6 @@ Pyramid = tuple[PyramidLevel, ...]
 
 def halve_grey(grey: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     """Halve an image with the binomial kernel [1 3 3 1]/8, which is centred on the 2x2 block; borders replicate."""
-
     height, width = (size // 2 * 2 for size in grey.shape)
     padded = jnp.pad(grey[:height, :width], 1, mode="edge")
     rows = [padded[k : k + height : 2] for k in range(4)]

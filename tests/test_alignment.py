@@ -21,6 +21,8 @@ from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.warp import exp
 
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
+Images = tuple[np.ndarray, np.ndarray]
+"""Grey and depth."""
 QUICK = GaussNewton(iterations=(0, 0, 0, 10, 20))
 """Two coarse levels: soon compiled."""
 PAIRS = ((0, 1), (1, 0), (8, 9), (14, 15), (22, 23))
@@ -49,7 +51,7 @@ def difference(estimate: Any, truth: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(delta[:3, 3])), float(np.degrees(np.arctan2(sine, (np.trace(delta[:3, :3]) - 1) / 2)))
 
 
-def run(method: str, reference: Frame, target: Frame, camera: Camera, seed: int = 0) -> Alignment:
+def run(method: str, reference: Frame | Images, target: Frame | Images, camera: Camera, seed: int = 0) -> Alignment:
     """Align by a method's default preset."""
     preset = get_preset(method)
     return align(reference, target, camera, solver=preset.solver, key=jax.random.key(seed), options=preset.alignment)
@@ -267,12 +269,12 @@ def test_an_undetermined_direction_is_named(sequence: SyntheticSequence) -> None
     assert textured.undetermined == "" and textured.sentence == textured.status.sentence
 
 
-def wide_search(reference: Any, target: Any, camera: Camera, **changes: Any) -> Alignment:
+def wide_search(reference: Frame | Images, target: Frame | Images, camera: Camera, **changes: Any) -> Alignment:
     preset = get_preset("ga", "wide")
     return align(reference, target, camera, solver=preset.solver, options=replace(preset.alignment, **changes))
 
 
-def wallpaper(sequence: SyntheticSequence, shift: float, repeats: bool) -> tuple[Any, Any]:
+def wallpaper(sequence: SyntheticSequence, shift: float, repeats: bool) -> Images:
     """A wall 1 m ahead, moved by some pixels to the side; its pattern may repeat every 160 pixels."""
     height, width = sequence.camera.height, sequence.camera.width
     u, v = np.arange(width) - shift, np.arange(height)[:, None]
