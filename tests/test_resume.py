@@ -23,10 +23,12 @@ from gavo_jax.odometry import Odometry, Progress, run_odometry, track
 from gavo_jax.presets import OdometryOptions
 from gavo_jax.results import RunFolder
 from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.trajectory import Trajectory
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SOLVER = GaussNewton(iterations=(0, 0, 15, 0, 0))
+GENETIC = GeneticAlgorithm(population=(0, 0, 16, 0, 0), iterations=(0, 0, 5, 0, 0))
 READ_ONLY_CACHE = {**os.environ, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e9"}
 """JAX writes its cache of programs in place: a process that dies meanwhile would spoil it for the others."""
 PLAIN = OdometryOptions(recover=False)
@@ -196,16 +198,16 @@ def test_a_checkpoint_of_another_camera_is_refused(tmp_path):
         load_checkpoint(tmp_path / "checkpoint.npz", Odometry(CAMERA.level(1), SOLVER, options=PLAIN).blank_state())
 
 
-@pytest.mark.parametrize("at", [1, 4])
-def test_a_driver_goes_on_from_a_saved_progress(tmp_path, at):
+@pytest.mark.parametrize(("solver", "at"), [(SOLVER, 1), (SOLVER, 4), (GENETIC, 3)])
+def test_a_driver_goes_on_from_a_saved_progress(tmp_path, solver, at):
     sequence = SyntheticSequence(frames=7, camera=CAMERA)
-    straight = run_odometry(sequence, SOLVER, options=PLAIN).trajectory.world_T_camera
-    first = Odometry(CAMERA, SOLVER, options=PLAIN)
+    straight = run_odometry(sequence, solver, options=PLAIN).trajectory.world_T_camera
+    first = Odometry(CAMERA, solver, options=PLAIN)
     for step in track(sequence, odometry=first):
         if step.index == at:
             break
     save_checkpoint(tmp_path / "checkpoint.npz", first.progress, {"frames.csv": 7})
-    second = Odometry(CAMERA, SOLVER, options=PLAIN)
+    second = Odometry(CAMERA, solver, options=PLAIN)
     second.progress, sizes = load_checkpoint(tmp_path / "checkpoint.npz", second.blank_state())
     rest = list(track(sequence, odometry=second))
     assert sizes == {"frames.csv": 7}
