@@ -154,11 +154,12 @@ def _unpack(archive: Path, target: Path) -> None:
     scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=".unpacking-"))
     try:
         with tarfile.open(archive, "r:gz") as tar:
-            tar.extractall(scratch, filter=_only_files_below(target.name))
+            for member in tar:
+                _unpack_member(tar, member, scratch, target.name)
         if not (scratch / target.name / "rgb.txt").is_file():
             raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
         os.replace(scratch / target.name, target)
-    except (tarfile.TarError, EOFError, zlib.error) as error:
+    except (tarfile.TarError, EOFError, zlib.error, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         reason = " ".join(str(error).split())
         archive.unlink()
         raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {reason}") from None
@@ -166,13 +167,19 @@ def _unpack(archive: Path, target: Path) -> None:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _only_files_below(folder: str) -> Callable[[tarfile.TarInfo, str], tarfile.TarInfo]:
-    def check(member: tarfile.TarInfo, path: str) -> tarfile.TarInfo:
-        member = tarfile.data_filter(member, path)
-        if not (member.isfile() or member.isdir()):
-            raise tarfile.ReadError(f"{member.name}: neither a file nor a folder")
-        if Path(os.path.normpath(member.name)).parts[:1] not in ((folder,), ()):
-            raise tarfile.ReadError(f"{member.name}: outside {folder}")
-        return member
-
-    return check
+def _unpack_member(tar: tarfile.TarFile, member: tarfile.TarInfo, scratch: Path, folder: str) -> None:
+    """Unpack a file or a folder below `folder`, nothing else; the filters of `tarfile` are not in every Python 3.11."""
+    if not (member.isfile() or member.isdir()):
+        raise tarfile.ReadError(f"{member.name}: neither a file nor a folder")
+    name = os.path.normpath(member.name)
+    if Path(name).parts[:1] not in ((folder,), ()):
+        raise tarfile.ReadError(f"{member.name}: outside {folder}")
+    place = scratch / name
+    if member.isdir():
+        place.mkdir(parents=True, exist_ok=True)
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    source = tar.extractfile(member)
+    assert source is not None
+    with source, place.open("xb") as file:
+        shutil.copyfileobj(source, file)
