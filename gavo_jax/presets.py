@@ -111,6 +111,7 @@ _WIDE = {
     "adam": GradientDescent(),
 }
 _EQUAL = 1.0 / DEPTH_WEIGHT_RANGE[1]
+"""Factor with which depth weighs, at most, as much as grey."""
 WIDE_OBJECTIVE = AlignmentOptions(
     centred=True,
     depth_weight=(_EQUAL, _EQUAL, _EQUAL, 1.0, 1.0),
