@@ -38,7 +38,7 @@ from gavo_jax.objective import (
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
 from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target
+from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target, rigid_inverse
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -98,6 +98,7 @@ class AlignmentOptions:
         brightness: Whether a gain and a bias between the frames are estimated (static).
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
             (static); see `Objective`.
+        symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels (static); None takes every
@@ -119,6 +120,7 @@ class AlignmentOptions:
     depth: bool = static(True)
     brightness: bool = static(True)
     centred: bool = static(False)
+    symmetric: bool = static(False)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: int | None = static(4800)
@@ -209,6 +211,15 @@ class View(NamedTuple):
     """Maps the view's points into the camera that the result is relative to."""
 
 
+class Exchanged(NamedTuple):
+    """The two frames of a pair with their parts exchanged, for the symmetric error."""
+
+    references: Reference
+    """Points of the target frame, as of `prepare_reference`."""
+    target: Target
+    """The anchor's frame, as of `prepare_target`."""
+
+
 def prepare_reference(
     pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
 ) -> Reference:
@@ -238,6 +249,8 @@ class Level(NamedTuple):
     """Independent populations."""
     depth_weight: Float[Array, ""]
     """Factor on the depth cost's weight."""
+    exchanged: Reference | None = None
+    """[1, N]: the target's points, where the error is symmetric."""
 
     @property
     def is_undecided(self) -> Bool[Array, ""]:
@@ -245,7 +258,13 @@ class Level(NamedTuple):
         return self.is_first | (self.islands > 1)
 
 
-def stack_levels(views: tuple[View, ...], camera: Camera, levels: tuple[int, ...], options: AlignmentOptions) -> Level:
+def stack_levels(
+    views: tuple[View, ...],
+    camera: Camera,
+    levels: tuple[int, ...],
+    options: AlignmentOptions,
+    exchanged: Exchanged | None = None,
+) -> Level:
     """The levels of a search, [L], coarsest first."""
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
@@ -261,6 +280,7 @@ def stack_levels(views: tuple[View, ...], camera: Camera, levels: tuple[int, ...
         jnp.array(columns),
         jnp.array([options.islands[level] for level in levels]),
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
+        None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
     )
 
 
@@ -286,13 +306,17 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         level.points,
         level.columns,
         level.is_undecided if options.centred else None,
-        options.loss,
-        options.depth,
+        loss=options.loss,
+        use_depth=options.depth,
     )
 
 
 def fit_objective(
-    level: Level, target: Target, options: AlignmentOptions, guess: Float[Array, "4 4"]
+    level: Level,
+    target: Target,
+    options: AlignmentOptions,
+    guess: Float[Array, "4 4"],
+    exchanged: Exchanged | None = None,
 ) -> tuple[Objective, Brightness]:
     """E of one level with everything that is estimated from the data at the motion that it starts from.
 
@@ -315,6 +339,10 @@ def fit_objective(
         scales = estimate_scales(objective, guess, level.depth_weight)
         weight = jnp.where(level.is_first, level.depth_weight * DEPTH_WEIGHT_RANGE[1], scales.depth_weight)
         objective = replace(objective, scales=scales._replace(depth_weight=weight))
+    if exchanged is not None and level.exchanged is not None:
+        swapped = level._replace(reference=level.exchanged, exchanged=None)
+        backward, _ = fit_objective(swapped, exchanged.target, options, rigid_inverse(guess))
+        objective = replace(objective, backward=replace(backward, scales=objective.scales))
     return objective, brightness
 
 
@@ -376,6 +404,7 @@ def align_views(
     key: PRNGKeyArray,
     guesses: Float[Array, "g 4 4"],
     record: bool = False,
+    exchanged: Exchanged | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -390,14 +419,15 @@ def align_views(
         key: Random key.
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
         record: Whether the candidates are kept (static).
+        exchanged: What the `symmetric` error needs; None where it is not asked for.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `solver.levels`.
     """
-    levels = stack_levels(views, camera, solver.levels, options)
+    levels = stack_levels(views, camera, solver.levels, options, exchanged)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
     start_key, key = jax.random.split(key)
-    origins = _origins(first, target, options, guesses, start_key)
+    origins = _origins(first, target, options, guesses, start_key, exchanged)
     start = Search(
         origins,
         jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
@@ -406,7 +436,7 @@ def align_views(
     )
 
     def search_level(search: Search, level: Level) -> tuple[Search, tuple[jax.Array, Population | None]]:
-        objective, brightness = fit_objective(level, target, options, search.islands[0])
+        objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
         basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
         problem = Problem(objective, search.islands[0], basis, origins[0])
         places = search.islands.shape[0]
@@ -463,7 +493,12 @@ def _search_island(
 
 
 def _origins(
-    level: Level, target: Target, options: AlignmentOptions, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray
+    level: Level,
+    target: Target,
+    options: AlignmentOptions,
+    guesses: Float[Array, "g 4 4"],
+    key: PRNGKeyArray,
+    exchanged: Exchanged | None,
 ) -> Float[Array, "i 4 4"]:
     """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
     about it.
@@ -473,7 +508,7 @@ def _origins(
     places = max(options.islands)
     if not options.scouts:
         return jnp.repeat(leader[None], places, axis=0)
-    objective, _ = fit_objective(level, target, options, leader)
+    objective, _ = fit_objective(level, target, options, leader, exchanged)
     spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
     twists = spread * jax.random.normal(key, (options.scouts, 6))
     scouts = leader @ exp(twists.at[0].set(0.0))
@@ -578,9 +613,11 @@ def _align_images(
     guess: Float[Array, "4 4"],
 ) -> Alignment:
     pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale, LEVELS) for image in (reference, target)]
-    view = View(prepare_reference(pyramids[0], camera, solver.levels, options), jnp.eye(4))
-    target_levels = prepare_target(pyramids[1], solver.levels)
-    return align_views((view,), target_levels, camera, solver, options, key, guess[None])[0]
+    points = [prepare_reference(pyramid, camera, solver.levels, options) for pyramid in pyramids]
+    packed = [prepare_target(pyramid, solver.levels) for pyramid in pyramids]
+    exchanged = Exchanged(points[1], packed[0]) if options.symmetric else None
+    view = View(points[0], jnp.eye(4))
+    return align_views((view,), packed[1], camera, solver, options, key, guess[None], exchanged=exchanged)[0]
 
 
 @jax.jit

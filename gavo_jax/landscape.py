@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from gavo_jax.alignment import (
     Alignment,
     AlignmentOptions,
+    Exchanged,
     View,
     fit_objective,
     prepare_reference,
@@ -67,10 +68,13 @@ def _score(
     reference, target = (build_pyramid(images[i], images[i + 1], camera.depth_scale, LEVELS) for i in (0, 2))
     motions = target_T_reference @ exp(steps[:, None] * directions[:, None, :])
     view = View(prepare_reference(reference, camera, levels, options), jnp.eye(4))
-    stacked, packed = stack_levels((view,), camera, levels, options), prepare_target(target, levels)
+    exchanged = None
+    if options.symmetric:
+        exchanged = Exchanged(prepare_reference(target, camera, levels, options), prepare_target(reference, levels))
+    stacked, packed = stack_levels((view,), camera, levels, options, exchanged), prepare_target(target, levels)
     errors = []
     for place in range(len(levels)):
         level = jax.tree.map(lambda leaf, place=place: leaf[place], stacked)
-        objective, _ = fit_objective(level, packed, options, target_T_reference)
+        objective, _ = fit_objective(level, packed, options, target_T_reference, exchanged)
         errors.append(objective.score(motions.reshape(-1, 4, 4))[0].reshape(len(directions), -1))
     return errors

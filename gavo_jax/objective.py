@@ -8,7 +8,7 @@ so the noise of 1/z is the same at every range and one scale serves all pixels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +30,7 @@ from gavo_jax.warp import (
     log,
     look_up,
     right_jacobian,
+    rigid_inverse,
     sample_depth,
     sample_grey,
     warp,
@@ -250,6 +251,9 @@ class Objective:
     centred: Bool[Array, ""] | None = None
     """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
     larger than any contrast, says nothing against the true motion. None: never, at no cost."""
+    backward: "Objective | None" = None
+    """The same error with the frames' parts exchanged: the target's points seen from the reference, by the inverse
+    motion. With it E is the mean of both, as neither frame is nearer to the truth than the other."""
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
 
@@ -338,7 +342,8 @@ class Objective:
 
     def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
         """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
-        return self._conclude(self._sums(self._cost(self.residuals(target_T_reference))))
+        found = self._conclude(self._sums(self._cost(self.residuals(target_T_reference))))
+        return found if self.backward is None else _mean(found, self.backward.error(rigid_inverse(target_T_reference)))
 
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
@@ -346,7 +351,15 @@ class Objective:
         """Errors and overlaps of P motions in one call; those not `counted` cost nothing and have an error of +inf."""
         if counted is None:
             counted = jnp.ones(target_T_reference.shape[0], bool)
-        return _score(self, target_T_reference, counted)
+        found = _score(replace(self, backward=None), target_T_reference, counted)
+        if self.backward is None:
+            return found
+        return _mean(found, self.backward.score(rigid_inverse(target_T_reference), counted))
+
+
+def _mean(forward: tuple[jax.Array, jax.Array], backward: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Error and overlap of both directions together."""
+    return 0.5 * (forward[0] + backward[0]), jnp.minimum(forward[1], backward[1])
 
 
 def _lane_sum(values: Float[Array, "*n"]) -> Float[Array, ""]:
@@ -500,26 +513,27 @@ class Problem:
 
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
-        motion = self.transform(x)
-        mean = self.objective.mean_residual(motion)
-
-        def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
-            r = self.objective.residuals(motion, reference, mean)
-            gradient, hessian = _normal_equations(self._weighted_terms(x, reference, r))
-            return self.objective._sums(self.objective._cost(r)), gradient, hessian
-
-        return self._linearization(*self.objective.sum_over_points(part, LINEARIZED_CHUNK))
+        motion, tangent = self._tangent(x)
+        model = _linearize(self.objective, motion, tangent)
+        backward = self.objective.backward
+        if backward is None:
+            return model
+        inverse = rigid_inverse(motion)
+        other = _linearize(backward, inverse, -jnp.einsum("ij,jkm,kl->ilm", inverse, tangent, inverse))
+        error, overlap = _mean(model[:2], other[:2])
+        return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
 
     def examine(self, x: Float[Array, " 6"]) -> tuple[Linearization, Float[Array, "6 6"], Residuals]:
-        """E's derivatives, the covariance of its gradient, and the residuals.
+        """E's derivatives, the covariance of its gradient, and the residuals; from the reference to the target alone.
 
         The covariance comes from the gradient's spread over tiles of the target image: residuals of neighbouring
         pixels are correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both
         sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
         """
         objective, plane = self.objective, self.objective.plane
-        r = objective.residuals(self.transform(x))
-        terms = self._weighted_terms(x, objective.reference, r)
+        motion, tangent = self._tangent(x)
+        r = objective.residuals(motion)
+        terms = _weighted_terms(objective, tangent, objective.reference, r)
         sums = objective._sums(objective._cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
@@ -528,37 +542,56 @@ class Problem:
         by_tile *= 2.0 / objective._divisor(sums[1])
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
-        return self._linearization(sums, *_normal_equations(terms)), scatter, r
+        return _linearization(objective, sums, *_normal_equations(terms)), scatter, r
 
-    def _linearization(self, sums: jax.Array, gradient: jax.Array, hessian: jax.Array) -> Linearization:
-        error, overlap = self.objective._conclude(sums)
-        factor = 2.0 / self.objective._divisor(sums[1])
-        return Linearization(error, overlap, factor * gradient, factor * hessian)
+    def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "4 4 6"]]:
+        """The motion, and its derivative by x."""
+        motion = self.transform(x)
+        step = GENERATORS @ (right_jacobian(self.basis @ x) @ self.basis)
+        return motion, jnp.einsum("ij,jkm->ikm", motion, step)
 
-    def _weighted_terms(self, x: Float[Array, " 6"], reference: Reference, r: Residuals) -> list[Term]:
-        """For each channel J of [6, N], r and w of [N]: half of E's gradient is Σ J w r over the number of points, half
-        its Gauss-Newton Hessian Σ w J Jᵀ.
-        """
-        objective = self.objective
-        twist = self.basis @ x
-        tangent = jnp.einsum("ij,jkm->ikm", self.transform(x), GENERATORS @ (right_jacobian(twist) @ self.basis))
-        scales, facing = objective.scales, reference.facing
-        grey, depth = r.grey_sample, r.depth_sample
-        one = jnp.float32(1.0)
-        channels = [(r.grey, scales.grey, r.inside, one, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
-        if objective.use_depth:
-            factor = scales.depth_weight * (scales.grey / scales.depth) ** 2
-            slopes = (facing * depth.along_u, facing * depth.along_v, -facing)
-            channels.append((r.depth, scales.depth, r.depth_valid, factor, *slopes))
-        terms = []
-        for residual, scale, mask, factor, along_u, along_v, along_q in channels:
-            jacobian = _jacobian(along_u, along_v, along_q, r.warped, reference.points, objective.plane, tangent)
-            jacobian = jnp.where(mask > 0, jacobian, 0.0)
-            s = (residual / scale) ** 2
-            _, slope = jax.jvp(objective.loss, (s,), (jnp.ones_like(s),))
-            weight = factor * jnp.where(mask > 0, slope, 0.0)
-            terms.append((jacobian.reshape(6, -1), residual.reshape(-1), weight.reshape(-1)))
-        return terms
+
+def _linearize(objective: Objective, motion: Float[Array, "4 4"], tangent: Float[Array, "4 4 6"]) -> Linearization:
+    """E of one direction and its first two derivatives at a motion whose derivative is `tangent`."""
+    mean = objective.mean_residual(motion)
+
+    def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
+        r = objective.residuals(motion, reference, mean)
+        gradient, hessian = _normal_equations(_weighted_terms(objective, tangent, reference, r))
+        return objective._sums(objective._cost(r)), gradient, hessian
+
+    return _linearization(objective, *objective.sum_over_points(part, LINEARIZED_CHUNK))
+
+
+def _linearization(objective: Objective, sums: jax.Array, gradient: jax.Array, hessian: jax.Array) -> Linearization:
+    error, overlap = objective._conclude(sums)
+    factor = 2.0 / objective._divisor(sums[1])
+    return Linearization(error, overlap, factor * gradient, factor * hessian)
+
+
+def _weighted_terms(
+    objective: Objective, tangent: Float[Array, "4 4 6"], reference: Reference, r: Residuals
+) -> list[Term]:
+    """For each channel J of [6, N], r and w of [N]: half of E's gradient is Σ J w r over the number of points, half its
+    Gauss-Newton Hessian Σ w J Jᵀ.
+    """
+    scales, facing = objective.scales, reference.facing
+    grey, depth = r.grey_sample, r.depth_sample
+    one = jnp.float32(1.0)
+    channels = [(r.grey, scales.grey, r.inside, one, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
+    if objective.use_depth:
+        factor = scales.depth_weight * (scales.grey / scales.depth) ** 2
+        slopes = (facing * depth.along_u, facing * depth.along_v, -facing)
+        channels.append((r.depth, scales.depth, r.depth_valid, factor, *slopes))
+    terms = []
+    for residual, scale, mask, factor, along_u, along_v, along_q in channels:
+        jacobian = _jacobian(along_u, along_v, along_q, r.warped, reference.points, objective.plane, tangent)
+        jacobian = jnp.where(mask > 0, jacobian, 0.0)
+        s = (residual / scale) ** 2
+        _, slope = jax.jvp(objective.loss, (s,), (jnp.ones_like(s),))
+        weight = factor * jnp.where(mask > 0, slope, 0.0)
+        terms.append((jacobian.reshape(6, -1), residual.reshape(-1), weight.reshape(-1)))
+    return terms
 
 
 def _normal_equations(terms: list[Term]) -> tuple[Float[Array, " 6"], Float[Array, "6 6"]]:

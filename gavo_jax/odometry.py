@@ -21,6 +21,7 @@ from gavo_jax.alignment import (
     Alignment,
     AlignmentOptions,
     AlignmentStatus,
+    Exchanged,
     Population,
     View,
     align_views,
@@ -37,7 +38,7 @@ from gavo_jax.objective import Reference, share_in_view
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.warp import exp, synchronise_depth
+from gavo_jax.warp import Target, exp, synchronise_depth
 
 
 class TrackerState(NamedTuple):
@@ -45,6 +46,8 @@ class TrackerState(NamedTuple):
 
     previous: Reference
     keyframe: Reference
+    previous_image: Target
+    """The previous frame, packed for sampling: what the symmetric error needs of it."""
     previous_T_keyframe: Float[Array, "4 4"]
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
@@ -98,7 +101,10 @@ def _track(
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
     packed = prepare_target(target, solver.levels)
-    result, populations = align_views(views, packed, camera, solver, alignment, key, guesses, record)
+    exchanged = None
+    if alignment.symmetric:
+        exchanged = Exchanged(prepare_reference(target, camera, solver.levels, alignment), state.previous_image)
+    result, populations = align_views(views, packed, camera, solver, alignment, key, guesses, record, exchanged)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
     newest = prepare_reference(target, camera, solver.levels, alignment)
@@ -109,7 +115,7 @@ def _track(
     keyframe, target_T_keyframe = jax.tree.map(
         lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
-    return TrackerState(newest, keyframe, target_T_keyframe, result.xi, clock.elapsed), result, populations
+    return TrackerState(newest, keyframe, packed, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
 
 @jax.jit
@@ -117,7 +123,8 @@ def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignme
     """State after the first frame: it is both references, and nothing is known of the motion."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     reference = prepare_reference(pyramid, camera, solver.levels, alignment)
-    return TrackerState(reference, reference, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
+    packed = prepare_target(pyramid, solver.levels)
+    return TrackerState(reference, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,14 @@ def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
     return jaxlie.SE3.from_matrix(transform).log()
 
 
+def rigid_inverse(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
+    """The inverse of a rigid motion, [Rᵀ, −Rᵀt]."""
+    turned = jnp.swapaxes(transform[..., :3, :3], -1, -2)
+    moved = -jnp.einsum("...ij,...j->...i", turned, transform[..., :3, 3])
+    top = jnp.concatenate([turned, moved[..., None]], axis=-1)
+    return jnp.concatenate([top, transform[..., 3:, :]], axis=-2)
+
+
 def _generators() -> np.ndarray:
     basis = np.zeros((4, 4, 6), np.float32)
     for i in range(3):

@@ -192,8 +192,12 @@ class _Stack:
 
     def _rows(self, values: Sequence[Any]) -> Any:
         """Stack R pytrees of numbers, laid out over the devices."""
-        stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in leaves]), *values)
+        stacked = jax.tree.map(lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *values)
         return jax.device_put(stacked, self._sharding)
+
+
+def _as_array(leaf: Any) -> jax.Array:
+    return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf, jnp.float32)
 
 
 @jax.jit
