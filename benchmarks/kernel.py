@@ -29,14 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import (
-    AlignmentOptions,
-    View,
-    fit_objective,
-    prepare_reference,
-    prepare_target,
-    stack_levels,
-)
+from gavo_jax.alignment import AlignmentOptions, objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
@@ -164,14 +157,7 @@ def make_objective(
     pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, options: AlignmentOptions
 ) -> Objective:
     """E of a level of a pair, every pixel a point."""
-
-    @jax.jit
-    def make() -> Objective:
-        view = View(prepare_reference(pyramids[0], camera, (level,), options), jnp.eye(4))
-        only = jax.tree.map(lambda leaf: leaf[0], stack_levels((view,), camera, (level,), options))
-        return fit_objective(only, prepare_target(pyramids[1], (level,)), options, jnp.eye(4))[0]
-
-    return make()
+    return jax.jit(lambda: objectives_of(*pyramids, camera, (level,), options, jnp.eye(4))[0])()
 
 
 def make_scene(pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, motions: np.ndarray) -> Scene:

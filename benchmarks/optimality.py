@@ -24,12 +24,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from gavo_jax.alignment import (
     AlignmentOptions,
     Images,
-    View,
     align_views,
-    fit_objective,
-    prepare_reference,
-    prepare_target,
-    stack_levels,
+    objectives_of,
+    prepare_pair,
 )
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
@@ -74,15 +71,15 @@ def final_errors(
     key: PRNGKeyArray,
 ) -> FinalErrors:
     """E of one pair, everything by the same objective (see the module)."""
-    pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale) for image in (reference, target)]
-    views = (View(prepare_reference(pyramids[0], camera, genetic.levels, options), jnp.eye(4)),)
-    packed = prepare_target(pyramids[1], genetic.levels)
+    before, after = (build_pyramid(frame.grey, frame.depth, camera.depth_scale) for frame in (reference, target))
+    view, packed, exchanged = prepare_pair(before, after, camera, genetic.levels, options)
     found, descended = (
-        align_views(views, packed, camera, solver, options, key, jnp.eye(4)[None])[0].target_T_reference
+        align_views((view,), packed, camera, solver, options, key, jnp.eye(4)[None], exchanged=exchanged)[
+            0
+        ].target_T_reference
         for solver in (genetic, gauss_newton)
     )
-    finest = jax.tree.map(lambda leaf: leaf[-1], stack_levels(views, camera, genetic.levels, options))
-    objective, _ = fit_objective(finest, packed, options, found)
+    objective = objectives_of(before, after, camera, genetic.levels, options, found)[-1]
     return FinalErrors(
         objective.error(found)[0],
         objective.error(descended)[0],

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gavo_jax as gavo
-from gavo_jax.alignment import View, align_views, prepare_reference, prepare_target
-from gavo_jax.objective import Reference
+from gavo_jax.alignment import View, align_views, prepare_pair
 from gavo_jax.pyramid import build_pyramid
 from gavo_jax.warp import Target
 
@@ -26,18 +25,16 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     sequence = gavo.SyntheticSequence(frames=2)
     camera, still = sequence.camera, jnp.eye(4)
     options = gavo.AlignmentOptions()
-    pyramids = [build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence]
-    reference = prepare_reference(pyramids[0], camera, SOLVER.levels, options)
-    target = prepare_target(pyramids[1], SOLVER.levels)
+    before, after = (build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence)
+    view, target, _ = prepare_pair(before, after, camera, SOLVER.levels, options)
 
-    def final_error(key: jax.Array, decay: jax.Array, reference: Reference, target: Target) -> jax.Array:
+    def final_error(key: jax.Array, decay: jax.Array, view: View, target: Target) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
-        views = (View(reference, still),)
-        return align_views(views, target, camera, solver, options, key, still[None])[0].error
+        return align_views((view,), target, camera, solver, options, key, still[None])[0].error
 
     over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
     over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))
-    errors = np.asarray(over_both(jax.random.split(jax.random.key(0), seeds), jnp.array(decays), reference, target))
+    errors = np.asarray(over_both(jax.random.split(jax.random.key(0), seeds), jnp.array(decays), view, target))
 
     for decay, row in zip(decays, errors, strict=True):
         print(f"mutation_decay {decay:.2f}: median {np.median(row):.4f}, from {row.min():.4f} to {row.max():.4f}")

@@ -99,6 +99,8 @@ class AlignmentOptions:
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
             (static); see `Objective`.
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
+        refine: Whether the motion that wins where islands compete is taken through all levels once more, alone, with
+            the brightness and scales that are known only then (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels (static); None takes every
@@ -121,6 +123,7 @@ class AlignmentOptions:
     brightness: bool = static(True)
     centred: bool = static(False)
     symmetric: bool = static(False)
+    refine: bool = static(False)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: int | None = static(4800)
@@ -232,12 +235,25 @@ def prepare_target(pyramid: Pyramid, levels: tuple[int, ...]) -> Target:
     return pack_target(*(pyramid[level] for level in levels))
 
 
+def prepare_pair(
+    reference: Pyramid, target: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
+) -> tuple[View, Target, Exchanged | None]:
+    """What a search needs of two frames."""
+    view = View(prepare_reference(reference, camera, levels, options), jnp.eye(4))
+    exchanged = None
+    if options.symmetric:
+        exchanged = Exchanged(prepare_reference(target, camera, levels, options), prepare_target(reference, levels))
+    return view, prepare_target(target, levels), exchanged
+
+
 class Level(NamedTuple):
     """What changes from level to level; with a leading axis L the input of the scan over the levels."""
 
     number: Integer[Array, ""]
     """In the pyramid; 0 is the full image."""
     is_first: Bool[Array, ""]
+    is_again: Bool[Array, ""]
+    """Whether one motion is refined, after a search in which several competed."""
     plane: ImagePlane
     reference: Reference
     """[V, N]: the points of all views as rays of the anchor camera."""
@@ -265,15 +281,16 @@ def stack_levels(
     options: AlignmentOptions,
     exchanged: Exchanged | None = None,
 ) -> Level:
-    """The levels of a search, [L], coarsest first."""
+    """The visits of a search to the levels, [L], coarsest first."""
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
     cells = [cell_of(c, options.points) for c in cameras]
     columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
     rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
-    return Level(
+    once = Level(
         jnp.array(levels),
         jnp.arange(len(levels)) == 0,
+        jnp.zeros(len(levels), bool),
         image_planes(camera, levels),
         jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved),
         jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
@@ -282,6 +299,19 @@ def stack_levels(
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
         None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
     )
+    if not options.refine:
+        return once
+    visits = visited_levels(levels, options)
+    first_round = jnp.arange(len(visits)) < len(visits) - len(levels)
+    order = jnp.array([levels.index(level) for level in visits])
+    rounds = jax.tree.map(lambda leaf: leaf[order], once)
+    islands = jnp.where(first_round, rounds.islands, 1)
+    return rounds._replace(is_first=rounds.is_first & first_round, is_again=~first_round, islands=islands)
+
+
+def visited_levels(levels: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
+    """The levels of a search in the order in which it visits them; with `refine` some twice."""
+    return tuple(level for level in levels if options.refine and options.islands[level] > 1) + levels
 
 
 class Brightness(NamedTuple):
@@ -344,6 +374,22 @@ def fit_objective(
         backward, _ = fit_objective(swapped, exchanged.target, options, rigid_inverse(guess))
         objective = replace(objective, backward=replace(backward, scales=objective.scales))
     return objective, brightness
+
+
+def objectives_of(
+    reference: Pyramid,
+    target: Pyramid,
+    camera: Camera,
+    levels: tuple[int, ...],
+    options: AlignmentOptions,
+    target_T_reference: Float[Array, "4 4"],
+) -> list[Objective]:
+    """E of some levels of a pair, each as a search that starts its level at one motion would minimise it."""
+    view, packed, exchanged = prepare_pair(reference, target, camera, levels, options)
+    options = replace(options, refine=False)
+    stacked = stack_levels((view,), camera, levels, options, exchanged)
+    rows = [jax.tree.map(lambda leaf, place=place: leaf[place], stacked) for place in range(len(levels))]
+    return [fit_objective(level, packed, options, target_T_reference, exchanged)[0] for level in rows]
 
 
 def unchanged_brightness(level: Level) -> Brightness:
@@ -422,7 +468,8 @@ def align_views(
         exchanged: What the `symmetric` error needs; None where it is not asked for.
 
     Returns:
-        The alignment and, where they were recorded, the candidates of each level of `solver.levels`.
+        The alignment and, where they were recorded, the candidates of each visit to a level, in the order of
+        `visited_levels`.
     """
     levels = stack_levels(views, camera, solver.levels, options, exchanged)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
@@ -440,7 +487,7 @@ def align_views(
         basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
         problem = Problem(objective, search.islands[0], basis, origins[0])
         places = search.islands.shape[0]
-        keys = jax.random.split(jax.random.fold_in(key, level.number), places)
+        keys = jax.random.split(jax.random.fold_in(key, level.number + LEVELS * level.is_again), places)
         island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
         if places == 1:
@@ -459,7 +506,7 @@ def align_views(
         return search, (history[order[0]], population)
 
     search, (histories, populations) = jax.lax.scan(search_level, start, levels)
-    iterations = [solver.iterations[level] for level in solver.levels]
+    iterations = [solver.iterations[level] for level in visited_levels(solver.levels, options)]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness)
     return _conclude(objective, search, finest, options, history), populations
@@ -612,12 +659,11 @@ def _align_images(
     key: PRNGKeyArray,
     guess: Float[Array, "4 4"],
 ) -> Alignment:
-    pyramids = [build_pyramid(image.grey, image.depth, camera.depth_scale, LEVELS) for image in (reference, target)]
-    points = [prepare_reference(pyramid, camera, solver.levels, options) for pyramid in pyramids]
-    packed = [prepare_target(pyramid, solver.levels) for pyramid in pyramids]
-    exchanged = Exchanged(points[1], packed[0]) if options.symmetric else None
-    view = View(points[0], jnp.eye(4))
-    return align_views((view,), packed[1], camera, solver, options, key, guess[None], exchanged=exchanged)[0]
+    before, after = (
+        build_pyramid(frame.grey, frame.depth, camera.depth_scale, LEVELS) for frame in (reference, target)
+    )
+    view, packed, exchanged = prepare_pair(before, after, camera, solver.levels, options)
+    return align_views((view,), packed, camera, solver, options, key, guess[None], exchanged=exchanged)[0]
 
 
 @jax.jit

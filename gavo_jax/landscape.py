@@ -8,16 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gavo_jax.alignment import (
-    Alignment,
-    AlignmentOptions,
-    Exchanged,
-    View,
-    fit_objective,
-    prepare_reference,
-    prepare_target,
-    stack_levels,
-)
+from gavo_jax.alignment import Alignment, AlignmentOptions, objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.plots import Landscape
@@ -67,14 +58,5 @@ def _score(
 ) -> list[Float[Array, "2 n"]]:
     reference, target = (build_pyramid(images[i], images[i + 1], camera.depth_scale, LEVELS) for i in (0, 2))
     motions = target_T_reference @ exp(steps[:, None] * directions[:, None, :])
-    view = View(prepare_reference(reference, camera, levels, options), jnp.eye(4))
-    exchanged = None
-    if options.symmetric:
-        exchanged = Exchanged(prepare_reference(target, camera, levels, options), prepare_target(reference, levels))
-    stacked, packed = stack_levels((view,), camera, levels, options, exchanged), prepare_target(target, levels)
-    errors = []
-    for place in range(len(levels)):
-        level = jax.tree.map(lambda leaf, place=place: leaf[place], stacked)
-        objective, _ = fit_objective(level, packed, options, target_T_reference, exchanged)
-        errors.append(objective.score(motions.reshape(-1, 4, 4))[0].reshape(len(directions), -1))
-    return errors
+    objectives = objectives_of(reference, target, camera, levels, options, target_T_reference)
+    return [e.score(motions.reshape(-1, 4, 4))[0].reshape(len(directions), -1) for e in objectives]

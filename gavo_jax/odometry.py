@@ -385,7 +385,8 @@ class Odometry:
         result = on_host(result)
         if populations is not None:
             host = jax.device_get(populations)
-            self.populations = tuple(jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(len(solver.levels)))
+            visits = range(len(host.level))
+            self.populations = tuple(jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in visits)
         return state, result
 
 

@@ -114,6 +114,9 @@ _EQUAL = 1.0 / DEPTH_WEIGHT_RANGE[1]
 """Factor with which depth weighs, at most, as much as grey."""
 WIDE_OBJECTIVE = AlignmentOptions(
     centred=True,
+    symmetric=True,
+    refine=True,
+    points=19200,
     depth_weight=(_EQUAL, _EQUAL, _EQUAL, 1.0, 1.0),
     islands=(1, 1, 4, 16, 96),
     scouts=8192,

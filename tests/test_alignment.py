@@ -10,14 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus, align, align_batch
+from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus, align, align_batch, visited_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.objective import l2
 from gavo_jax.presets import METHODS, PRESETS, get_preset
 from gavo_jax.pyramid import LEVELS
 from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.warp import exp
 
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
@@ -67,6 +69,33 @@ def test_recovers_an_exact_motion(
     assert metres < 0.0005 and degrees < 0.02
     assert result.status is AlignmentStatus.OK
     assert 0.9 < result.overlap <= 1
+
+
+def test_the_symmetric_error_does_not_care_which_frame_is_the_reference(
+    sequence: SyntheticSequence, frames: dict[int, Frame]
+) -> None:
+    start, far = frames[0], SyntheticSequence(frames=30)[9]
+    truth = target_T_reference(sequence, 0, 9)
+
+    def there_and_back(symmetric: bool) -> tuple[float, float]:
+        options = AlignmentOptions(symmetric=symmetric, robust_scale=False, brightness=False, depth=False, loss=l2)
+        there = align(start, far, sequence.camera, QUICK, guess=jnp.asarray(truth), options=options)
+        back = align(far, start, sequence.camera, QUICK, guess=jnp.asarray(np.linalg.inv(truth)), options=options)
+        return difference(back.target_T_reference, np.linalg.inv(np.asarray(there.target_T_reference, float)))
+
+    one_way, both_ways = there_and_back(False), there_and_back(True)
+    assert both_ways[0] < one_way[0] / 5 and both_ways[1] < one_way[1] / 5
+    assert one_way[0] > 1e-4
+
+
+def test_a_search_that_refines_visits_its_levels_again(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    options = AlignmentOptions(islands=(1, 1, 1, 1, 3), scouts=32, refine=True)
+    assert visited_levels((4, 3), options) == (4, 4, 3)
+    assert visited_levels((4, 3), replace(options, refine=False)) == (4, 3)
+    solver = GeneticAlgorithm(population=16, iterations=(0, 0, 0, 5, 7))
+    result = align(frames[0], frames[1], sequence.camera, solver, options=options)
+    assert result.history.shape == (7 + 7 + 5,)
+    assert difference(result.target_T_reference, target_T_reference(sequence, 0, 1))[0] < 0.01
 
 
 def test_the_result_tells_all(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:

@@ -24,6 +24,7 @@ from gavo_jax.objective import (
     estimate_brightness,
     estimate_scales,
     explained_variance,
+    huber,
     l2,
     make_reference,
     move_reference,
@@ -362,6 +363,57 @@ def test_gradient_against_central_differences(loss: str, depth_weight: float) ->
     model = jit_linearize(problem, x.astype(np.float32))
     assert float(model.error) == pytest.approx(reference_error(x), rel=1e-4)
     np.testing.assert_allclose(model.gradient, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def exchanged(pair: oracle.Pair) -> oracle.Pair:
+    return oracle.Pair(pair.camera, *pair[3:], *pair[1:3])
+
+
+def test_symmetric_error_is_the_mean_of_both_directions() -> None:
+    scales = (20.0, 0.05, 0.3)
+    forward, backward = random_pair(3), exchanged(random_pair(3))
+    objective = replace(build(forward, huber, scales), backward=build(backward, huber, scales))
+    motions = [oracle.expm(np.random.default_rng(i).normal(0, 0.05, 6)) for i in range(5)]
+    expected = [
+        (
+            oracle.error(oracle.residuals(forward, motion), "huber", *scales)
+            + oracle.error(oracle.residuals(backward, np.linalg.inv(motion)), "huber", *scales)
+        )
+        / 2
+        for motion in motions
+    ]
+    stacked = jnp.asarray(np.stack(motions), jnp.float32)
+    np.testing.assert_allclose(jit_score(objective, stacked)[0], expected, rtol=2e-3)
+    np.testing.assert_allclose(jit_error(objective, stacked[0])[0], expected[0], rtol=2e-3)
+    one_way = [jit_score(build(pair), stacked[:1])[1] for pair in (forward, backward)]
+    assert abs(float(one_way[0][0]) - float(one_way[1][0])) > 0.01
+
+
+def test_symmetric_gradient_against_central_differences() -> None:
+    rng = np.random.default_rng(5)
+    forward = smooth_pair(shift=(0.4, -0.3))
+    inner = np.pad(np.ones((CAMERA.height - 12, CAMERA.width - 12)), 6)
+    forward = forward._replace(target_inverse_depth=forward.target_inverse_depth * inner)
+    backward = exchanged(forward)
+    scales = (6.0, 0.01, 0.0)
+    origin, basis = oracle.expm(rng.normal(0, 0.01, 6)), np.diag(rng.uniform(0.5, 2, 6))
+    x = rng.normal(0, 0.005, 6)
+
+    def reference_error(x: np.ndarray) -> float:
+        motion = origin @ oracle.expm(basis @ x)
+        errors = [
+            oracle.error(oracle.residuals(pair, m), "cauchy", *scales)
+            for pair, m in ((forward, motion), (backward, np.linalg.inv(motion)))
+        ]
+        return sum(errors) / 2
+
+    objective = replace(build(forward, LOSSES["cauchy"], scales), backward=build(backward, LOSSES["cauchy"], scales))
+    problem = Problem(objective, jnp.asarray(origin, jnp.float32), jnp.asarray(basis, jnp.float32))
+    model = jit_linearize(problem, x.astype(np.float32))
+    expected = central_differences(reference_error, x, 1e-7)
+    assert float(model.error) == pytest.approx(reference_error(x), rel=1e-4)
+    np.testing.assert_allclose(model.gradient, expected, atol=2e-3 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(np.asarray(model.hessian, float)).min() > 0
 
 
 @pytest.mark.parametrize("loss", LOSSES)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gavo_jax import plots
+from gavo_jax.alignment import visited_levels
 from gavo_jax.cli.screen import pair_progress
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
@@ -104,11 +105,12 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
     if not plots.available() or not good:
         return
     solver = odometry.solver
-    widths = [solver.iterations[level] for level in solver.levels]
+    visits = visited_levels(solver.levels, odometry.alignment)
+    widths = [solver.iterations[level] for level in visits]
     whole = [step.alignment.history for step in good if len(step.alignment.history) == sum(widths)]
     if whole:
         parts = np.split(np.stack(whole), np.cumsum(widths)[:-1], axis=1)
-        histories = dict(zip(solver.levels, parts, strict=True))
+        histories = dict(zip(visits, parts, strict=True))
         save_figure(plots.plot_convergence(histories), folder, "convergence")
     if odometry.populations:
         trimmed = [population.trimmed() for population in odometry.populations]
