@@ -93,7 +93,7 @@ def _paper_solver(method: str) -> Any:
 _DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": GaussNewton(), "adam": GradientDescent()}
 
 _FAST = {
-    "ga": GeneticAlgorithm(population=(0, 16, 16, 24, 48), iterations=(0, 5, 5, 7, 10)),
+    "ga": GeneticAlgorithm(population=(0, 16, 16, 16, 32), iterations=(0, 3, 4, 6, 8)),
     "pso": ParticleSwarm(population=(0, 12, 16, 20, 32), iterations=(0, 8, 10, 12, 16)),
     "gauss-newton": GaussNewton(iterations=(0, 6, 8, 10, 12), patience=2),
     "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),
@@ -102,7 +102,7 @@ _FAST = {
 _WIDE = {
     "ga": GeneticAlgorithm(
         population=(0, 16, 20, 24, 16),
-        iterations=(0, 8, 8, 10, 12),
+        iterations=(0, 12, 12, 10, 12),
         spread=(0.5, 0.5, 1.0, 3.0, 15.0),
         mutation_step=(1.0, 1.0, 2.0, 5.0, 15.0),
     ),
@@ -128,7 +128,9 @@ WIDE_OBJECTIVE = AlignmentOptions(
 """Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
 16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
 so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
-their mean, and once few modes are left depth may count as much as grey does."""
+their mean, and once few modes are left depth may count as much as grey does. Over a wide baseline one frame may be
+blurred and each sees what the other does not, so both directions count; the winner is refined from the coarsest level
+again, on more points than tracking takes."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:

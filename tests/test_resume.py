@@ -243,14 +243,17 @@ def test_full_standard_output_is_one_line(clip, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_at_twenty_random_moments(clip, whole, tmp_path):
+@pytest.mark.parametrize("method", ["gauss-newton", "ga"])
+def test_killed_at_twenty_random_moments(clip, tmp_path, method):
     """SIGKILL at any time, then --resume: the same bytes each time."""
     rng = np.random.default_rng(0)
+    whole = tmp_path / "whole"
+    assert main(arguments(clip, whole, "--method", method)) == 0
     killed = 0
     for moment in range(20):
         output = tmp_path / str(moment)
         rows, delay = int(rng.integers(0, 39)), rng.uniform(0.0, 0.1)
-        command = [sys.executable, "-c", OFTEN, *arguments(clip, output)]
+        command = [sys.executable, "-c", OFTEN, *arguments(clip, output, "--method", method)]
         process = subprocess.Popen(command, env=READ_ONLY_CACHE)
         frames = output / "frames.csv"
         while process.poll() is None:
