@@ -28,7 +28,7 @@ from gavo_jax.objective import (
     cell_of,
     estimate_brightness,
     estimate_scales,
-    explained_variance,
+    explained_share,
     geman_mcclure,
     make_references,
     move_reference,
@@ -185,13 +185,13 @@ MIN_CONTRAST = 2.0
 """Grey levels: a smaller standard deviation over the reference makes a pair `LOW_TEXTURE`."""
 MIN_FINAL_OVERLAP = 0.3
 """Overlap of the result below which a pair is `LOW_OVERLAP`."""
-MIN_EXPLAINED = 0.85
-"""Share of the reference's grey variance that a result must explain; below, a pair is `HIGH_ERROR`, unless its grey
-residuals are as small as"""
-SMALL_GREY_SCALE = 8.0
-"""grey levels: a scene without contrast leaves little to explain."""
-MAX_DEPTH_SCALE = 0.03
-"""1/m, ten times the sensor's quantisation: depth residuals of a larger scale make a pair `HIGH_ERROR`."""
+MIN_EXPLAINED_GREY = 0.45
+"""Share of the grey residuals that must not be large (`objective.explained_share`); below, a pair is `HIGH_ERROR`."""
+MIN_EXPLAINED_DEPTH = 0.9
+"""The same of the depth residuals, for a motion of which the images leave a standard deviation above"""
+DOUBTFUL_DEVIATION = 0.005
+"""metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
+where it is not, depth that disagrees says that it is wrong."""
 MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
@@ -613,9 +613,8 @@ def _conclude(
     The scales are estimated there once more, so that errors of different solvers can be compared.
     """
     target_T_reference = search.islands[0]
-    scales = estimate_scales(objective, target_T_reference, finest.depth_weight)
     if options.robust_scale:
-        objective = replace(objective, scales=scales)
+        objective = replace(objective, scales=estimate_scales(objective, target_T_reference, finest.depth_weight))
     problem = Problem(objective, target_T_reference, jnp.eye(6))
     model, scatter, residuals = problem.examine(jnp.zeros(6))
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
@@ -627,14 +626,15 @@ def _conclude(
     depth_share = jnp.sum(has_reading) / (has_reading.shape[0] * has_reading.shape[1])
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(problem.origin)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
-    explained = explained_variance(objective, residuals)
-    unexplained = (explained < MIN_EXPLAINED) & (scales.grey > SMALL_GREY_SCALE)
+    explained = explained_share(residuals)
+    doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
+    unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
         (search.rival < MAX_RIVAL, AlignmentStatus.AMBIGUOUS),
         (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
-        (unexplained | (scales.depth > MAX_DEPTH_SCALE), AlignmentStatus.HIGH_ERROR),
+        (unexplained, AlignmentStatus.HIGH_ERROR),
         (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),
         (~finite, AlignmentStatus.NOT_FINITE),
         (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),

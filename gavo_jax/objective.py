@@ -735,11 +735,26 @@ GAIN_PRIOR = 100.0
 """Squared grey levels: the image contrast at which the estimated gain is half-way between 1 and the regression's."""
 
 
-def explained_variance(objective: Objective, residuals: Residuals) -> Float[Array, ""]:
-    """Share of the reference's grey variance that the target explains, 1 at best; points in view only."""
+LARGE_GREY_RESIDUAL = 12.0
+"""Grey levels: what noise and interpolation leave of a true match stays below, on all but edges and occlusions."""
+LARGE_DEPTH_RESIDUAL = 0.03
+"""1/m: ten times the quantisation of a structured-light sensor."""
+
+
+class ExplainedShare(NamedTuple):
+    """Share of a motion's residuals that are not large."""
+
+    grey: Float[Array, ""]
+    depth: Float[Array, ""]
+
+
+def explained_share(residuals: Residuals) -> ExplainedShare:
+    """How much of what both frames see a motion explains, 1 at best; points in view, with a reading, only."""
     r = residuals
-    count = jnp.maximum(jnp.sum(r.inside), 1.0)
-    grey = objective.reference.grey
-    mean = jnp.sum(r.inside * grey) / count
-    variance = jnp.sum(r.inside * (grey - mean) ** 2) / count
-    return 1.0 - (jnp.sum(r.inside * r.grey**2) / count) / jnp.maximum(variance, 1e-6)
+
+    def share(residual: jax.Array, mask: jax.Array, large: float) -> jax.Array:
+        return jnp.sum(mask * (jnp.abs(residual) < large)) / jnp.maximum(jnp.sum(mask), 1.0)
+
+    return ExplainedShare(
+        share(r.grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)
+    )

@@ -23,7 +23,7 @@ from gavo_jax.objective import (
     Scales,
     estimate_brightness,
     estimate_scales,
-    explained_variance,
+    explained_share,
     huber,
     l2,
     make_reference,
@@ -99,7 +99,7 @@ jit_error = jax.jit(lambda objective, motion: objective.error(motion))
 jit_score = jax.jit(lambda objective, motions: objective.score(motions))
 jit_problem_score = jax.jit(lambda problem, x: problem.score(x))
 jit_scales, jit_brightness = map(jax.jit, (estimate_scales, estimate_brightness))
-jit_explained = jax.jit(lambda objective, motion: explained_variance(objective, objective.residuals(motion)))
+jit_explained = jax.jit(lambda objective, motion: explained_share(objective.residuals(motion)))
 jit_linearize = jax.jit(lambda problem, x: problem.linearize(x))
 
 # metres and radians that move a point of SMALL by a few pixels
@@ -547,14 +547,18 @@ def test_brightness_of_a_blank_image_is_a_bias_alone() -> None:
     assert float(gain) == pytest.approx(1, abs=1e-3) and float(bias) == pytest.approx(10, abs=0.2)
 
 
-def test_jit_explained() -> None:
+def test_explained_share() -> None:
     rng = np.random.default_rng(3)
-    matched = float(jit_explained(build(smooth_pair(rim=1)), jnp.eye(4)))
-    noise = noisy_pair(rng.normal(0, 20, (48, 64)))
+    matched = jit_explained(build(smooth_pair(rim=1), scales=(1.0, 0.01, 0.3)), jnp.eye(4))
+    assert float(matched.grey) == pytest.approx(1, abs=1e-3) and float(matched.depth) == pytest.approx(1, abs=1e-3)
+    noise = noisy_pair(rng.normal(0, 12, (48, 64)))
+    one_sigma = float(jit_explained(build(noise), jnp.eye(4)).grey)
+    assert one_sigma == pytest.approx(0.683, abs=0.04)
     unrelated = noise._replace(target_grey=rng.permuted(noise.reference_grey))
-    assert matched == pytest.approx(1, abs=1e-3)
-    assert 0.6 < float(jit_explained(build(noise), jnp.eye(4))) < 0.95
-    assert float(jit_explained(build(unrelated), jnp.eye(4))) < 0
+    assert float(jit_explained(build(unrelated), jnp.eye(4)).grey) < 0.4
+    half = smooth_pair(rim=1)
+    half.target_inverse_depth[:, :32] += 0.1
+    assert 0.4 < float(jit_explained(build(half, scales=(1.0, 0.01, 0.3)), jnp.eye(4)).depth) < 0.6
 
 
 def test_gradient_scatter_is_a_covariance() -> None:
