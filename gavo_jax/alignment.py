@@ -29,6 +29,7 @@ from gavo_jax.objective import (
     estimate_brightness,
     estimate_scales,
     explained_share,
+    explained_variance,
     geman_mcclure,
     make_references,
     move_reference,
@@ -157,6 +158,8 @@ class Alignment(NamedTuple):
     """`AlignmentStatus`."""
     history: Float[Array, " iterations"]
     """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
+    suspect: Any = False
+    """Whether the result, though its status may be ok, explains so little that another search is worth its time."""
 
     @property
     def undetermined(self) -> str:
@@ -192,6 +195,13 @@ MIN_EXPLAINED_DEPTH = 0.9
 DOUBTFUL_DEVIATION = 0.005
 """metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
 where it is not, depth that disagrees says that it is wrong."""
+MIN_EXPLAINED_VARIANCE = 0.85
+"""Share of the reference's grey variance that a result must explain; below, it is `suspect`, unless its grey residuals
+are as small as"""
+SMALL_GREY_SCALE = 8.0
+"""grey levels: a scene without contrast leaves little to explain."""
+MAX_DEPTH_SCALE = 0.03
+"""1/m: a result whose depth residuals are of a larger scale is `suspect`."""
 MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
@@ -613,8 +623,9 @@ def _conclude(
     The scales are estimated there once more, so that errors of different solvers can be compared.
     """
     target_T_reference = search.islands[0]
+    scales = estimate_scales(objective, target_T_reference, finest.depth_weight)
     if options.robust_scale:
-        objective = replace(objective, scales=estimate_scales(objective, target_T_reference, finest.depth_weight))
+        objective = replace(objective, scales=scales)
     problem = Problem(objective, target_T_reference, jnp.eye(6))
     model, scatter, residuals = problem.examine(jnp.zeros(6))
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
@@ -629,6 +640,8 @@ def _conclude(
     explained = explained_share(residuals)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
+    faint = (explained_variance(objective, residuals) < MIN_EXPLAINED_VARIANCE) & (scales.grey > SMALL_GREY_SCALE)
+    suspect = faint | (scales.depth > MAX_DEPTH_SCALE)
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
@@ -640,7 +653,8 @@ def _conclude(
         (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
     ):
         status = jnp.where(found, jnp.int32(value), status)
-    return Alignment(problem.origin, log(problem.origin), model.error, model.overlap, covariance, status, history)
+    xi = log(problem.origin)
+    return Alignment(problem.origin, xi, model.error, model.overlap, covariance, status, history, suspect)
 
 
 class Images(NamedTuple):
@@ -776,7 +790,7 @@ def align_batch(
 def on_host(alignment: Alignment) -> Alignment:
     """The same result as NumPy arrays, with `status` as an `AlignmentStatus`."""
     host = jax.device_get(alignment)
-    return host._replace(status=AlignmentStatus(int(host.status)))
+    return host._replace(status=AlignmentStatus(int(host.status)), suspect=bool(host.suspect))
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:

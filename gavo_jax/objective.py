@@ -758,3 +758,13 @@ def explained_share(residuals: Residuals) -> ExplainedShare:
     return ExplainedShare(
         share(r.grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)
     )
+
+
+def explained_variance(objective: Objective, residuals: Residuals) -> Float[Array, ""]:
+    """Share of the reference's grey variance that the target explains, 1 at best; points in view only."""
+    r = residuals
+    count = jnp.maximum(jnp.sum(r.inside), 1.0)
+    grey = objective.reference.grey
+    mean = jnp.sum(r.inside * grey) / count
+    variance = jnp.sum(r.inside * (grey - mean) ** 2) / count
+    return 1.0 - (jnp.sum(r.inside * r.grey**2) / count) / jnp.maximum(variance, 1e-6)

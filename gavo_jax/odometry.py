@@ -337,23 +337,27 @@ class Odometry:
         return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay)), key
 
     def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment, bool]:
-        """Align with the references; a result that looks wrong is tried again by the wide search.
+        """Align with the references; a result that is not ok, or suspect, is tried again by the wide search.
 
         Returns:
             The state afterwards, the result, and whether its motion can be used: it is ok, or its high error is all
-            that speaks against it and the wide search ends at the same motion (blur, or something that moves).
+            that speaks against it and the wide search ends at the same motion (blur, or something that moves). A
+            suspect result stands unless the wide search finds one that is not.
         """
         assert before.tracker is not None
         clock, key = self.inputs(before, frame)
         state_after, result = self._run(before.tracker, frame, clock, key)
-        if result.status == AlignmentStatus.OK or not self.options.recover:
-            return state_after, result, result.status == AlignmentStatus.OK
+        usable = result.status == AlignmentStatus.OK
+        if not self.options.recover or (usable and not result.suspect):
+            return state_after, result, usable
         wide = self._wide()
         state_wide, second = self._run(
             before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
-        if second.status == AlignmentStatus.OK:
+        if second.status == AlignmentStatus.OK and not (usable and second.suspect):
             return state_wide, second, True
+        if usable:
+            return state_after, result, True
         confirmed = result.status == second.status == AlignmentStatus.HIGH_ERROR and _agree(result, second)
         return state_after, result, confirmed
 

@@ -93,7 +93,7 @@ def _paper_solver(method: str) -> Any:
 _DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": GaussNewton(), "adam": GradientDescent()}
 
 _FAST = {
-    "ga": GeneticAlgorithm(population=(0, 16, 16, 16, 32), iterations=(0, 3, 4, 6, 8)),
+    "ga": GeneticAlgorithm(population=(0, 16, 16, 24, 48), iterations=(0, 5, 5, 7, 10)),
     "pso": ParticleSwarm(population=(0, 12, 16, 20, 32), iterations=(0, 8, 10, 12, 16)),
     "gauss-newton": GaussNewton(iterations=(0, 6, 8, 10, 12), patience=2),
     "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),

@@ -187,7 +187,9 @@ class _Stack:
         host = jax.device_get(results)
         for i, lane in enumerate(self.lanes):
             result: Alignment = jax.tree.map(lambda leaf, i=i: leaf[i], host)
-            lane.first_attempt = result._replace(status=AlignmentStatus(int(result.status)))
+            lane.first_attempt = result._replace(
+                status=AlignmentStatus(int(result.status)), suspect=bool(result.suspect)
+            )
         return after
 
     def _rows(self, values: Sequence[Any]) -> Any:
