@@ -350,12 +350,14 @@ class Odometry:
         usable = result.status == AlignmentStatus.OK
         if not self.options.recover or (usable and not result.suspect):
             return state_after, result, usable
+        populations = self.populations
         wide = self._wide()
         state_wide, second = self._run(
             before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
         if second.status == AlignmentStatus.OK and not (usable and second.suspect):
             return state_wide, second, True
+        self.populations = populations
         if usable:
             return state_after, result, True
         confirmed = result.status == second.status == AlignmentStatus.HIGH_ERROR and _agree(result, second)
