@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,7 @@ def test_a_lost_and_an_unreadable_frame_are_shown_as_far_as_known(run, tmp_path)
         shown.open("lost", sequence.camera, sequence.timestamps, None)
         shown.watch(sequence[0], None)
         shown.watch(None, steps[0])
-        shown.watch(sequence[2], steps[1])
+        shown.watch(sequence[2], replace(steps[1], reference_timestamp=float(sequence.timestamps[1]), lost=False))
     found = read_recording(tmp_path / "lost.rrd")
     assert len(found["/images/target"]) == 2 and len(found["/world/estimate"]) == 2
     assert "/world/truth" not in found and "/images/warped" not in found
