@@ -73,12 +73,12 @@ def final_errors(
     """E of one pair, everything by the same objective (see the module)."""
     before, after = (build_pyramid(frame.grey, frame.depth, camera.depth_scale) for frame in (reference, target))
     view, packed, exchanged = prepare_pair(before, after, camera, genetic.levels, options)
-    found, descended = (
-        align_views((view,), packed, camera, solver, options, key, jnp.eye(4)[None], exchanged=exchanged)[
-            0
-        ].target_T_reference
+    guesses = jnp.eye(4)[None]
+    results = [
+        align_views((view,), packed, camera, solver, options, key, guesses, exchanged=exchanged)[0]
         for solver in (genetic, gauss_newton)
-    )
+    ]
+    found, descended = (result.target_T_reference for result in results)
     objective = objectives_of(before, after, camera, genetic.levels, options, found)[-1]
     return FinalErrors(
         objective.error(found)[0],

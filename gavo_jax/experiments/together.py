@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus
+from gavo_jax.alignment import Alignment, AlignmentOptions, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -186,10 +186,7 @@ class _Stack:
         after, results = _track_stack(states, *images, clocks, keys, *solved)
         host = jax.device_get(results)
         for i, lane in enumerate(self.lanes):
-            result: Alignment = jax.tree.map(lambda leaf, i=i: leaf[i], host)
-            lane.first_attempt = result._replace(
-                status=AlignmentStatus(int(result.status)), suspect=bool(result.suspect)
-            )
+            lane.first_attempt = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
         return after
 
     def _rows(self, values: Sequence[Any]) -> Any:
