@@ -29,7 +29,6 @@ from gavo_jax.objective import (
     estimate_brightness,
     estimate_scales,
     explained_share,
-    explained_variance,
     geman_mcclure,
     make_references,
     move_reference,
@@ -158,8 +157,6 @@ class Alignment(NamedTuple):
     """`AlignmentStatus`."""
     history: Float[Array, " iterations"]
     """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
-    suspect: Any = False
-    """Whether the result, though its status may be ok, explains so little that another search is worth its time."""
 
     @property
     def undetermined(self) -> str:
@@ -195,13 +192,6 @@ MIN_EXPLAINED_DEPTH = 0.9
 DOUBTFUL_DEVIATION = 0.005
 """metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
 where it is not, depth that disagrees says that it is wrong."""
-MIN_EXPLAINED_VARIANCE = 0.85
-"""Share of the reference's grey variance that a result must explain; below, it is `suspect`, unless its grey residuals
-are as small as"""
-SMALL_GREY_SCALE = 8.0
-"""grey levels: a scene without contrast leaves little to explain."""
-MAX_DEPTH_SCALE = 0.03
-"""1/m: a result whose depth residuals are of a larger scale is `suspect`."""
 MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
@@ -277,6 +267,8 @@ class Level(NamedTuple):
     """Factor on the depth cost's weight."""
     exchanged: Reference | None = None
     """[1, N]: the target's points, where the error is symmetric."""
+    readout: Float[Array, ""] | None = None
+    """Of a rolling shutter; see `Objective`."""
 
     @property
     def is_undecided(self) -> Bool[Array, ""]:
@@ -290,6 +282,7 @@ def stack_levels(
     levels: tuple[int, ...],
     options: AlignmentOptions,
     exchanged: Exchanged | None = None,
+    readout: Float[Array, ""] | None = None,
 ) -> Level:
     """The visits of a search to the levels, [L], coarsest first."""
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
@@ -308,6 +301,7 @@ def stack_levels(
         jnp.array([options.islands[level] for level in levels]),
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
         None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
+        None if readout is None else jnp.full(len(levels), readout),
     )
     if not options.refine:
         return once
@@ -346,6 +340,7 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         level.points,
         level.columns,
         level.is_undecided if options.centred else None,
+        level.readout,
         loss=options.loss,
         use_depth=options.depth,
     )
@@ -380,7 +375,8 @@ def fit_objective(
         weight = jnp.where(level.is_first, level.depth_weight * DEPTH_WEIGHT_RANGE[1], scales.depth_weight)
         objective = replace(objective, scales=scales._replace(depth_weight=weight))
     if exchanged is not None and level.exchanged is not None:
-        swapped = level._replace(reference=level.exchanged, exchanged=None)
+        readout = None if level.readout is None else -level.readout
+        swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)
         backward, _ = fit_objective(swapped, exchanged.target, options, rigid_inverse(guess))
         objective = replace(objective, backward=replace(backward, scales=objective.scales))
     return objective, brightness
@@ -461,6 +457,7 @@ def align_views(
     guesses: Float[Array, "g 4 4"],
     record: bool = False,
     exchanged: Exchanged | None = None,
+    readout: Float[Array, ""] | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -476,12 +473,14 @@ def align_views(
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
         record: Whether the candidates are kept (static).
         exchanged: What the `symmetric` error needs; None where it is not asked for.
+        readout: Time that the shutter takes from the first to the last row, over the time between anchor and target;
+            None where all rows are exposed at once.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each visit to a level, in the order of
         `visited_levels`.
     """
-    levels = stack_levels(views, camera, solver.levels, options, exchanged)
+    levels = stack_levels(views, camera, solver.levels, options, exchanged, readout)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
     start_key, key = jax.random.split(key)
     origins = _origins(first, target, options, guesses, start_key, exchanged)
@@ -640,8 +639,6 @@ def _conclude(
     explained = explained_share(residuals)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
-    faint = (explained_variance(objective, residuals) < MIN_EXPLAINED_VARIANCE) & (scales.grey > SMALL_GREY_SCALE)
-    suspect = faint | (scales.depth > MAX_DEPTH_SCALE)
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
@@ -654,7 +651,7 @@ def _conclude(
     ):
         status = jnp.where(found, jnp.int32(value), status)
     xi = log(problem.origin)
-    return Alignment(problem.origin, xi, model.error, model.overlap, covariance, status, history, suspect)
+    return Alignment(problem.origin, xi, model.error, model.overlap, covariance, status, history)
 
 
 class Images(NamedTuple):
@@ -790,7 +787,7 @@ def align_batch(
 def on_host(alignment: Alignment) -> Alignment:
     """The same result as NumPy arrays, with `status` as an `AlignmentStatus`."""
     host = jax.device_get(alignment)
-    return host._replace(status=AlignmentStatus(int(host.status)), suspect=bool(host.suspect))
+    return host._replace(status=AlignmentStatus(int(host.status)))
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:

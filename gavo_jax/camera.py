@@ -26,7 +26,7 @@ MAX_CAMERA_FILE_BYTES = 65536
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["fx", "fy", "cx", "cy", "depth_scale"],
+    data_fields=["fx", "fy", "cx", "cy", "depth_scale", "readout"],
     meta_fields=["width", "height", "distortion"],
 )
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Camera:
         height: image height, pixels.
         distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model, in OpenCV's order; of the images as recorded.
         depth_scale: raw depth units per metre (metres = raw / depth_scale).
+        readout: seconds from the exposure of the first row to that of the last (rolling shutter); 0 = all at once.
     """
 
     fx: float
@@ -54,6 +55,7 @@ class Camera:
     height: int
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
+    readout: float = 0.0
 
     @staticmethod
     def preset(name: str) -> "Camera":
@@ -148,10 +150,14 @@ class Camera:
             raise ValueError(f"image of {self.height} rows and {self.width} columns expected, got {image.shape[:2]}")
 
 
+READOUT = 0.02
+"""Seconds. Found on freiburg1's images by `benchmarks/shutter.py`, without ground truth, and taken over for the two
+others, which are of like make but were not at hand."""
+
 PRESETS = {
-    "fr1": Camera(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "fr2": Camera(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "fr3": Camera(535.4, 539.2, 320.1, 247.6, 640, 480),
+    "fr1": Camera(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), readout=READOUT),
+    "fr2": Camera(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), readout=READOUT),
+    "fr3": Camera(535.4, 539.2, 320.1, 247.6, 640, 480, readout=READOUT),
 }
 """Cameras of the TUM RGB-D benchmark (Sturm et al. 2012), as its page of file formats gives them."""
 
@@ -182,7 +188,8 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def load_camera(path_or_name: str | Path) -> Camera:
     """Return a camera from a preset's name (fr1, fr2, fr3) or from a small TOML or YAML file.
 
-    Keys: fx, fy, cx, cy, width, height; optional distortion (4 or 5 numbers: k1 k2 p1 p2 [k3]) and depth_scale.
+    Keys: fx, fy, cx, cy, width, height; optional distortion (4 or 5 numbers: k1 k2 p1 p2 [k3]), depth_scale and readout
+    (seconds).
     YAML is read in its flat form only: one `key: number` or `key: [number, …]` a line, `#` comments.
 
     Raises:
@@ -251,7 +258,7 @@ def _number(text: str) -> int | float:
 def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
     """Check the values of a camera file, key by key, and build the camera."""
     names = [field.name for field in fields(Camera)]
-    required = [name for name in names if name not in ("distortion", "depth_scale")]
+    required = [name for name in names if name not in ("distortion", "depth_scale", "readout")]
     for key in values:
         if key not in names:
             raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(names)})")
@@ -281,4 +288,5 @@ def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
         height=height,
         distortion=(k1, k2, p1, p2, k3),
         depth_scale=number("depth_scale", values.get("depth_scale", 5000.0), 1e-3, 1e6),
+        readout=number("readout", values.get("readout", 0.0), 0, 1),
     )

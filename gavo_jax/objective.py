@@ -23,14 +23,19 @@ from gavo_jax.warp import (
     GreySample,
     ImagePlane,
     Points,
+    Shutter,
+    Slopes,
     Target,
     Warped,
+    delay,
+    delayed_slopes,
     exp,
     inverse_depth_slopes,
     log,
     look_up,
     right_jacobian,
     rigid_inverse,
+    row_time,
     sample_depth,
     sample_grey,
     warp,
@@ -97,6 +102,8 @@ class Reference(NamedTuple):
     slope_v: Float[Array, "*views n"]
     facing: Float[Array, "*views n"]
     """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""
+    row_time: Float[Array, "*views n"]
+    """When the point's row was exposed; see `Shutter`."""
 
 
 def central_gradient(image: Float[Array, "h w"]) -> tuple[jax.Array, jax.Array]:
@@ -120,7 +127,8 @@ def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Refere
     y = jnp.broadcast_to(((jnp.arange(height) - camera.cy) / camera.fy)[:, None], (height, width))
     near = jnp.maximum(level.inverse_depth, 1e-3)
     facing = jax.lax.rsqrt(1.0 + (camera.fx * slope_u / near) ** 2 + (camera.fy * slope_v / near) ** 2)
-    images = [x, y, level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v, facing]
+    exposed = jnp.broadcast_to(row_time(jnp.arange(height), camera)[:, None], (height, width))
+    images = [x, y, level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v, facing, exposed]
     if cell == 1:
         flat = [image.reshape(-1) for image in images]
     else:
@@ -133,8 +141,8 @@ def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Refere
         steepness = jnp.where(level.inverse_depth > 0, grey_u**2 + grey_v**2, -1.0)
         chosen = jnp.argmax(blocks(steepness), axis=1)[:, None]
         flat = [jnp.take_along_axis(blocks(image), chosen, axis=1)[:, 0] for image in images]
-    x, y, q, grey, grey_u, grey_v, slope_u, slope_v, facing = flat
-    return Reference(Points(x, y, q), grey, grey_u, grey_v, slope_u, slope_v, facing)
+    x, y, q, *others = flat
+    return Reference(Points(x, y, q), *others)
 
 
 def cell_of(camera: Camera, points: int | None) -> int:
@@ -168,11 +176,30 @@ def move_reference(reference: Reference, anchor_T_view: Float[Array, "4 4"]) -> 
     """The same points as rays of another camera; what falls behind it loses its reading."""
     r, t = anchor_T_view[:3, :3], anchor_T_view[:3, 3]
     x, y, q = reference.points
-    moved = [r[i, 0] * x + r[i, 1] * y + (r[i, 2] + t[i] * q) for i in range(3)]
+    return reference._replace(points=_rays([r[i, 0] * x + r[i, 1] * y + (r[i, 2] + t[i] * q) for i in range(3)], q))
+
+
+def settle_reference(reference: Reference, twist: Float[Array, " 6"]) -> Reference:
+    """The points where they were at their frame's moment instead of when their rows were exposed.
+
+    Args:
+        reference: As the camera's rolling shutter saw it.
+        twist: Motion of the points in the camera during one readout, small.
+    """
+    (v, w), (x, y, q), back = (twist[:3], twist[3:]), reference.points, -reference.row_time
+    moved = [
+        x + back * (w[1] - w[2] * y + v[0] * q),
+        y + back * (w[2] * x - w[0] + v[1] * q),
+        1.0 + back * (w[0] * y - w[1] * x + v[2] * q),
+    ]
+    return reference._replace(points=_rays(moved, q), row_time=jnp.zeros_like(reference.row_time))
+
+
+def _rays(moved: list[jax.Array], q: jax.Array) -> Points:
+    """Points from their coordinates times their old inverse depth; those behind the camera lose their reading."""
     before = (q > 0) & (moved[2] > 1e-3)
     depth = jnp.where(before, moved[2], 1.0)
-    points = Points(moved[0] / depth, moved[1] / depth, jnp.where(before, q / depth, 0.0))
-    return reference._replace(points=points)
+    return Points(moved[0] / depth, moved[1] / depth, jnp.where(before, q / depth, 0.0))
 
 
 def share_in_view(
@@ -210,6 +237,7 @@ class Residuals(NamedTuple):
     inside: Float[Array, "*n"]
     depth_valid: Float[Array, "*n"]
     warped: Warped
+    """Before any delay by the shutter."""
     grey_sample: GreySample
     depth_sample: DepthSample
 
@@ -251,6 +279,9 @@ class Objective:
     centred: Bool[Array, ""] | None = None
     """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
     larger than any contrast, says nothing against the true motion. None: never, at no cost."""
+    readout: Float[Array, ""] | None = None
+    """Of a camera with a rolling shutter the share of the motion that passes during a readout; see `Shutter`. None: all
+    rows are exposed at once."""
     backward: "Objective | None" = None
     """The same error with the frames' parts exchanged: the target's points seen from the reference, by the inverse
     motion. With it E is the mean of both, as neither frame is nearer to the truth than the other."""
@@ -295,15 +326,18 @@ class Objective:
         reference = self.reference if reference is None else reference
         mean = self.mean_residual(target_T_reference) if mean is None else mean
         warped = warp(reference.points, target_T_reference, self.plane)
-        words = look_up(self.target, warped, self.plane)
-        grey_sample, depth_sample = sample_grey(words, warped), sample_depth(words, warped)
+        seen = warped
+        if self.readout is not None:
+            seen = delay(reference.points, warped, Shutter(self.readout, reference.row_time), self.plane)
+        words = look_up(self.target, seen, self.plane)
+        grey_sample, depth_sample = sample_grey(words, seen), sample_depth(words, seen)
         grey = grey_sample.value - reference.grey - mean
-        depth = reference.facing * (depth_sample.value - warped.inverse_depth)
-        depth_valid = depth_sample.valid * warped.inside
+        depth = reference.facing * (depth_sample.value - seen.inverse_depth)
+        depth_valid = depth_sample.valid * seen.inside
         return Residuals(
-            jnp.where(warped.inside > 0, grey, 0.0),
+            jnp.where(seen.inside > 0, grey, 0.0),
             jnp.where(depth_valid > 0, depth, 0.0),
-            warped.inside,
+            seen.inside,
             depth_valid,
             warped,
             grey_sample,
@@ -437,15 +471,10 @@ class Linearization(NamedTuple):
 
 
 def _jacobian(
-    along_u: jax.Array,
-    along_v: jax.Array,
-    along_inverse_depth: jax.Array,
-    warped: Warped,
-    points: Points,
-    camera: Camera | ImagePlane,
-    tangent: Float[Array, "4 4 6"],
+    slopes: Slopes, warped: Warped, points: Points, camera: Camera | ImagePlane, tangent: Float[Array, "4 4 6"]
 ) -> Float[Array, "6 ..."]:
     """Chain rule from (u, v, 1/z) of the warped points to six coordinates; `tangent` is ∂(4x4 motion)/∂x."""
+    along_u, along_v, along_inverse_depth = slopes
     per_depth = warped.inverse_depth / jnp.maximum(points.q, 1e-6)
     from_x = along_u * camera.fx * per_depth
     from_y = along_v * camera.fy * per_depth
@@ -578,14 +607,18 @@ def _weighted_terms(
     scales, facing = objective.scales, reference.facing
     grey, depth = r.grey_sample, r.depth_sample
     one = jnp.float32(1.0)
-    channels = [(r.grey, scales.grey, r.inside, one, grey.along_u, grey.along_v, jnp.zeros_like(r.grey))]
+    along = Slopes(grey.along_u, grey.along_v, jnp.zeros_like(r.grey))
+    channels = [(r.grey, scales.grey, r.inside, one, along)]
     if objective.use_depth:
         factor = scales.depth_weight * (scales.grey / scales.depth) ** 2
-        slopes = (facing * depth.along_u, facing * depth.along_v, -facing)
-        channels.append((r.depth, scales.depth, r.depth_valid, factor, *slopes))
+        along = Slopes(facing * depth.along_u, facing * depth.along_v, -facing)
+        channels.append((r.depth, scales.depth, r.depth_valid, factor, along))
     terms = []
-    for residual, scale, mask, factor, along_u, along_v, along_q in channels:
-        jacobian = _jacobian(along_u, along_v, along_q, r.warped, reference.points, objective.plane, tangent)
+    for residual, scale, mask, factor, slopes in channels:
+        if objective.readout is not None:
+            shutter = Shutter(objective.readout, reference.row_time)
+            slopes = delayed_slopes(slopes, reference.points, r.warped, shutter, objective.plane)
+        jacobian = _jacobian(slopes, r.warped, reference.points, objective.plane, tangent)
         jacobian = jnp.where(mask > 0, jacobian, 0.0)
         s = (residual / scale) ** 2
         _, slope = jax.jvp(objective.loss, (s,), (jnp.ones_like(s),))
@@ -614,14 +647,14 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
     valid = (points.q > 0).astype(jnp.float32)
     warped = Warped(points.x * plane.fx + plane.cx, points.y * plane.fy + plane.cy, points.q, valid)
 
-    def curvature(along_u: jax.Array, along_v: jax.Array, along_q: jax.Array) -> jax.Array:
-        jacobian = _jacobian(along_u, along_v, along_q, warped, points, plane, jnp.asarray(GENERATORS)) * valid
+    def curvature(slopes: Slopes) -> jax.Array:
+        jacobian = _jacobian(slopes, warped, points, plane, jnp.asarray(GENERATORS)) * valid
         jacobian = jacobian.reshape(6, -1)
         return jacobian @ jacobian.T / jnp.maximum(jnp.sum(valid), 1.0)
 
-    total = curvature(reference.grey_u, reference.grey_v, jnp.zeros_like(valid))
+    total = curvature(Slopes(reference.grey_u, reference.grey_v, jnp.zeros_like(valid)))
     if objective.use_depth:
-        depth = curvature(facing * reference.slope_u, facing * reference.slope_v, -facing)
+        depth = curvature(Slopes(facing * reference.slope_u, facing * reference.slope_v, -facing))
         total += scales.depth_weight * (scales.grey / scales.depth) ** 2 * depth
     return total
 
@@ -758,13 +791,3 @@ def explained_share(residuals: Residuals) -> ExplainedShare:
     return ExplainedShare(
         share(r.grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)
     )
-
-
-def explained_variance(objective: Objective, residuals: Residuals) -> Float[Array, ""]:
-    """Share of the reference's grey variance that the target explains, 1 at best; points in view only."""
-    r = residuals
-    count = jnp.maximum(jnp.sum(r.inside), 1.0)
-    grey = objective.reference.grey
-    mean = jnp.sum(r.inside * grey) / count
-    variance = jnp.sum(r.inside * (grey - mean) ** 2) / count
-    return 1.0 - (jnp.sum(r.inside * r.grey**2) / count) / jnp.maximum(variance, 1e-6)

@@ -34,7 +34,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
-from gavo_jax.objective import Reference, share_in_view
+from gavo_jax.objective import Reference, settle_reference, share_in_view
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
@@ -94,7 +94,11 @@ def _track(
     finest = min(solver.levels)
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
-    views = (View(state.previous, jnp.eye(4)),)
+    previous, readout = state.previous, None
+    if options.rolling_shutter:
+        previous = settle_reference(previous, state.motion * (camera.readout / state.seconds))
+        readout = camera.readout / clock.elapsed
+    views = (View(previous, jnp.eye(4)),)
     if options.reference == "keyframe":
         views += (View(state.keyframe, state.previous_T_keyframe),)
     guesses = jnp.eye(4)[None]
@@ -104,7 +108,9 @@ def _track(
     exchanged = None
     if alignment.symmetric:
         exchanged = Exchanged(prepare_reference(target, camera, solver.levels, alignment), state.previous_image)
-    result, populations = align_views(views, packed, camera, solver, alignment, key, guesses, record, exchanged)
+    result, populations = align_views(
+        views, packed, camera, solver, alignment, key, guesses, record, exchanged, readout
+    )
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
     newest = prepare_reference(target, camera, solver.levels, alignment)
@@ -112,8 +118,11 @@ def _track(
     coarsest = jax.tree.map(lambda leaf: leaf[0], state.keyframe)
     share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
     renew = share < options.keyframe_overlap
+    settled = newest
+    if options.rolling_shutter:
+        settled = settle_reference(newest, result.xi * (camera.readout / clock.elapsed))
     keyframe, target_T_keyframe = jax.tree.map(
-        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
+        lambda new, old: jnp.where(renew, new, old), (settled, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
     return TrackerState(newest, keyframe, packed, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
@@ -337,29 +346,26 @@ class Odometry:
         return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay)), key
 
     def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment, bool]:
-        """Align with the references; a result that is not ok, or suspect, is tried again by the wide search.
+        """Align with the references; a result that is not ok is tried again by the wide search.
 
         Returns:
             The state afterwards, the result, and whether its motion can be used: it is ok, or its high error is all
-            that speaks against it and the wide search ends at the same motion (blur, or something that moves). A
-            suspect result stands unless the wide search finds one that is not.
+            that speaks against it and the wide search ends at the same motion (blur, or something that moves).
         """
         assert before.tracker is not None
         clock, key = self.inputs(before, frame)
         state_after, result = self._run(before.tracker, frame, clock, key)
         usable = result.status == AlignmentStatus.OK
-        if not self.options.recover or (usable and not result.suspect):
+        if usable or not self.options.recover:
             return state_after, result, usable
         populations = self.populations
         wide = self._wide()
         state_wide, second = self._run(
             before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
-        if second.status == AlignmentStatus.OK and not (usable and second.suspect):
+        if second.status == AlignmentStatus.OK:
             return state_wide, second, True
         self.populations = populations
-        if usable:
-            return state_after, result, True
         confirmed = result.status == second.status == AlignmentStatus.HIGH_ERROR and _agree(result, second)
         return state_after, result, confirmed
 

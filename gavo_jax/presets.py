@@ -26,6 +26,7 @@ class OdometryOptions:
         prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
         synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
             sequence tells both stamps.
+        rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
     """
@@ -34,6 +35,7 @@ class OdometryOptions:
     keyframe_overlap: float = 0.85
     prior: bool = True
     synchronise: bool = True
+    rolling_shutter: bool = True
     recover: bool = True
     on_lost: Literal["hold", "predict", "stop"] = "hold"
 
@@ -151,7 +153,7 @@ def get_preset(method: str = "ga", name: str = "default") -> Preset:
         return Preset(
             _paper_solver(method),
             PAPER_OBJECTIVE,
-            OdometryOptions(reference="previous", prior=False, synchronise=False, recover=False),
+            OdometryOptions(reference="previous", prior=False, synchronise=False, rolling_shutter=False, recover=False),
         )
     if name == "default":
         return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())

@@ -260,6 +260,14 @@ def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> 
         assert 0 < row["millimetres"] < 5
 
 
+def test_shutter_compares_readouts(load, tmp_path: Path) -> None:
+    load("shutter").main(clips=CLIP, readouts="0,30", json=tmp_path / "shutter.json")
+    [rows] = read(tmp_path / "shutter.json")["clips"].values()
+    assert [row["readout_ms"] for row in rows] == [0, 30] and rows[0]["error"] == 1
+    # the synthetic camera exposes all rows at once
+    assert rows[1]["error"] > 1.001 and rows[1]["translation"] > rows[0]["translation"]
+
+
 def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
     load("viewer").main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
     figures = read(tmp_path / "viewer.json")["methods"]["gauss-newton"]

@@ -60,7 +60,7 @@ def test_projection_follows_the_pinhole_formula_in_numpy_and_jax():
 
 def test_camera_is_a_pytree_with_static_sizes():
     leaves, structure = jax.tree.flatten(Camera.preset("fr1"))
-    assert leaves == [517.3, 516.5, 318.6, 255.3, 5000.0]
+    assert leaves == [517.3, 516.5, 318.6, 255.3, 5000.0, 0.02]
     assert jax.tree.unflatten(structure, leaves) == Camera.preset("fr1")
 
 
@@ -173,6 +173,8 @@ def test_camera_files(tmp_path):
     expected = replace(SMALL, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), depth_scale=1000.0)
     assert load_camera(str(tmp_path / "b.yaml")) == expected
     assert load_camera(tmp_path / "c.toml").distortion == (0.1, -0.2, 0.0, 0.001, 0.3)
+    (tmp_path / "d.toml").write_text(TOML + "readout = 0.02\n")
+    assert load_camera(tmp_path / "d.toml") == replace(SMALL, readout=0.02)
     assert load_camera("fr2") == Camera.preset("fr2")
 
 
@@ -194,6 +196,8 @@ def test_camera_files(tmp_path):
         (TOML + "fz = 1\n", "fz"),
         (TOML + "depth_scale = 0\n", "depth_scale"),
         (TOML + "depth_scale = inf\n", "depth_scale"),
+        (TOML + "readout = -0.01\n", "readout"),
+        (TOML + "readout = 20\n", "readout"),
         (TOML + "distortion = 3\n", "distortion"),
         (TOML + "distortion = [1, 2]\n", "distortion"),
         (TOML + "distortion = [1, 2, 3, nan]\n", "distortion"),

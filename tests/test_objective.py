@@ -30,6 +30,7 @@ from gavo_jax.objective import (
     move_reference,
     preconditioner,
     reference_curvature,
+    settle_reference,
     share_in_view,
     student_t,
 )
@@ -318,6 +319,21 @@ def test_two_references_score_as_the_mean_over_both_their_points() -> None:
     assert float(jit_error(together, motion)[0]) == pytest.approx(expected, rel=1e-5)
 
 
+def test_settled_points_are_where_they_were_in_the_middle_of_the_readout() -> None:
+    pair = smooth_pair(rim=1)
+    reference = make_reference(PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in pair[1:3])), CAMERA)
+    twist = np.array([0.02, -0.01, 0.015, 0.01, -0.02, 0.015])
+    settled = settle_reference(reference, jnp.asarray(twist, jnp.float32))
+    assert not np.any(settled.row_time)
+    for i in (70, 1000, 2900):
+        row = i // CAMERA.width
+        x, y, q = (float(leaf[i]) for leaf in reference.points)
+        moment = (row + 0.5) / CAMERA.height - 0.5
+        expected = oracle.expm(-moment * twist) @ [x / q, y / q, 1 / q, 1.0]
+        found = np.array([settled.points.x[i], settled.points.y[i], 1.0]) / float(settled.points.q[i])
+        assert np.abs(found - expected[:3]).max() < 3e-4 < np.abs(np.array([x, y, 1.0]) / q - expected[:3]).max() / 10
+
+
 # --- derivatives -----------------------------------------------------------------------------------------------------
 
 
@@ -414,6 +430,25 @@ def test_symmetric_gradient_against_central_differences() -> None:
     assert float(model.error) == pytest.approx(reference_error(x), rel=1e-4)
     np.testing.assert_allclose(model.gradient, expected, atol=2e-3 * np.abs(expected).max())
     assert np.linalg.eigvalsh(np.asarray(model.hessian, float)).min() > 0
+
+
+def test_gradient_under_a_rolling_shutter() -> None:
+    """Against differences of E itself, which rounding and the image's kinks allow to a few per cent."""
+    objective = replace(
+        build(smooth_pair(shift=(0.4, -0.3)), LOSSES["cauchy"], (6.0, 0.01, 0.3)), readout=jnp.float32(3.0)
+    )
+    problem = Problem(objective, exp(jnp.full(6, 0.02)), jnp.eye(6))
+    x = np.zeros(6, np.float32)
+
+    def error(x: np.ndarray) -> float:
+        return float(jit_problem_score(problem, jnp.asarray(x[None], jnp.float32))[0][0])
+
+    model = jit_linearize(problem, x)
+    at_once = jit_linearize(replace(problem, objective=replace(objective, readout=None)), x)
+    expected = central_differences(error, x.astype(float), 1e-3)
+    assert float(model.error) == pytest.approx(error(x), rel=1e-5)
+    np.testing.assert_allclose(model.gradient, expected, atol=0.03 * np.abs(expected).max())
+    assert np.abs(at_once.gradient - expected).max() > 0.1 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("loss", LOSSES)

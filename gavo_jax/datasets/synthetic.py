@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import overload
@@ -21,16 +21,20 @@ from gavo_jax.datasets.room import (
     LOWEST_VIEW,
     MARGIN_X,
     MARGIN_Y,
+    Room,
     build_room,
     free_space,
     render,
 )
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
+from gavo_jax.warp import row_time
 
 DEFAULT_CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
 """The factory calibration commonly used for Kinect-like cameras, 640 x 480, no distortion."""
 DEFAULT_FRAMES, DEFAULT_RATE = 30, 30.0
+BANDS = 60
+"""Bands of rows that a rolling shutter exposes one after the other."""
 
 LARGEST_EXTENT = 50.0
 """Trajectories that reach further than this (m) along an axis are refused: a room has to hold them."""
@@ -163,6 +167,7 @@ class SyntheticSequence:
         seed: of the textures, the noise and the phases of the built-in path; from 0.
         noise: what the sensor adds; `NONE` for exact frames.
         camera: any pinhole camera; frames come undistorted. By default 640 x 480, f = 525, the centre in the middle.
+            With a `readout` its shutter rolls: each frame is seen from where the camera is as its rows are read.
         trajectory: what to follow instead of the built-in path: a Trajectory or a TUM file (camera to world, z up). It
             is shifted into the room's free middle (the room is built larger where it must); scale and rotation stay.
         rate: frames a second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
@@ -247,7 +252,7 @@ class SyntheticSequence:
     def _render_frame(self, i: int) -> Frame:
         """Render frame i of the whole sequence and let the sensor disturb it."""
         room = build_room(self._seed, self._half_extent, self._height)
-        exact_grey, exact_depth, face = render(room, self._camera, self._truth.world_T_camera[i])
+        exact_grey, exact_depth, face = self._expose(room, i)
         rng = np.random.default_rng([self._seed, _FRAME_STREAM, i])
         seconds = float(self._truth.timestamps[i] - self._truth.timestamps[0])
         grey = self._noise.disturb_grey(exact_grey, seconds, self._phases, rng)
@@ -266,6 +271,23 @@ class SyntheticSequence:
             if image is not None:
                 image.setflags(write=False)
         return frame
+
+    def _expose(self, room: Room, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Exact grey, depth and faces of frame i; with a rolling shutter in bands of rows, each at its moment."""
+        camera = self._camera
+        if not camera.readout:
+            return render(room, camera, self._truth.world_T_camera[i])
+        tops = np.unique(np.linspace(0, camera.height, BANDS + 1).astype(int))
+        middles = 0.5 * (tops[:-1] + tops[1:] - 1)
+        moments = self._truth.timestamps[i] + camera.readout * row_time(middles, camera)
+        moments = np.clip(moments, self._truth.timestamps[0], self._truth.timestamps[-1])
+        poses, _ = self._truth.interpolate(moments, max_gap=math.inf)
+        bands = [
+            render(room, replace(camera, cy=camera.cy - top, height=int(bottom - top)), pose)
+            for top, bottom, pose in zip(tops[:-1], tops[1:], poses, strict=True)
+        ]
+        grey, depth, face = (np.concatenate(rows) for rows in zip(*bands, strict=True))
+        return grey, depth, face
 
 
 def _to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
@@ -404,4 +426,5 @@ def _camera_toml(camera: Camera) -> str:
     lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
     lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
     lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
+    lines += [f"readout = {float(camera.readout)!r}"]
     return "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ import pytest
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.room import build_room, free_space
+from gavo_jax.datasets.room import build_room, free_space, render
 from gavo_jax.datasets.synthetic import (
     DEFAULT_CAMERA,
     KINECT,
@@ -294,6 +294,22 @@ def test_a_wide_trajectory_gets_a_larger_room():
 
 
 # Arguments, files, time
+
+
+def test_a_rolling_shutter_sees_each_row_at_its_moment():
+    at_once, rolling = (
+        SyntheticSequence(frames=3, noise=NONE, camera=replace(SMALL, readout=readout)) for readout in (0.0, 1 / 30)
+    )
+    path, last = rolling.ground_truth, SMALL.height - 1
+    for row in (0, SMALL.height // 2, last):
+        moment = path.timestamps[1] + ((row + 0.5) / SMALL.height - 0.5) / 30
+        [pose], _ = path.interpolate(np.array([moment]))
+        _, depth, _ = render(build_room(0), SMALL, pose)
+        off, seen_at_once = (
+            np.median(np.abs(s[1].depth[row] / SMALL.depth_scale - depth[row])) for s in (rolling, at_once)
+        )
+        assert off < 5e-4
+        assert row not in (0, last) or seen_at_once > 4 * off
 
 
 def test_any_camera():

@@ -1,0 +1,72 @@
+"""What the photometric error says of a camera's rolling shutter: E over the time from the first row to the last.
+
+Runs Gauss-Newton frame to frame with each readout time. Prints, for each clip, a row a readout: E relative to that of
+a shutter that exposes all rows at once (geometric mean over the pairs; below 1, the images agree better) and, where the
+clip has ground truth, the drift. E needs no ground truth: the readout where it is least is the camera's, as far as the
+clip can tell. A camera that moves slowly, or a series of blurred images, tells little.
+
+    python benchmarks/shutter.py
+    python benchmarks/shutter.py --clips FOLDER --readouts 0,10,20,30 --json shutter.json
+
+On 2 cores the defaults take about 3 minutes.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.cli.tracking import track_visibly
+from gavo_jax.odometry import Odometry
+from gavo_jax.presets import get_preset
+
+
+def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
+    """E, relative to the first readout's, and drift of a clip for each readout in milliseconds."""
+    sequence = common.open_clip(clip)
+    preset = get_preset("gauss-newton")
+    options = replace(preset.odometry, reference="previous", recover=False)
+    rows, first = [], None
+    for milliseconds in readouts:
+        camera = replace(sequence.camera, readout=milliseconds / 1000)
+        odometry = Odometry(camera, preset.solver, preset.alignment, options)
+        tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry)
+        errors = np.array([float(step.alignment.error) for step in tracked.steps])
+        first = errors if first is None else first
+        both = np.isfinite(first) & np.isfinite(errors)
+        rows.append(
+            {
+                "readout_ms": milliseconds,
+                "error": common.geometric_mean(list(errors[both] / first[both])),
+                "translation": tracked.metrics[common.TRANSLATION],
+                "rotation": tracked.metrics[common.ROTATION],
+            }
+        )
+    return rows
+
+
+def main(clips: str = common.CLIPS, readouts: str = "0,12,16,20,24,28,32", json: Path | None = None) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: names with commas between; see `common.open_clip`.
+        readouts: milliseconds, with commas between; the first is what the others are compared with.
+        json: file for the figures.
+    """
+    found = {clip: measure(clip, common.counts(readouts)) for clip in common.names(clips)}
+    for clip, rows in found.items():
+        cells = [
+            [str(row["readout_ms"]), number(row["error"], 3), number(row["translation"], 4), number(row["rotation"], 2)]
+            for row in rows
+        ]
+        print_table(f"rolling shutter of {clip}", ("readout, ms", "E", "m/s", "deg/s"), cells)
+    results = {"clips": found}
+    common.record(json, "shutter", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)
