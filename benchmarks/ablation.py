@@ -58,6 +58,7 @@ VARIANTS: dict[str, tuple[str, Callable[[Preset], Preset]]] = {
     "depth": ("no depth term", _alignment(depth=False)),
     "brightness": ("no brightness model", _alignment(brightness=False)),
     "synchronise": ("depth as it was read", _odometry(synchronise=False)),
+    "shutter": ("all rows exposed at once", _odometry(rolling_shutter=False)),
     "keyframe": ("previous frame only", _odometry(reference="previous")),
     "prior": ("no constant velocity", _odometry(prior=False)),
     "recover": ("no second try", _odometry(recover=False)),

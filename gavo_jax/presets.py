@@ -158,7 +158,7 @@ def get_preset(method: str = "ga", name: str = "default") -> Preset:
     if name == "default":
         return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
     if name == "fast":
-        return Preset(_FAST[method], AlignmentOptions(points=2400), OdometryOptions())
+        return Preset(_FAST[method], AlignmentOptions(points=3200), OdometryOptions())
     if name == "wide":
         return Preset(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
     raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")
