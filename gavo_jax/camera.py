@@ -151,8 +151,8 @@ class Camera:
 
 
 READOUT = 0.02
-"""Seconds. Found on freiburg1's images by `benchmarks/shutter.py`, without ground truth, and taken over for the two
-others, which are of like make but were not at hand."""
+"""Seconds, of freiburg1, where the images alone (`benchmarks/shutter.py`) say 0.019 on two clips and less on a third; 0.02
+drifted a little less there. Taken over for the two others, which are of like make but were not at hand."""
 
 PRESETS = {
     "fr1": Camera(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), readout=READOUT),
