@@ -151,7 +151,7 @@ class Camera:
 
 
 READOUT = 0.02
-"""Seconds, of freiburg1, where the images alone (`benchmarks/shutter.py`) say 0.019 on two clips and less on a third; 0.02
+"""Seconds, of freiburg1. The images alone (`benchmarks/shutter.py`) say 0.019 on two clips and less on a third; 0.02
 drifted a little less there. Taken over for the two others, which are of like make but were not at hand."""
 
 PRESETS = {
