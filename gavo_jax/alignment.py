@@ -650,8 +650,7 @@ def _conclude(
         (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
     ):
         status = jnp.where(found, jnp.int32(value), status)
-    xi = log(problem.origin)
-    return Alignment(problem.origin, xi, model.error, model.overlap, covariance, status, history)
+    return Alignment(problem.origin, log(problem.origin), model.error, model.overlap, covariance, status, history)
 
 
 class Images(NamedTuple):

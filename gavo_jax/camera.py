@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -258,7 +258,7 @@ def _number(text: str) -> int | float:
 def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
     """Check the values of a camera file, key by key, and build the camera."""
     names = [field.name for field in fields(Camera)]
-    required = [name for name in names if name not in ("distortion", "depth_scale", "readout")]
+    required = [field.name for field in fields(Camera) if field.default is MISSING]
     for key in values:
         if key not in names:
             raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(names)})")

@@ -94,11 +94,8 @@ def _track(
     finest = min(solver.levels)
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
-    previous, readout = state.previous, None
-    if options.rolling_shutter:
-        previous = settle_reference(previous, state.motion * (camera.readout / state.seconds))
-        readout = camera.readout / clock.elapsed
-    views = (View(previous, jnp.eye(4)),)
+    readout = camera.readout / clock.elapsed if options.rolling_shutter else None
+    views = (View(state.previous, jnp.eye(4)),)
     if options.reference == "keyframe":
         views += (View(state.keyframe, state.previous_T_keyframe),)
     guesses = jnp.eye(4)[None]
@@ -114,15 +111,14 @@ def _track(
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
     newest = prepare_reference(target, camera, solver.levels, alignment)
+    if readout is not None:
+        newest = settle_reference(newest, result.xi * readout)
     target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
     coarsest = jax.tree.map(lambda leaf: leaf[0], state.keyframe)
     share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
     renew = share < options.keyframe_overlap
-    settled = newest
-    if options.rolling_shutter:
-        settled = settle_reference(newest, result.xi * (camera.readout / clock.elapsed))
     keyframe, target_T_keyframe = jax.tree.map(
-        lambda new, old: jnp.where(renew, new, old), (settled, jnp.eye(4)), (state.keyframe, target_T_keyframe)
+        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
     )
     return TrackerState(newest, keyframe, packed, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
@@ -133,7 +129,8 @@ def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignme
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     reference = prepare_reference(pyramid, camera, solver.levels, alignment)
     packed = prepare_target(pyramid, solver.levels)
-    return TrackerState(reference, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
+    settled = settle_reference(reference, jnp.zeros(6))
+    return TrackerState(settled, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
 @dataclass(frozen=True)
