@@ -19,7 +19,6 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
-    DEPTH_WEIGHT_RANGE,
     Loss,
     Objective,
     Problem,
@@ -103,11 +102,11 @@ class AlignmentOptions:
             the brightness and scales that are known only then (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
-        points: Largest number of reference points a level, one a square block of pixels (static); None takes every
-            pixel.
+        points: Largest number of reference points, one a square block of pixels, an entry a level (static); None takes
+            every pixel.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
-        depth_weight: Factor on the depth cost's weight, which comes from the data, an entry a level; see
-            `objective.estimate_scales`.
+        depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
+            level.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -126,9 +125,9 @@ class AlignmentOptions:
     refine: bool = static(False)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
-    points: int | None = static(4800)
+    points: tuple[int | None, ...] = static((4800,) * 5)
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
-    depth_weight: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0)
+    depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
     min_overlap: float = 0.35
     outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
@@ -259,12 +258,10 @@ class Level(NamedTuple):
     """[V, N]: the points of all views as rays of the anchor camera."""
     points: Integer[Array, ""]
     """Points a view on this level; places from there on are empty."""
-    columns: Integer[Array, ""]
-    """Points a row."""
     islands: Integer[Array, ""]
     """Independent populations."""
     depth_weight: Float[Array, ""]
-    """Factor on the depth cost's weight."""
+    """Of the depth cost."""
     exchanged: Reference | None = None
     """[1, N]: the target's points, where the error is symmetric."""
     readout: Float[Array, ""] | None = None
@@ -287,17 +284,15 @@ def stack_levels(
     """The visits of a search to the levels, [L], coarsest first."""
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
-    cells = [cell_of(c, options.points) for c in cameras]
-    columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
-    rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
+    cells = [cell_of(c, options.points[level]) for level, c in zip(levels, cameras, strict=True)]
+    points = [(c.width // cell) * (c.height // cell) for c, cell in zip(cameras, cells, strict=True)]
     once = Level(
         jnp.array(levels),
         jnp.arange(len(levels)) == 0,
         jnp.zeros(len(levels), bool),
         image_planes(camera, levels),
         jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved),
-        jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
-        jnp.array(columns),
+        jnp.array(points),
         jnp.array([options.islands[level] for level in levels]),
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
         None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
@@ -338,7 +333,6 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         jnp.float32(options.min_overlap),
         jnp.float32(charge),
         level.points,
-        level.columns,
         level.is_undecided if options.centred else None,
         level.readout,
         loss=options.loss,
@@ -371,9 +365,7 @@ def fit_objective(
         brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
     if options.robust_scale:
-        scales = estimate_scales(objective, guess, level.depth_weight)
-        weight = jnp.where(level.is_first, level.depth_weight * DEPTH_WEIGHT_RANGE[1], scales.depth_weight)
-        objective = replace(objective, scales=scales._replace(depth_weight=weight))
+        objective = replace(objective, scales=estimate_scales(objective, guess, level.depth_weight))
     if exchanged is not None and level.exchanged is not None:
         readout = None if level.readout is None else -level.readout
         swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)

@@ -153,17 +153,19 @@ def cell_of(camera: Camera, points: int | None) -> int:
     return cell
 
 
-def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: int | None) -> Reference:
+def make_references(
+    pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: tuple[int | None, ...]
+) -> Reference:
     """Points of some levels, [L, N]: shorter levels are filled up with points without a reading.
 
     Args:
         pyramid: Of the reference frame.
         camera: Of level 0.
         levels: Which ones, in the order of the result.
-        points: Largest number of points a level; None takes every pixel.
+        points: Largest number of points, an entry a level of the pyramid; None takes every pixel.
     """
     cameras = [camera.level(level) for level in levels]
-    references = [make_reference(pyramid[k], c, cell_of(c, points)) for k, c in zip(levels, cameras, strict=True)]
+    references = [make_reference(pyramid[k], c, cell_of(c, points[k])) for k, c in zip(levels, cameras, strict=True)]
     longest = max(reference.grey.shape[0] for reference in references)
 
     def fill(*leaves: jax.Array) -> jax.Array:
@@ -274,8 +276,6 @@ class Objective:
     by pushing pixels out of view; 0 averages over the points in view alone, as (2) does."""
     count: Integer[Array, ""] | None = None
     """Points a view that hold something, from the first on; None: all."""
-    columns: Integer[Array, ""] | int = 1
-    """Reference points a row: they come from a grid, row after row."""
     centred: Bool[Array, ""] | None = None
     """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
     larger than any contrast, says nothing against the true motion. None: never, at no cost."""
@@ -693,49 +693,14 @@ SMALLEST_DEPTH_SCALE = 5e-4
 """1/m: a tenth of the quantisation of a structured-light sensor."""
 
 
-def _independent_share(
-    residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: jax.Array | int
-) -> Float[Array, ""]:
-    """Share of a channel's residuals that are independent witnesses, from their correlation between neighbours.
-
-    n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ the correlation at lag one of the residuals as the
-    loss weighs them (an autoregressive model along either direction). Where depth and colour are out of step, whole
-    surfaces err together: ρ is near 1 and the share falls to a few per cent.
-    """
-    weighted = mask * residual * 6.0 / (5.0 + (residual / scale) ** 2)
-    place = jnp.arange(residual.shape[-1])
-    share = jnp.float32(1.0)
-    for step, has_next in ((1, place % columns < columns - 1), (columns, True)):
-        following, following_mask = (
-            jnp.take(a, place + step, axis=-1, mode="fill", fill_value=0.0) for a in (weighted, mask)
-        )
-        both = mask * following_mask * has_next
-        product = jnp.sum(both * weighted * following)
-        power = 0.5 * jnp.sum(both * (weighted**2 + following**2))
-        rho = jnp.clip(product / jnp.maximum(power, 1e-20), 0.0, 0.98)
-        share *= (1.0 - rho) / (1.0 + rho)
-    return share
-
-
 def estimate_scales(
     objective: Objective, target_T_reference: Float[Array, "4 4"], depth_weight: jax.Array | float
 ) -> Scales:
-    """Scales of the grey and the depth residuals at one motion, and the weight of depth that follows from them.
-
-    Each channel counts as its independent residuals do; `depth_weight` multiplies the ratio.
-    """
+    """Scales of the grey and the depth residuals at one motion, with the weight that depth is given."""
     r = objective.residuals(target_T_reference)
     grey = jnp.maximum(_t_scale(r.grey, r.inside), SMALLEST_GREY_SCALE)
     depth = jnp.maximum(_t_scale(r.depth, r.depth_valid), SMALLEST_DEPTH_SCALE)
-    ratio = _independent_share(r.depth, r.depth_valid, depth, objective.columns) / _independent_share(
-        r.grey, r.inside, grey, objective.columns
-    )
-    return Scales(grey, depth, depth_weight * jnp.clip(ratio, *DEPTH_WEIGHT_RANGE))
-
-
-DEPTH_WEIGHT_RANGE = (0.1, 0.3)
-"""The estimated weight of depth is held within these: depth errs by whole surfaces (calibration, timing) in ways that
-its scatter about them does not show, so it never counts as much as grey does."""
+    return Scales(grey, depth, jnp.float32(depth_weight))
 
 
 def estimate_brightness(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:

@@ -110,27 +110,28 @@ def _track(
     )
     if options.synchronise:
         target = _synchronised(raw, camera, delay * result.xi, finest)
-    newest = prepare_reference(target, camera, solver.levels, alignment)
+    newest, keyframe = prepare_reference(target, camera, solver.levels, alignment), state.keyframe
     if readout is not None:
-        newest = settle_reference(newest, result.xi * readout)
+        newest, keyframe = (settle_reference(frame, result.xi * readout) for frame in (newest, keyframe))
     target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
-    coarsest = jax.tree.map(lambda leaf: leaf[0], state.keyframe)
+    coarsest = jax.tree.map(lambda leaf: leaf[0], keyframe)
     share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
     renew = share < options.keyframe_overlap
     keyframe, target_T_keyframe = jax.tree.map(
-        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (state.keyframe, target_T_keyframe)
+        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (keyframe, target_T_keyframe)
     )
     return TrackerState(newest, keyframe, packed, target_T_keyframe, result.xi, clock.elapsed), result, populations
 
 
 @jax.jit
 def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignment: AlignmentOptions) -> TrackerState:
-    """State after the first frame: it is both references, and nothing is known of the motion."""
+    """State after the first frame: it is both references, and nothing is known of the motion, so that their points are
+    still where their rows' moments left them.
+    """
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     reference = prepare_reference(pyramid, camera, solver.levels, alignment)
     packed = prepare_target(pyramid, solver.levels)
-    settled = settle_reference(reference, jnp.zeros(6))
-    return TrackerState(settled, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
+    return TrackerState(reference, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
 
 
 @dataclass(frozen=True)

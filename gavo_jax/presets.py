@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from gavo_jax.alignment import AlignmentOptions
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import DEPTH_WEIGHT_RANGE, l2
+from gavo_jax.objective import l2
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -32,7 +32,7 @@ class OdometryOptions:
     """
 
     reference: Literal["previous", "keyframe"] = "keyframe"
-    keyframe_overlap: float = 0.85
+    keyframe_overlap: float = 0.75
     prior: bool = True
     synchronise: bool = True
     rolling_shutter: bool = True
@@ -55,7 +55,7 @@ PAPER_OBJECTIVE = AlignmentOptions(
     brightness=False,
     robust_scale=False,
     precondition=False,
-    points=None,
+    points=(None,) * 5,
     min_overlap=0.5,
     bounds=(0.06, 0.06),
     bounds_factor=0.5,
@@ -101,6 +101,9 @@ _FAST = {
     "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),
 }
 
+_FAST_POINTS = (4800, 4800, 1200, 1200, 1200)
+"""The finest level decides how far the result is off; on the coarser ones a quarter of its points do as well."""
+
 _WIDE = {
     "ga": GeneticAlgorithm(
         population=(0, 16, 20, 24, 16),
@@ -112,14 +115,12 @@ _WIDE = {
     "gauss-newton": GaussNewton(),
     "adam": GradientDescent(),
 }
-_EQUAL = 1.0 / DEPTH_WEIGHT_RANGE[1]
-"""Factor with which depth weighs, at most, as much as grey."""
 WIDE_OBJECTIVE = AlignmentOptions(
     centred=True,
     symmetric=True,
     refine=True,
-    points=19200,
-    depth_weight=(_EQUAL, _EQUAL, _EQUAL, 1.0, 1.0),
+    points=(19200,) * 5,
+    depth_weight=(0.7, 0.7, 0.7, 0.3, 0.3),
     islands=(1, 1, 4, 16, 96),
     scouts=8192,
     scout_spread=(0.1, 0.5),
@@ -158,7 +159,7 @@ def get_preset(method: str = "ga", name: str = "default") -> Preset:
     if name == "default":
         return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
     if name == "fast":
-        return Preset(_FAST[method], AlignmentOptions(points=3200), OdometryOptions())
+        return Preset(_FAST[method], AlignmentOptions(points=_FAST_POINTS), OdometryOptions())
     if name == "wide":
         return Preset(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
     raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")

@@ -268,6 +268,15 @@ def test_shutter_compares_readouts(load, tmp_path: Path) -> None:
     assert rows[1]["error"] > 1.001 and rows[1]["translation"] > rows[0]["translation"]
 
 
+def test_depth_weight_compares_the_channels(load, tmp_path: Path) -> None:
+    load("depth_weight").main(clips=CLIP, json=tmp_path / "depth_weight.json")
+    [levels] = read(tmp_path / "depth_weight.json")["clips"].values()
+    assert list(levels) == ["4", "3", "2", "1"]
+    for row in levels.values():
+        # rendered depth has no error that the whole image shares, so the channels disagree as their scatters promise
+        assert 0.05 < row["disagreement"] < 20 and 0 < row["by_disagreement"] <= row["by_scatter"]
+
+
 def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
     load("viewer").main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
     figures = read(tmp_path / "viewer.json")["methods"]["gauss-newton"]

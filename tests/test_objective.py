@@ -81,7 +81,6 @@ def build(
         values,
         jnp.float32(min_overlap),
         jnp.float32(outside_cost),
-        columns=pair.camera.width,
         loss=loss,
         use_depth=use_depth,
     )
@@ -540,16 +539,16 @@ def test_scale_of_a_t_distribution() -> None:
     assert float(jit_scales(build(noisy_pair(noise)), jnp.eye(4), 1.0).grey) == pytest.approx(4.0, rel=0.1)
 
 
-def test_depth_that_errs_by_whole_surfaces_counts_less() -> None:
+def test_depth_counts_as_its_own_scale_says() -> None:
     rng = np.random.default_rng(0)
     pair = noisy_pair(rng.normal(0, 3, (48, 64)))
-    patches = np.kron(rng.normal(0, 0.004, (6, 8)), np.ones((8, 8)))
-    weights = []
-    for noise in (rng.permuted(patches), patches):
+    found = []
+    for sigma in (0.01, 0.02):
+        noise = sigma * rng.standard_t(5, (48, 64))
         noisy = pair._replace(target_inverse_depth=pair.target_inverse_depth + noise)
-        weights.append([float(jit_scales(build(noisy), jnp.eye(4), factor).depth_weight) for factor in (1.0, 2.0)])
-    np.testing.assert_allclose([w[1] for w in weights], [2 * w[0] for w in weights], rtol=1e-5)
-    assert 0 < weights[1][0] < weights[0][0] <= 1
+        found.append(jit_scales(build(noisy), jnp.eye(4), 0.3))
+    assert float(found[1].depth / found[0].depth) == pytest.approx(2.0, rel=0.1)
+    assert [float(scales.depth_weight) for scales in found] == pytest.approx([0.3, 0.3])
 
 
 def test_scale_survives_outliers() -> None:

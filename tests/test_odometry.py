@@ -414,6 +414,17 @@ def test_a_rolling_shutter_is_reckoned_with() -> None:
         assert np.all(off(True, reference) < 0.7 * off(False, reference))
 
 
+def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticSequence) -> None:
+    odometry = Odometry(replace(CAMERA, readout=0.03), SOLVER, options=PLAIN)
+    pending = []
+    for index in range(2):
+        odometry.register(sequence[index], float(sequence.timestamps[index]))
+        state = odometry.progress.tracker
+        assert state is not None
+        pending.append([bool(np.any(frame.row_time)) for frame in (state.previous, state.keyframe)])
+    assert pending == [[True, True], [False, False]]
+
+
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
     result = run(sequence[:6], replace(PLAIN, reference="previous", prior=False))
     assert result.metrics["lost_pairs"] == 0

@@ -1,0 +1,135 @@
+"""How much depth is worth beside grey: what either channel alone says of the motion, and how far the two disagree.
+
+Tracks with Gauss-Newton. At each pair and level the optimum of the grey cost alone and that of the depth cost alone are
+found. Prints, for each clip, a row a level, with medians over the pairs:
+
+- weight by scatter: the weight of depth that each channel's own scatter from tile to tile of the image would justify;
+- disagreement: how far apart the two optima lie, squared, in units of the covariance that those scatters promise for
+  their difference (1 if they told the whole truth);
+- weight by disagreement: the weight that is left when the disagreement is taken for depth's error.
+
+A disagreement far above 1 is an error that a whole image shares (calibration, timing), which no scatter shows. No
+ground truth is used.
+
+    python benchmarks/depth_weight.py
+    python benchmarks/depth_weight.py --clips FOLDER --json depth_weight.json
+
+On 2 cores the defaults take about a minute.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gavo_jax.alignment import AlignmentOptions, View, fit_objective, stack_levels
+from gavo_jax.camera import Camera
+from gavo_jax.cli.screen import number, print_table
+from gavo_jax.objective import Objective, Problem
+from gavo_jax.odometry import Odometry, TrackerState, decoded
+from gavo_jax.presets import get_preset
+from gavo_jax.warp import exp
+
+STEPS = 5
+"""Of Gauss-Newton from the common optimum to a channel's own."""
+DEPTH_ALONE = 1e6
+"""Weight beside which grey vanishes."""
+FIGURES = ("by_scatter", "disagreement", "by_disagreement")
+
+
+@jax.jit
+def own_optima(
+    before: TrackerState, after: TrackerState, camera: Camera, solver: Any, options: AlignmentOptions
+) -> list[list[tuple[jax.Array, ...]]]:
+    """For each level, coarsest first, and for grey and depth: the optimum, in steps about the motion that was tracked,
+    the Hessian of the mean cost there, residuals in units of their scale, and the covariance of its gradient.
+    """
+    motion = exp(after.motion)
+    levels = stack_levels(
+        (View(before.previous, jnp.eye(4)),), camera, solver.levels, options, None, camera.readout / after.seconds
+    )
+    found = []
+    for place in range(len(solver.levels)):
+        level = jax.tree.map(lambda leaf, place=place: leaf[place], levels)
+        objective, _ = fit_objective(level, after.previous_image, options, motion)
+        scales = objective.scales
+        depth = replace(objective, scales=scales._replace(depth_weight=jnp.float32(DEPTH_ALONE)))
+        unit = scales.grey**2
+        found.append(
+            [
+                optimum(replace(objective, use_depth=False), motion, unit),
+                optimum(depth, motion, unit * DEPTH_ALONE),
+            ]
+        )
+    return found
+
+
+def optimum(objective: Objective, motion: jax.Array, unit: jax.Array) -> tuple[jax.Array, ...]:
+    """One channel's part of `own_optima`."""
+    problem = Problem(objective, motion, jnp.eye(6))
+
+    def step(_: int, x: jax.Array) -> jax.Array:
+        model = problem.linearize(x)
+        return x - jnp.linalg.solve(model.hessian, model.gradient)
+
+    x = jax.lax.fori_loop(0, STEPS, step, jnp.zeros(6))
+    model, scatter, _ = problem.examine(x)
+    return x, model.hessian / unit, scatter / unit**2
+
+
+def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
+    """The three `FIGURES` of one level of one pair."""
+    (at_grey, grey_hessian, grey_scatter), (at_depth, hessian, scatter) = (
+        [np.asarray(leaf, np.float64) for leaf in channel] for channel in channels
+    )
+    grey_covariance = np.linalg.solve(grey_hessian, np.linalg.solve(grey_hessian, grey_scatter).T)
+    covariance = np.linalg.solve(hessian, np.linalg.solve(hessian, scatter).T)
+    grey, depth = np.trace(grey_hessian @ grey_covariance), np.trace(hessian @ covariance)
+    apart = at_depth - at_grey
+    disagreement = apart @ np.linalg.solve(grey_covariance + covariance, apart) / 6
+    distance = apart @ hessian @ apart - np.trace(hessian @ grey_covariance)
+    return grey / depth, disagreement, grey / max(distance, depth)
+
+
+def measure(clip: str) -> dict[int, dict[str, float]]:
+    """Medians over a clip's pairs, level by level."""
+    sequence, preset = common.open_clip(clip), get_preset("gauss-newton")
+    options = replace(preset.odometry, reference="previous", recover=False)
+    odometry = Odometry(sequence.camera, preset.solver, preset.alignment, options)
+    pairs, before = [], None
+    for index, frame in enumerate(decoded(sequence)):
+        step = odometry.register(frame, float(sequence.timestamps[index]))
+        after = odometry.progress.tracker
+        if step is not None and not step.lost and before is not None and after is not None:
+            levels = own_optima(before, after, odometry.camera, preset.solver, preset.alignment)
+            pairs.append([weigh(channels) for channels in jax.device_get(levels)])
+        before = after
+    medians = np.median(np.array(pairs), axis=0)
+    levels = preset.solver.levels
+    return {level: dict(zip(FIGURES, row.tolist(), strict=True)) for level, row in zip(levels, medians, strict=True)}
+
+
+def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: names with commas between; see `common.open_clip`.
+        json: file for the figures.
+    """
+    found = {clip: measure(clip) for clip in common.names(clips)}
+    for clip, levels in found.items():
+        cells = [[str(level), *(number(row[name], 3) for name in FIGURES)] for level, row in levels.items()]
+        print_table(
+            f"what depth is worth, {clip}", ("level", "weight by scatter", "disagreement", "by disagreement"), cells
+        )
+    results = {"clips": found}
+    common.record(json, "depth_weight", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)
