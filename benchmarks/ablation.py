@@ -62,7 +62,7 @@ VARIANTS: dict[str, tuple[str, Callable[[Preset], Preset]]] = {
     "keyframe": ("previous frame only", _odometry(reference="previous")),
     "prior": ("no constant velocity", _odometry(prior=False)),
     "recover": ("no second try", _odometry(recover=False)),
-    "points": ("every pixel", _alignment(points=(None,) * 5)),
+    "points": ("every pixel", _alignment(points=None)),
 }
 """Ingredient: what is there without it, and the preset without it."""
 

@@ -92,7 +92,7 @@ def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
     apart = at_depth - at_grey
     disagreement = apart @ np.linalg.solve(grey_covariance + covariance, apart) / 6
     distance = apart @ hessian @ apart - np.trace(hessian @ grey_covariance)
-    return grey / depth, disagreement, grey / max(distance, depth)
+    return float(grey / depth), float(disagreement), float(grey / max(distance, depth))
 
 
 def measure(clip: str) -> dict[int, dict[str, float]]:

@@ -42,9 +42,7 @@ from gavo_jax.warp import exp
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
 NO_BARRIER, TWO_MARKS = "score, no barrier", "score, two marks"
 PLAIN, NUMBA, SCIPY = "plain vmap", "numba", "scipy"
-GREY_ONLY = AlignmentOptions(
-    loss=l2, depth=False, brightness=False, robust_scale=False, points=(None,) * 5, min_overlap=0.0
-)
+GREY_ONLY = AlignmentOptions(loss=l2, depth=False, brightness=False, robust_scale=False, points=None, min_overlap=0.0)
 SCIPY_CANDIDATES = 4
 GENERATIONS = 10
 """Populations that one call of ours scores, one after the other: a search is one program, entered once."""
@@ -271,7 +269,7 @@ def main(levels: str = "0,1,2,3,4", population: int = 64, rounds: int = 7, json:
     for level in common.counts(levels):
         scene = make_scene(pyramids, camera, level, motions)
         objective = make_objective(pyramids, camera, level, GREY_ONLY)
-        full = make_objective(pyramids, camera, level, AlignmentOptions(points=(None,) * 5, min_overlap=0.0))
+        full = make_objective(pyramids, camera, level, AlignmentOptions(points=None, min_overlap=0.0))
         size = f"{scene.camera.width}x{scene.camera.height}"
         by_size[size] = measure(formulations(scene, objective, full), scene.grey.size, rounds)
     rows = [[name, *(number(times[name], 2) for times in by_size.values())] for name in next(iter(by_size.values()))]

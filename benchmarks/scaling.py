@@ -84,7 +84,7 @@ def time_scoring(
     pyramids = (pyramid_of(sequence[0], camera), pyramid_of(sequence[1], camera))
     score, rows, calls = jax.jit(Objective.score), [], []
     for level in levels:
-        objective = make_objective(pyramids, camera, level, AlignmentOptions(points=(None,) * 5, min_overlap=0.0))
+        objective = make_objective(pyramids, camera, level, AlignmentOptions(points=None, min_overlap=0.0))
         width, height = camera.level(level).width, camera.level(level).height
         for count in populations:
             rows.append({"size": f"{width}x{height}", "pixels": width * height, "candidates": count})

@@ -21,10 +21,11 @@ from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
     Loss,
     Objective,
+    PointsPerLevel,
     Problem,
     Reference,
     Scales,
-    cell_of,
+    cells_of,
     estimate_brightness,
     estimate_scales,
     explained_share,
@@ -102,8 +103,8 @@ class AlignmentOptions:
             the brightness and scales that are known only then (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
-        points: Largest number of reference points, one a square block of pixels, an entry a level (static); None takes
-            every pixel.
+        points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
+            None takes every pixel.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
             level.
@@ -125,7 +126,7 @@ class AlignmentOptions:
     refine: bool = static(False)
     robust_scale: bool = static(True)
     precondition: bool = static(True)
-    points: tuple[int | None, ...] = static((4800,) * 5)
+    points: PointsPerLevel = static(4800)
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
     min_overlap: float = 0.35
@@ -284,7 +285,7 @@ def stack_levels(
     """The visits of a search to the levels, [L], coarsest first."""
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
-    cells = [cell_of(c, options.points[level]) for level, c in zip(levels, cameras, strict=True)]
+    cells = cells_of(cameras, levels, options.points)
     points = [(c.width // cell) * (c.height // cell) for c, cell in zip(cameras, cells, strict=True)]
     once = Level(
         jnp.array(levels),

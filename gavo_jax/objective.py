@@ -7,7 +7,7 @@ residual 1/z_{t+1}(ω(ξ, p_i)) − 1/z_i(ξ). Inverse depth is the right quanti
 so the noise of 1/z is the same at every range and one scale serves all pixels.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -153,19 +153,28 @@ def cell_of(camera: Camera, points: int | None) -> int:
     return cell
 
 
-def make_references(
-    pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: tuple[int | None, ...]
-) -> Reference:
+PointsPerLevel = int | None | tuple[int, ...]
+"""Largest number of points: of every level alike, None for every pixel, or an entry a level of the pyramid."""
+
+
+def cells_of(cameras: Sequence[Camera], levels: tuple[int, ...], points: PointsPerLevel) -> list[int]:
+    """`cell_of` some levels, each with its camera."""
+    most = [points[level] if isinstance(points, tuple) else points for level in levels]
+    return [cell_of(*view) for view in zip(cameras, most, strict=True)]
+
+
+def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> Reference:
     """Points of some levels, [L, N]: shorter levels are filled up with points without a reading.
 
     Args:
         pyramid: Of the reference frame.
         camera: Of level 0.
         levels: Which ones, in the order of the result.
-        points: Largest number of points, an entry a level of the pyramid; None takes every pixel.
+        points: Largest number of points a level.
     """
     cameras = [camera.level(level) for level in levels]
-    references = [make_reference(pyramid[k], c, cell_of(c, points[k])) for k, c in zip(levels, cameras, strict=True)]
+    cells = cells_of(cameras, levels, points)
+    references = [make_reference(pyramid[k], c, cell) for k, c, cell in zip(levels, cameras, cells, strict=True)]
     longest = max(reference.grey.shape[0] for reference in references)
 
     def fill(*leaves: jax.Array) -> jax.Array:

@@ -11,6 +11,7 @@ import optax
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.objective import LOSSES
 from gavo_jax.presets import Preset
+from gavo_jax.pyramid import LEVELS
 
 ROOMS = tuple(field.name for field in dataclasses.fields(Preset))
 """First part of a dotted name: the parts of a preset."""
@@ -102,18 +103,24 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
         if not isinstance(value, bool):
             raise GavoError(f"{where}: must be true or false, not {shown(value)}")
         return value
+    if field == "points":
+        return _entries(where, value, LEVELS, True) if isinstance(value, list) else _number(where, value, True)
     if isinstance(current, tuple):
         whole = all(isinstance(entry, int) for entry in current)
         if not isinstance(value, list):
             if whole:
                 raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {shown(value)}")
             return (_number(where, value, whole),) * len(current)
-        if len(value) != len(current):
-            raise GavoError(f"{where}: must have {len(current)} entries, not {len(value)}")
-        return tuple(_number(where, entry, whole) for entry in value)
+        return _entries(where, value, len(current), whole)
     if isinstance(value, list) and current is None:
         return tuple(_number(where, entry, False) for entry in value)
     return _number(where, value, isinstance(current, int))
+
+
+def _entries(where: str, value: list[Any], count: int, whole: bool) -> tuple[Any, ...]:
+    if len(value) != count:
+        raise GavoError(f"{where}: must have {count} entries, not {len(value)}")
+    return tuple(_number(where, entry, whole) for entry in value)
 
 
 def _callable(where: str, field: str, value: Any) -> Any:

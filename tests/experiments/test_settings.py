@@ -29,6 +29,11 @@ def test_values_of_every_kind():
     assert preset.solver.surrogate is False and preset.alignment.loss is huber
     assert preset.alignment.outside_cost == 0.5 and preset.alignment.bounds == (0.1, 0.2)
     assert preset.odometry.on_lost == "stop"
+    for name in ("default", "fast", "paper"):
+        for points in (900, [0, 900, 600, 300, 300]):
+            chosen = override(get_preset("ga", name), {"alignment.points": points}).alignment.points
+            assert chosen == (points if isinstance(points, int) else tuple(points))
+        assert override(get_preset("ga", name), {"alignment.points": "none"}).alignment.points is None
     assert override(get_preset("adam"), {"solver.optimizer": "lion"}).solver.optimizer is optax.lion
 
 
@@ -49,6 +54,8 @@ def test_values_of_every_kind():
         ("solver.population", [0, 16, 20, 24, 2], ["population", "level 4"]),
         ("solver.population.5", 16, ["population.5", "no such entry"]),
         ("solver.iterations", [0, 0, 0, 0, 0], ["iterations"]),
+        ("alignment.points", [900, 900], ["points", "5 entries"]),
+        ("alignment.points", 0.5, ["points", "whole"]),
         ("odometry.on_lost", "panic", ["on_lost", "hold, predict, stop"]),
         ("odometry.prior", 1, ["prior", "true or false"]),
     ],
