@@ -26,6 +26,7 @@ from gavo_jax.objective import (
     Reference,
     Scales,
     cells_of,
+    depth_trust,
     estimate_brightness,
     estimate_scales,
     explained_share,
@@ -108,6 +109,8 @@ class AlignmentOptions:
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
             level.
+        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
+            err by whole surfaces (static); see `objective.depth_trust`.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -129,6 +132,7 @@ class AlignmentOptions:
     points: PointsPerLevel = static(4800)
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
+    doubt_depth: bool = static(False)
     min_overlap: float = 0.35
     outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
@@ -259,6 +263,8 @@ class Level(NamedTuple):
     """[V, N]: the points of all views as rays of the anchor camera."""
     points: Integer[Array, ""]
     """Points a view on this level; places from there on are empty."""
+    columns: Integer[Array, ""]
+    """Points a row."""
     islands: Integer[Array, ""]
     """Independent populations."""
     depth_weight: Float[Array, ""]
@@ -286,14 +292,16 @@ def stack_levels(
     moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
     cells = cells_of(cameras, levels, options.points)
-    points = [(c.width // cell) * (c.height // cell) for c, cell in zip(cameras, cells, strict=True)]
+    columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
+    rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
     once = Level(
         jnp.array(levels),
         jnp.arange(len(levels)) == 0,
         jnp.zeros(len(levels), bool),
         image_planes(camera, levels),
         jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved),
-        jnp.array(points),
+        jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
+        jnp.array(columns),
         jnp.array([options.islands[level] for level in levels]),
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
         None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
@@ -334,6 +342,7 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         jnp.float32(options.min_overlap),
         jnp.float32(charge),
         level.points,
+        level.columns,
         level.is_undecided if options.centred else None,
         level.readout,
         loss=options.loss,
@@ -366,7 +375,11 @@ def fit_objective(
         brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
     if options.robust_scale:
-        objective = replace(objective, scales=estimate_scales(objective, guess, level.depth_weight))
+        scales = estimate_scales(objective, guess, level.depth_weight)
+        if options.doubt_depth:
+            trust = jnp.where(level.is_first, 1.0, depth_trust(objective, guess, scales))
+            scales = scales._replace(depth_weight=trust * scales.depth_weight)
+        objective = replace(objective, scales=scales)
     if exchanged is not None and level.exchanged is not None:
         readout = None if level.readout is None else -level.readout
         swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)

@@ -285,6 +285,8 @@ class Objective:
     by pushing pixels out of view; 0 averages over the points in view alone, as (2) does."""
     count: Integer[Array, ""] | None = None
     """Points a view that hold something, from the first on; None: all."""
+    columns: Integer[Array, ""] | int = 1
+    """Reference points a row: they come from a grid, row after row."""
     centred: Bool[Array, ""] | None = None
     """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
     larger than any contrast, says nothing against the true motion. None: never, at no cost."""
@@ -700,6 +702,44 @@ SMALLEST_GREY_SCALE = 0.5
 """Grey levels: rounding alone leaves 0.3."""
 SMALLEST_DEPTH_SCALE = 5e-4
 """1/m: a tenth of the quantisation of a structured-light sensor."""
+
+
+def _independent_share(
+    residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: jax.Array | int
+) -> Float[Array, ""]:
+    """Share of a channel's residuals that are independent witnesses, from their correlation between neighbours.
+
+    n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ the correlation at lag one of the residuals as the
+    loss weighs them (an autoregressive model along either direction). Where depth and colour are out of step, whole
+    surfaces err together: ρ is near 1 and the share falls to a few per cent.
+    """
+    weighted = mask * residual * 6.0 / (5.0 + (residual / scale) ** 2)
+    place = jnp.arange(residual.shape[-1])
+    share = jnp.float32(1.0)
+    for step, has_next in ((1, place % columns < columns - 1), (columns, True)):
+        following, following_mask = (
+            jnp.take(a, place + step, axis=-1, mode="fill", fill_value=0.0) for a in (weighted, mask)
+        )
+        both = mask * following_mask * has_next
+        product = jnp.sum(both * weighted * following)
+        power = 0.5 * jnp.sum(both * (weighted**2 + following**2))
+        rho = jnp.clip(product / jnp.maximum(power, 1e-20), 0.0, 0.98)
+        share *= (1.0 - rho) / (1.0 + rho)
+    return share
+
+
+FULL_DEPTH_RATIO = 0.3
+"""Independent share of the depth residuals, over that of the grey ones, from which on depth has its whole weight;"""
+LEAST_DEPTH_TRUST = 1 / 3
+"""of which this part always stays."""
+
+
+def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], scales: Scales) -> Float[Array, ""]:
+    """Factor on depth's weight, from 1 to a third where its residuals, more than grey's, err by whole surfaces."""
+    r = objective.residuals(target_T_reference)
+    depth = _independent_share(r.depth, r.depth_valid, scales.depth, objective.columns)
+    grey = _independent_share(r.grey, r.inside, scales.grey, objective.columns)
+    return jnp.clip(depth / grey / FULL_DEPTH_RATIO, LEAST_DEPTH_TRUST, 1.0)
 
 
 def estimate_scales(

@@ -21,6 +21,7 @@ from gavo_jax.objective import (
     Problem,
     Reference,
     Scales,
+    depth_trust,
     estimate_brightness,
     estimate_scales,
     explained_share,
@@ -98,7 +99,7 @@ def prepare(
 jit_error = jax.jit(lambda objective, motion: objective.error(motion))
 jit_score = jax.jit(lambda objective, motions: objective.score(motions))
 jit_problem_score = jax.jit(lambda problem, x: problem.score(x))
-jit_scales, jit_brightness = map(jax.jit, (estimate_scales, estimate_brightness))
+jit_scales, jit_brightness, jit_trust = map(jax.jit, (estimate_scales, estimate_brightness, depth_trust))
 jit_explained = jax.jit(lambda objective, motion: explained_share(objective.residuals(motion)))
 jit_linearize = jax.jit(lambda problem, x: problem.linearize(x))
 
@@ -549,6 +550,18 @@ def test_depth_counts_as_its_own_scale_says() -> None:
         found.append(jit_scales(build(noisy), jnp.eye(4), 0.3))
     assert float(found[1].depth / found[0].depth) == pytest.approx(2.0, rel=0.1)
     assert [float(scales.depth_weight) for scales in found] == pytest.approx([0.3, 0.3])
+
+
+def test_depth_that_errs_by_whole_surfaces_is_trusted_less() -> None:
+    rng = np.random.default_rng(0)
+    pair = noisy_pair(rng.normal(0, 3, (48, 64)))
+    patches = np.kron(rng.normal(0, 0.004, (6, 8)), np.ones((8, 8)))
+    trust = []
+    for noise in (rng.permuted(patches), patches):
+        noisy = pair._replace(target_inverse_depth=pair.target_inverse_depth + noise)
+        objective = replace(build(noisy), columns=noisy.camera.width)
+        trust.append(float(jit_trust(objective, jnp.eye(4), jit_scales(objective, jnp.eye(4), 1.0))))
+    assert trust == pytest.approx([1.0, 1 / 3], rel=1e-6)
 
 
 def test_scale_survives_outliers() -> None:
