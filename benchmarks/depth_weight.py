@@ -29,8 +29,9 @@ import numpy as np
 from gavo_jax.alignment import AlignmentOptions, View, fit_objective, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
+from gavo_jax.datasets.base import Frame
 from gavo_jax.objective import Objective, Problem
-from gavo_jax.odometry import Odometry, TrackerState, decoded
+from gavo_jax.odometry import Odometry, Step, TrackerState, track
 from gavo_jax.presets import get_preset
 from gavo_jax.warp import exp
 
@@ -86,8 +87,9 @@ def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
     (at_grey, grey_hessian, grey_scatter), (at_depth, hessian, scatter) = (
         [np.asarray(leaf, np.float64) for leaf in channel] for channel in channels
     )
-    grey_covariance = np.linalg.solve(grey_hessian, np.linalg.solve(grey_hessian, grey_scatter).T)
-    covariance = np.linalg.solve(hessian, np.linalg.solve(hessian, scatter).T)
+    grey_covariance, covariance = (
+        np.linalg.solve(h, np.linalg.solve(h, s).T) for h, s in ((grey_hessian, grey_scatter), (hessian, scatter))
+    )
     grey, depth = np.trace(grey_hessian @ grey_covariance), np.trace(hessian @ covariance)
     apart = at_depth - at_grey
     disagreement = apart @ np.linalg.solve(grey_covariance + covariance, apart) / 6
@@ -100,14 +102,17 @@ def measure(clip: str) -> dict[int, dict[str, float]]:
     sequence, preset = common.open_clip(clip), get_preset("gauss-newton")
     options = replace(preset.odometry, reference="previous", recover=False)
     odometry = Odometry(sequence.camera, preset.solver, preset.alignment, options)
-    pairs, before = [], None
-    for index, frame in enumerate(decoded(sequence)):
-        step = odometry.register(frame, float(sequence.timestamps[index]))
-        after = odometry.progress.tracker
-        if step is not None and not step.lost and before is not None and after is not None:
-            levels = own_optima(before, after, odometry.camera, preset.solver, preset.alignment)
+    pairs, states = [], []
+
+    def compare(_: Frame | None, step: Step | None) -> None:
+        states.append(odometry.progress.tracker)
+        if step is not None and not step.lost and None not in (states[-2], states[-1]):
+            levels = own_optima(*states[-2:], odometry.camera, preset.solver, preset.alignment)
             pairs.append([weigh(channels) for channels in jax.device_get(levels)])
-        before = after
+        del states[:-1]
+
+    for _ in track(sequence, odometry=odometry, watch=compare):
+        pass
     medians = np.median(np.array(pairs), axis=0)
     levels = preset.solver.levels
     return {level: dict(zip(FIGURES, row.tolist(), strict=True)) for level, row in zip(levels, medians, strict=True)}
