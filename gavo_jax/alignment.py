@@ -19,6 +19,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
+    ESTIMATION_POINTS,
     Loss,
     Objective,
     PointsPerLevel,
@@ -106,6 +107,8 @@ class AlignmentOptions:
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
             None takes every pixel.
+        views: Largest number of reference frames that are scored together, an entry a level (static); the first ones
+            are.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
             level.
@@ -130,6 +133,7 @@ class AlignmentOptions:
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: PointsPerLevel = static(4800)
+    views: tuple[int, ...] = static((2, 2, 1, 1, 1))
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
     doubt_depth: bool = static(False)
@@ -265,6 +269,8 @@ class Level(NamedTuple):
     """Points a view on this level; places from there on are empty."""
     columns: Integer[Array, ""]
     """Points a row."""
+    views: Integer[Array, ""]
+    """Views that count; the points of the others have lost their readings."""
     islands: Integer[Array, ""]
     """Independent populations."""
     depth_weight: Float[Array, ""]
@@ -294,14 +300,19 @@ def stack_levels(
     cells = cells_of(cameras, levels, options.points)
     columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
     rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
+    counted = jnp.array([min(options.views[level], len(views)) for level in levels])
+    reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved)
+    left_out = jnp.arange(len(views))[:, None] >= counted[:, None, None]
+    points = reference.points._replace(q=jnp.where(left_out, 0.0, reference.points.q))
     once = Level(
         jnp.array(levels),
         jnp.arange(len(levels)) == 0,
         jnp.zeros(len(levels), bool),
         image_planes(camera, levels),
-        jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved),
+        reference._replace(points=points),
         jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
         jnp.array(columns),
+        counted,
         jnp.array([options.islands[level] for level in levels]),
         jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
         None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
@@ -342,6 +353,7 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
         jnp.float32(options.min_overlap),
         jnp.float32(charge),
         level.points,
+        level.views,
         level.columns,
         level.is_undecided if options.centred else None,
         level.readout,
@@ -369,13 +381,14 @@ def fit_objective(
     if options.brightness:
 
         def estimate(reference: Reference) -> Brightness:
-            return Brightness(*estimate_brightness(replace(objective, reference=reference), guess))
+            return Brightness(*estimate_brightness(replace(few, reference=reference), guess))
 
-        estimated = jax.vmap(estimate)(level.reference)
+        few = objective.sample(ESTIMATION_POINTS)
+        estimated = jax.vmap(estimate)(few.reference)
         brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
     if options.robust_scale:
-        scales = estimate_scales(objective, guess, level.depth_weight)
+        scales = estimate_scales(objective.sample(ESTIMATION_POINTS), guess, level.depth_weight)
         if options.doubt_depth:
             trust = jnp.where(level.is_first, 1.0, depth_trust(objective, guess, scales))
             scales = scales._replace(depth_weight=trust * scales.depth_weight)
@@ -499,7 +512,9 @@ def align_views(
 
     def search_level(search: Search, level: Level) -> tuple[Search, tuple[jax.Array, Population | None]]:
         objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
-        basis = preconditioner(reference_curvature(objective)) if options.precondition else jnp.eye(6)
+        basis = jnp.eye(6)
+        if options.precondition:
+            basis = preconditioner(reference_curvature(objective.sample(ESTIMATION_POINTS)))
         problem = Problem(objective, search.islands[0], basis, origins[0])
         places = search.islands.shape[0]
         keys = jax.random.split(jax.random.fold_in(key, level.number + LEVELS * level.is_again), places)

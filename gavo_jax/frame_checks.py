@@ -106,7 +106,7 @@ def check_frame(
     grey = np.asarray(frame.grey)[::ROW_STEP]
     repeated, checksum = history.checksum, zlib.crc32(grey.tobytes())
     history = history._replace(checksum=checksum)
-    if not np.isfinite(grey).all():
+    if not _is_finite(grey).all():
         return _refused(AlignmentStatus.NOT_FINITE), history
     clipped = float(np.mean((grey <= BLACK) | (grey >= WHITE)))
     status = _check_image(grey, clipped)
@@ -168,13 +168,13 @@ def _check_image(grey: np.ndarray, clipped: float) -> AlignmentStatus:
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:
     """Coverage and range of depth against what was usual."""
-    readings = depth[(depth > 0) & np.isfinite(depth)]
+    readings = depth[(depth > 0) & _is_finite(depth)]
     coverage = readings.size / depth.size
     if coverage < MIN_DEPTH_SHARE:
         return Finding(AlignmentStatus.NO_DEPTH, Use.TARGET), history
     usual = np.median(history.coverages) if history.coverages else coverage
     history = history._replace(coverages=_remember(history.coverages, coverage))
-    range_m = float(np.median(readings)) / depth_scale
+    range_m = float(np.median(readings[::ROW_STEP])) / depth_scale
     if history.range is not None:
         ratio = range_m / history.range
         if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
@@ -185,6 +185,11 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
     return Finding(AlignmentStatus.OK, Use.ALL), history
+
+
+def _is_finite(image: np.ndarray) -> np.ndarray:
+    """`np.isfinite`, which turns integers into floats first."""
+    return np.isfinite(image) if image.dtype.kind == "f" else np.ones((), bool)
 
 
 def _remember(values: tuple[float, ...], value: float) -> tuple[float, ...]:

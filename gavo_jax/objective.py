@@ -9,6 +9,7 @@ so the noise of 1/z is the same at every range and one scale serves all pixels.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -123,26 +124,29 @@ def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Refere
     height, width = level.grey.shape
     grey_u, grey_v = central_gradient(level.grey)
     slope_u, slope_v = inverse_depth_slopes(level.inverse_depth)
-    x = jnp.broadcast_to((jnp.arange(width) - camera.cx) / camera.fx, (height, width))
-    y = jnp.broadcast_to(((jnp.arange(height) - camera.cy) / camera.fy)[:, None], (height, width))
-    near = jnp.maximum(level.inverse_depth, 1e-3)
-    facing = jax.lax.rsqrt(1.0 + (camera.fx * slope_u / near) ** 2 + (camera.fy * slope_v / near) ** 2)
-    exposed = jnp.broadcast_to(row_time(jnp.arange(height), camera)[:, None], (height, width))
-    images = [x, y, level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v, facing, exposed]
+    images = [level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v]
     if cell == 1:
-        flat = [image.reshape(-1) for image in images]
+        place = jnp.arange(height * width)
     else:
-        rows, columns = height // cell, width // cell
-
-        def blocks(image: jax.Array) -> jax.Array:
-            cut = image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
-            return cut.transpose(0, 2, 1, 3).reshape(rows * columns, cell * cell)
-
         steepness = jnp.where(level.inverse_depth > 0, grey_u**2 + grey_v**2, -1.0)
-        chosen = jnp.argmax(blocks(steepness), axis=1)[:, None]
-        flat = [jnp.take_along_axis(blocks(image), chosen, axis=1)[:, 0] for image in images]
-    x, y, q, *others = flat
-    return Reference(Points(x, y, q), *others)
+        place = _largest_of_blocks(steepness, cell)
+    q, grey, grey_u, grey_v, slope_u, slope_v = (image.reshape(-1)[place] for image in images)
+    u, v = place % width, place // width
+    near = jnp.maximum(q, 1e-3)
+    facing = jax.lax.rsqrt(1.0 + (camera.fx * slope_u / near) ** 2 + (camera.fy * slope_v / near) ** 2)
+    points = Points((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, q)
+    return Reference(points, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, camera))
+
+
+def _largest_of_blocks(image: Float[Array, "h w"], cell: int) -> Integer[Array, " n"]:
+    """Place of the largest pixel of each cell x cell block in the flat image; the first of equal ones."""
+    height, width = image.shape
+    rows, columns = height // cell, width // cell
+    blocks = image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
+    within = jnp.argmax(blocks.reshape(rows, columns, cell * cell), axis=-1)
+    u = jnp.arange(columns) * cell + within % cell
+    v = jnp.arange(rows)[:, None] * cell + within // cell
+    return (v * width + u).reshape(-1)
 
 
 def cell_of(camera: Camera, points: int | None) -> int:
@@ -256,12 +260,14 @@ class Residuals(NamedTuple):
 GROUP = 8
 """Candidates that are scored side by side on a CPU; a population's size is best a multiple of it."""
 CHUNK = 1200
-"""Points a view on which a group of candidates is scored at a time on a CPU; what lies between two loops stays in the
-cache (`benchmarks/kernel.py`)."""
+"""Points of a view on which a group of candidates is scored at a time on a CPU; what lies between two loops stays in
+the cache (`benchmarks/kernel.py`)."""
 LINEARIZED_CHUNK = 4800
-"""Points a view that are linearised at a time; there is only one candidate then."""
+"""Points of a view that are linearised at a time; there is only one candidate then."""
 CENTRING_POINTS = 480
-"""Points, spread evenly, that tell a motion's mean residual."""
+"""Points a view that tell a motion's mean residual."""
+ESTIMATION_POINTS = 1200
+"""Points a view that tell brightness, scales and curvature before a level is searched."""
 MOST_CHUNKS = 16
 """On large images chunks grow so that there are no more than these."""
 
@@ -285,6 +291,8 @@ class Objective:
     by pushing pixels out of view; 0 averages over the points in view alone, as (2) does."""
     count: Integer[Array, ""] | None = None
     """Points a view that hold something, from the first on; None: all."""
+    views: Integer[Array, ""] | None = None
+    """Views that hold something, from the first on; None: all."""
     columns: Integer[Array, ""] | int = 1
     """Reference points a row: they come from a grid, row after row."""
     centred: Bool[Array, ""] | None = None
@@ -300,32 +308,39 @@ class Objective:
     use_depth: bool = field(default=False, metadata={"static": True})
 
     def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
-        """Sum of `part` over chunks of the reference's points, as far as there are any."""
-        points = self.reference.grey.shape[-1]
+        """Sum of `part` over chunks of the reference's points, view after view, as far as there are any."""
+        views, points = self.reference.grey.reshape(-1, self.reference.grey.shape[-1]).shape
         size = max(min(chunk_size, points), -(-points // MOST_CHUNKS))
         chunks = -(-points // size)
-        if chunks == 1:
+        if chunks * views == 1:
             return part(self.reference)
         fill = chunks * size - points
-        whole = jax.tree.map(lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, fill)]), self.reference)
-        used = chunks if self.count is None else -(-self.count // size)
+        whole = jax.tree.map(lambda a: jnp.pad(a.reshape(views, points), [(0, 0), (0, fill)]), self.reference)
+        used_chunks = chunks if self.count is None else -(-self.count // size)
+        used_views = views if self.views is None else jnp.minimum(self.views, views)
 
         def chunk(k: jax.Array | int) -> Reference:
-            return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, k * size, size, axis=a.ndim - 1), whole)
+            start = (k // used_chunks, k % used_chunks * size)
+            return jax.tree.map(lambda a: jax.lax.dynamic_slice(a, start, (1, size))[0], whole)
 
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: part(chunk(0))))
-        return jax.lax.fori_loop(0, used, lambda k, total: jax.tree.map(jnp.add, total, part(chunk(k))), zero)
+        add = partial(jax.tree.map, jnp.add)
+        return jax.lax.fori_loop(0, used_views * used_chunks, lambda k, total: add(total, part(chunk(k))), zero)
 
     def mean_residual(self, target_T_reference: Float[Array, "4 4"]) -> Float[Array, ""]:
         """Mean grey residual of one motion over points inside; 0 unless `centred`."""
         if self.centred is None:
             return jnp.float32(0.0)
-        points = self.reference.grey.shape[-1]
-        size = min(CENTRING_POINTS, points)
-        places = jnp.arange(size) * (points if self.count is None else self.count) // size
-        some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
-        r = self.residuals(target_T_reference, some, jnp.float32(0.0))
+        r = replace(self.sample(CENTRING_POINTS), centred=None).residuals(target_T_reference)
         return jnp.where(self.centred, jnp.sum(r.grey) / jnp.maximum(jnp.sum(r.inside), 1.0), 0.0)
+
+    def sample(self, points: int) -> "Objective":
+        """The same error on at most so many points a view, spread evenly."""
+        available = self.reference.grey.shape[-1]
+        size = min(points, available)
+        places = jnp.arange(size) * (available if self.count is None else self.count) // size
+        some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
+        return replace(self, reference=some, count=None)
 
     def residuals(
         self,
@@ -578,7 +593,8 @@ class Problem:
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
         tile = jax.nn.one_hot((row * TILES[0] + column).reshape(-1), TILES[0] * TILES[1])
-        by_tile = jnp.asarray(sum((jacobian * (weight * residual)) @ tile for jacobian, residual, weight in terms))
+        pull = jnp.asarray(sum(jacobian * (weight * residual) for jacobian, residual, weight in terms))
+        by_tile = pull @ tile
         by_tile *= 2.0 / objective._divisor(sums[1])
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)

@@ -56,12 +56,14 @@ class TrackerState(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """Times of a new frame, seconds."""
+    """When a new frame was taken, as numbers of the program."""
 
-    elapsed: Float[Array, ""]
-    """Since the reference's colour image."""
-    depth_delay: Float[Array, ""]
-    """From the new colour image to the new depth image."""
+    elapsed: Any
+    """Since the reference's colour image, seconds."""
+    depth_delay: Any
+    """From the new colour image to the new depth image, seconds."""
+    frame: Any
+    """Index in the sequence; with the run's key it makes the frame's random numbers."""
 
 
 def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], finest: int) -> Pyramid:
@@ -75,7 +77,7 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
     return tuple(levels)
 
 
-@partial(jax.jit, static_argnames=("options", "record"))
+@partial(jax.jit, static_argnames="record")
 def _track(
     state: TrackerState,
     grey: Array,
@@ -88,7 +90,7 @@ def _track(
     options: OdometryOptions,
     record: bool,
 ) -> tuple[TrackerState, Alignment, Population | None]:
-    """One frame: pyramid, alignment with the references, and the state for the next frame."""
+    """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's."""
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     predicted = state.motion * (clock.elapsed / state.seconds)
     finest = min(solver.levels)
@@ -105,6 +107,7 @@ def _track(
     exchanged = None
     if alignment.symmetric:
         exchanged = Exchanged(prepare_reference(target, camera, solver.levels, alignment), state.previous_image)
+    key = jax.random.fold_in(key, clock.frame)
     result, populations = align_views(
         views, packed, camera, solver, alignment, key, guesses, record, exchanged, readout
     )
@@ -203,6 +206,7 @@ class Odometry:
 
     Attributes:
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
+        key: Every random number follows from it and the frames' indices.
     """
 
     def __init__(
@@ -223,12 +227,12 @@ class Odometry:
         self.populations: tuple[Population, ...] = ()
         """Candidates of the last frame's search, an entry a level, coarsest first; empty unless they are recorded."""
         self.progress = Progress()
-        self._key = jax.random.key(seed)
+        self.key = jax.random.key(seed)
 
     def warm_up(self) -> float:
         """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
         start = time.perf_counter()
-        self._run(self.blank_state(), self._blank(), Clock(jnp.float32(1.0), jnp.float32(0.0)), self._key)
+        self._run(self.blank_state(), self._blank(), Clock(np.float32(1.0), np.float32(0.0), np.uint32(1)))
         return time.perf_counter() - start
 
     def blank_state(self) -> TrackerState:
@@ -333,15 +337,14 @@ class Odometry:
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
 
-    def inputs(self, before: Progress, frame: Frame) -> tuple[Clock, PRNGKeyArray]:
-        """Times and random key that a frame is aligned with."""
+    def clock(self, before: Progress, frame: Frame) -> Clock:
+        """When a frame was taken, for a driver that counts it as its last one already."""
         assert before.tracker is not None
         elapsed = frame.timestamp - before.reference_timestamp
         if elapsed <= 0:
             elapsed = float(before.tracker.seconds)
         delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
-        key = jax.random.fold_in(self._key, before.last_index)
-        return Clock(jnp.float32(max(elapsed, 1e-3)), jnp.float32(delay)), key
+        return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay), np.uint32(before.last_index))
 
     def _align(self, before: Progress, frame: Frame) -> tuple[TrackerState, Alignment, bool]:
         """Align with the references; a result that is not ok is tried again by the wide search.
@@ -351,15 +354,15 @@ class Odometry:
             that speaks against it and the wide search ends at the same motion (blur, or something that moves).
         """
         assert before.tracker is not None
-        clock, key = self.inputs(before, frame)
-        state_after, result = self._run(before.tracker, frame, clock, key)
+        clock = self.clock(before, frame)
+        state_after, result = self._run(before.tracker, frame, clock)
         usable = result.status == AlignmentStatus.OK
         if usable or not self.options.recover:
             return state_after, result, usable
         populations = self.populations
         wide = self._wide()
         state_wide, second = self._run(
-            before.tracker, frame, clock, key, wide.solver, wide.alignment, replace(self.options, reference="previous")
+            before.tracker, frame, clock, wide.solver, wide.alignment, replace(self.options, reference="previous")
         )
         if second.status == AlignmentStatus.OK:
             return state_wide, second, True
@@ -382,16 +385,14 @@ class Odometry:
         state: TrackerState,
         frame: Frame,
         clock: Clock,
-        key: PRNGKeyArray,
         solver: Any = None,
         alignment: AlignmentOptions | None = None,
         options: OdometryOptions | None = None,
     ) -> tuple[TrackerState, Alignment]:
         solver, alignment = solver or self.solver, alignment or self.alignment
         options = options or self.options
-        state, result, populations = _track(
-            state, frame.grey, frame.depth, clock, key, self.camera, solver, alignment, _traced(options), self.record
-        )
+        images, settings = (frame.grey, frame.depth), (self.camera, solver, alignment, _traced(options))
+        state, result, populations = _track(state, *images, clock, self.key, *settings, self.record)
         result = on_host(result)
         if populations is not None:
             host = jax.device_get(populations)

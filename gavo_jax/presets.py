@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import jax
+
 from gavo_jax.alignment import AlignmentOptions
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
+from gavo_jax.solvers.base import static
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -15,9 +18,10 @@ METHODS = ("ga", "pso", "gauss-newton", "adam")
 PRESETS = ("default", "paper", "fast", "wide")
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class OdometryOptions:
-    """How the driver uses the alignment.
+    """How the driver uses the alignment; all but `keyframe_overlap` is static.
 
     Attributes:
         reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
@@ -31,13 +35,13 @@ class OdometryOptions:
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
     """
 
-    reference: Literal["previous", "keyframe"] = "keyframe"
+    reference: Literal["previous", "keyframe"] = static("keyframe")
     keyframe_overlap: float = 0.75
-    prior: bool = True
-    synchronise: bool = True
-    rolling_shutter: bool = True
-    recover: bool = True
-    on_lost: Literal["hold", "predict", "stop"] = "hold"
+    prior: bool = static(True)
+    synchronise: bool = static(True)
+    rolling_shutter: bool = static(True)
+    recover: bool = static(True)
+    on_lost: Literal["hold", "predict", "stop"] = static("hold")
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,12 @@ def _paper_solver(method: str) -> Any:
 _DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": GaussNewton(), "adam": GradientDescent()}
 
 _FAST = {
-    "ga": GeneticAlgorithm(population=(0, 16, 16, 24, 48), iterations=(0, 5, 5, 7, 10)),
+    "ga": GeneticAlgorithm(
+        population=(0, 16, 16, 24, 48),
+        iterations=(0, 5, 5, 7, 10),
+        patience=2,
+        progress=(0.003, 0.01, 0.03, 0.03, 0.03),
+    ),
     "pso": ParticleSwarm(population=(0, 12, 16, 20, 32), iterations=(0, 8, 10, 12, 16)),
     "gauss-newton": GaussNewton(iterations=(0, 6, 8, 10, 12), patience=2),
     "adam": GradientDescent(iterations=(0, 15, 20, 30, 40)),

@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import jax
@@ -82,7 +81,7 @@ def track_stacked(
 
 def program_of(preset: Preset) -> Any:
     """What decides, beside the camera, the compiled program of a run: runs of equal (hashable) answers share one."""
-    return jax.tree.structure((preset.solver, preset.alignment)), _traced(preset.odometry)
+    return jax.tree.structure(_settings_of(preset))
 
 
 def _drive(
@@ -105,7 +104,15 @@ def _drive(
     return steps
 
 
-@partial(jax.jit, static_argnames=("odometry",))
+Settings = tuple[Any, AlignmentOptions, OdometryOptions]
+"""A run's solver, what it minimises and how the driver uses it, as the program takes them."""
+
+
+def _settings_of(preset: Preset) -> Settings:
+    return preset.solver, preset.alignment, _traced(preset.odometry)
+
+
+@jax.jit
 def _track_stack(
     states: TrackerState,
     grey: Any,
@@ -113,16 +120,14 @@ def _track_stack(
     clocks: Clock,
     keys: Any,
     camera: Camera,
-    solvers: Any,
-    alignments: AlignmentOptions,
-    odometry: OdometryOptions,
+    settings: Settings,
 ) -> tuple[TrackerState, Alignment]:
-    """One frame of R runs: everything but the images, the camera and the program has a leading axis R."""
+    """One frame of R runs: everything but the images and the camera has a leading axis R."""
 
-    def one(state: TrackerState, clock: Clock, key: Any, solver: Any, alignment: AlignmentOptions) -> Any:
-        return _track(state, grey, depth, clock, key, camera, solver, alignment, odometry, record=False)[:2]
+    def one(state: TrackerState, clock: Clock, key: Any, settings: Settings) -> Any:
+        return _track(state, grey, depth, clock, key, camera, *settings, record=False)[:2]
 
-    return jax.vmap(one)(states, clocks, keys, solvers, alignments)
+    return jax.vmap(one)(states, clocks, keys, settings)
 
 
 NEW_ROW: Any = object()
@@ -139,14 +144,13 @@ class _Lane(Odometry):
         state: TrackerState,
         frame: Frame,
         clock: Clock,
-        key: Any,
         solver: Any = None,
         alignment: AlignmentOptions | None = None,
         options: OdometryOptions | None = None,
     ) -> tuple[TrackerState, Alignment]:
         if solver is None and self.first_attempt is not None:
             return NEW_ROW, self.first_attempt
-        return super()._run(state, frame, clock, key, solver, alignment, options)
+        return super()._run(state, frame, clock, solver, alignment, options)
 
 
 class _Stack:
@@ -157,10 +161,9 @@ class _Stack:
             _Lane(camera, preset.solver, preset.alignment, preset.odometry, seed)
             for preset, seed in zip(presets, seeds, strict=True)
         ]
-        self._camera, self._options = camera, _traced(presets[0].odometry)
+        self._camera = camera
         self._sharding = _over_devices(len(presets))
-        self._solvers = self._rows([preset.solver for preset in presets])
-        self._alignments = self._rows([preset.alignment for preset in presets])
+        self._settings = self._rows([_settings_of(preset) for preset in presets])
 
     def register(self, frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
         """Track one more frame by all lanes; each decides by itself what becomes of it."""
@@ -178,12 +181,11 @@ class _Stack:
     def _attempt(self, frame: Frame, before: Sequence[Progress]) -> TrackerState:
         """Align a frame by all lanes in one call; each lane keeps its own result, the stack of states is returned."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
-        inputs = [lane.inputs(progress, frame) for lane, progress in zip(self.lanes, numbered, strict=True)]
-        clocks, keys = self._rows([clock for clock, _ in inputs]), jnp.stack([key for _, key in inputs])
+        clocks = self._rows([lane.clock(progress, frame) for lane, progress in zip(self.lanes, numbered, strict=True)])
+        keys = jnp.stack([lane.key for lane in self.lanes])
         states = self._rows([progress.tracker for progress in before])
         images = jnp.asarray(frame.grey), jnp.asarray(frame.depth)
-        solved = (self._camera, self._solvers, self._alignments, self._options)
-        after, results = _track_stack(states, *images, clocks, keys, *solved)
+        after, results = _track_stack(states, *images, clocks, keys, self._camera, self._settings)
         host = jax.device_get(results)
         for i, lane in enumerate(self.lanes):
             lane.first_attempt = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
@@ -196,7 +198,7 @@ class _Stack:
 
 
 def _as_array(leaf: Any) -> jax.Array:
-    return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf, jnp.float32)
+    return jnp.asarray(leaf, jnp.float32) if isinstance(leaf, float | int) else jnp.asarray(leaf)
 
 
 @jax.jit

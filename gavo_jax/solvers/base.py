@@ -56,7 +56,12 @@ class Solver(Protocol):
 
     @property
     def patience(self) -> int:
-        """Iterations without a better candidate after which a level ends."""
+        """Iterations without progress after which a level ends."""
+        ...
+
+    @property
+    def progress(self) -> Schedule:
+        """Share of its best error that an iteration must exceed to be one with progress."""
         ...
 
     @property
@@ -94,10 +99,16 @@ class Solver(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PerLevel:
-    """Base of the solvers: resolves fields that hold an entry a level."""
+    """Base of the solvers: resolves fields that hold an entry a level.
 
+    Attributes:
+        progress: An iteration that lowers the best error by no more than this share counts as one without progress;
+            an entry a level.
+        level: The level that is being searched; an input of the compiled program.
+    """
+
+    progress: Schedule = 1e-4
     level: Integer[Array, ""] | int = field(default=0, repr=False)
-    """The level that is being searched; an input of the compiled program."""
 
     def at_level(self, level: Integer[Array, ""] | int) -> Self:
         """The same solver on one level."""
@@ -137,10 +148,6 @@ class Solution(NamedTuple):
     like `history`."""
 
 
-STAGNATION = 1e-4
-"""An iteration whose best error is not lower by this share counts as one without progress."""
-
-
 def solve(
     key: PRNGKeyArray,
     solver: Any,
@@ -155,7 +162,7 @@ def solve(
     """
     init_key, loop_key = jax.random.split(key)
     state = solver.init(init_key, problem, guess, bounds)
-    iterations = solver.here(solver.iterations)
+    iterations, least = solver.here(solver.iterations), solver.here(solver.progress)
 
     def entry(state: Any, best: Best) -> tuple[jax.Array, Candidates | None]:
         return best.error, solver.candidates(state) if record else None
@@ -167,7 +174,7 @@ def solve(
         state, best, count, stale, log = carry
         state = solver.step(jax.random.fold_in(loop_key, count), state, problem)
         new = solver.best(state)
-        progress = new.error < best.error * (1.0 - STAGNATION)
+        progress = new.error < best.error * (1.0 - least)
         best = jax.tree.map(lambda a, b: jnp.where(new.error < best.error, a, b), new, best)
         log = jax.tree.map(lambda rows, row: rows.at[count].set(row), log, entry(state, best))
         return state, best, count + 1, jnp.where(progress, 0, stale + 1), log

@@ -58,8 +58,8 @@ class GeneticAlgorithm(PerLevel):
     patience: int = static(1000)
     mutants: float = 0.3
     surrogate: bool = static(True)
-    spread: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
-    mutation_step: Schedule | None = (1.0, 1.0, 2.0, 3.0, 6.0)
+    spread: Schedule | None = (0.5, 0.5, 2.0, 3.0, 6.0)
+    mutation_step: Schedule | None = (0.5, 0.5, 2.0, 3.0, 6.0)
     mutation_decay: float = 0.8
     mutation_rate: float = 0.1
     crossover_range: float = 0.25
