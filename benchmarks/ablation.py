@@ -1,4 +1,4 @@
-"""What each ingredient buys: the GA's default preset with one ingredient switched off at a time.
+"""What each ingredient buys: a preset of the GA with one ingredient switched off at a time.
 
 Prints, for each clip, a row a variant: drift of translation (m/s) and rotation (deg/s), median over the seeds with its
 spread, lost pairs of the worst run, milliseconds a pair; then a row a variant with the ratios of its medians to those
@@ -7,8 +7,9 @@ without it is 1 buys nothing.
 
     python benchmarks/ablation.py
     python benchmarks/ablation.py --clips fr1_desk:40 --variants depth,prior --seeds 2 --json ablation.json
+    python benchmarks/ablation.py --preset fast --variants views,stagnation
 
-On 2 cores the defaults (3 clips, 5 seeds, 12 rows) take about 20 minutes.
+On 2 cores the defaults (3 clips, 5 seeds, 13 rows) take about 20 minutes.
 """
 
 from collections.abc import Callable
@@ -63,17 +64,24 @@ VARIANTS: dict[str, tuple[str, Callable[[Preset], Preset]]] = {
     "prior": ("no constant velocity", _odometry(prior=False)),
     "recover": ("no second try", _odometry(recover=False)),
     "points": ("every pixel", _alignment(points=None)),
+    "views": ("both references on every level", _alignment(views=(2, 2, 2, 2, 2))),
+    "stagnation": (
+        "every generation",
+        lambda preset: replace(preset, solver=replace(preset.solver, patience=max(preset.solver.iterations))),
+    ),
 }
 """Ingredient: what is there without it, and the preset without it."""
+OF_DEFAULT = ",".join(name for name in VARIANTS if name != "stagnation")
+"""The default preset never stops a level before its last generation."""
 
 
-def contenders(variants: str) -> list[common.Contender]:
+def contenders(variants: str, preset_name: str = "default") -> list[common.Contender]:
     """The full preset and its variants.
 
     Raises:
         GavoError: an unknown variant.
     """
-    preset = get_preset("ga", "default")
+    preset = get_preset("ga", preset_name)
     chosen = [common.preset_contender(FULL, preset)]
     for name in common.names(variants):
         if name not in VARIANTS:
@@ -97,7 +105,11 @@ def compare(summaries: list[common.Summary]) -> list[dict[str, Any]]:
 
 
 def main(
-    clips: str = common.CLIPS, variants: str = ",".join(VARIANTS), seeds: int = 5, json: Path | None = None
+    clips: str = common.CLIPS,
+    variants: str = OF_DEFAULT,
+    seeds: int = 5,
+    preset: str = "default",
+    json: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, print and return the figures.
 
@@ -105,9 +117,10 @@ def main(
         clips: as for drift.py, with commas between.
         variants: ingredients to switch off, with commas between.
         seeds: runs of each variant.
+        preset: settings that the ingredients are taken from.
         json: file for all runs and the summary.
     """
-    runs = common.measure_drift(common.names(clips), contenders(variants), seeds)
+    runs = common.measure_drift(common.names(clips), contenders(variants, preset), seeds)
     summaries = common.summarise(runs)
     for clip in common.names(clips):
         rows = [common.drift_row(summary) for summary in summaries if summary.clip == clip]

@@ -352,9 +352,8 @@ class Objective:
         reference = self.reference if reference is None else reference
         mean = self.mean_residual(target_T_reference) if mean is None else mean
         warped = warp(reference.points, target_T_reference, self.plane)
-        seen = warped
-        if self.readout is not None:
-            seen = delay(reference.points, warped, Shutter(self.readout, reference.row_time), self.plane)
+        shutter = self.shutter(reference)
+        seen = warped if shutter is None else delay(reference.points, warped, shutter, self.plane)
         words = look_up(self.target, seen, self.plane)
         grey_sample, depth_sample = sample_grey(words, seen), sample_depth(words, seen)
         grey = grey_sample.value - reference.grey - mean
@@ -369,6 +368,10 @@ class Objective:
             grey_sample,
             depth_sample,
         )
+
+    def shutter(self, reference: Reference) -> Shutter | None:
+        """How the rows of some points were exposed; None where all were at once."""
+        return None if self.readout is None else Shutter(self.readout, reference.row_time)
 
     def _cost(self, r: Residuals) -> Float[Array, "*n"]:
         """Cost of every point; −1 marks those outside, so that one pass over the points does."""
@@ -631,7 +634,7 @@ def _weighted_terms(
     """For each channel J of [6, N], r and w of [N]: half of E's gradient is Σ J w r over the number of points, half its
     Gauss-Newton Hessian Σ w J Jᵀ.
     """
-    scales, facing = objective.scales, reference.facing
+    scales, facing, shutter = objective.scales, reference.facing, objective.shutter(reference)
     grey, depth = r.grey_sample, r.depth_sample
     one = jnp.float32(1.0)
     along = Slopes(grey.along_u, grey.along_v, jnp.zeros_like(r.grey))
@@ -642,8 +645,7 @@ def _weighted_terms(
         channels.append((r.depth, scales.depth, r.depth_valid, factor, along))
     terms = []
     for residual, scale, mask, factor, slopes in channels:
-        if objective.readout is not None:
-            shutter = Shutter(objective.readout, reference.row_time)
+        if shutter is not None:
             slopes = delayed_slopes(slopes, reference.points, r.warped, shutter, objective.plane)
         jacobian = _jacobian(slopes, r.warped, reference.points, objective.plane, tangent)
         jacobian = jnp.where(mask > 0, jacobian, 0.0)

@@ -10,14 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, AlignmentStatus, align, align_batch, visited_levels
+from gavo_jax.alignment import (
+    Alignment,
+    AlignmentOptions,
+    AlignmentStatus,
+    align,
+    align_batch,
+    prepare_pair,
+    stack_levels,
+    visited_levels,
+)
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
 from gavo_jax.presets import METHODS, PRESETS, get_preset
-from gavo_jax.pyramid import LEVELS
+from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.warp import exp
@@ -86,6 +95,16 @@ def test_the_symmetric_error_does_not_care_which_frame_is_the_reference(
     one_way, both_ways = there_and_back(False), there_and_back(True)
     assert both_ways[0] < one_way[0] / 5 and both_ways[1] < one_way[1] / 5
     assert one_way[0] > 1e-4
+
+
+def test_coarse_levels_see_the_first_view_alone(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    camera, options = sequence.camera, AlignmentOptions(views=(2, 2, 1, 1, 1))
+    pyramid = build_pyramid(jnp.asarray(frames[0].grey), jnp.asarray(frames[0].depth), camera.depth_scale)
+    view, *_ = prepare_pair(pyramid, pyramid, camera, (2, 1), options)
+    levels = stack_levels((view, view), camera, (2, 1), options)
+    assert levels.views.tolist() == [1, 2]
+    has_reading = np.asarray(levels.reference.points.q > 0).any(axis=-1)
+    assert has_reading.tolist() == [[True, False], [True, True]]
 
 
 def test_a_search_that_refines_visits_its_levels_again(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:

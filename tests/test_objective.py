@@ -319,6 +319,43 @@ def test_two_references_score_as_the_mean_over_both_their_points() -> None:
     assert float(jit_error(together, motion)[0]) == pytest.approx(expected, rel=1e-5)
 
 
+def two_views(pair: oracle.Pair, other: oracle.Pair) -> tuple[Objective, Objective]:
+    """The first pair's objective, and the same with the other's reference as a second view."""
+    one = build(pair, student_t, (20.0, 0.02, 0.3))
+    second = build(other, student_t, (20.0, 0.02, 0.3)).reference
+    return one, replace(one, reference=jax.tree.map(lambda *leaves: jnp.stack(leaves), one.reference, second))
+
+
+@pytest.mark.parametrize("chunk", [432, 100])
+def test_views_are_scored_chunk_after_chunk(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    _, both = two_views(random_pair(8), random_pair(9))
+    motions = random_motions(11)
+    expected = objective_module._score_side_by_side(both, motions, jnp.ones(11, bool))
+    monkeypatch.setattr(objective_module, "CHUNK", chunk)
+    for found, value in zip(jax.jit(lambda o, m: o.score(m))(both, motions), expected, strict=True):
+        np.testing.assert_allclose(found, value, rtol=1e-5)
+
+
+def test_a_view_without_readings_changes_nothing_and_is_not_visited() -> None:
+    one, both = two_views(random_pair(8), random_pair(9))
+    motions = random_motions(11)
+    expected = jit_score(one, motions)
+    points = both.reference.points
+    emptied = replace(both, reference=both.reference._replace(points=points._replace(q=points.q.at[1].set(0.0))))
+    visited = replace(both, reference=both.reference._replace(grey=both.reference.grey.at[1].set(jnp.nan)))
+    for objective in (emptied, replace(emptied, views=jnp.int32(1))):
+        np.testing.assert_allclose(jit_score(objective, motions), expected, rtol=1e-5)
+    assert not np.any(np.isnan(jit_score(replace(visited, views=jnp.int32(1)), motions)))
+
+
+def test_a_sample_is_spread_over_the_points_that_count() -> None:
+    objective = build(random_pair(5), student_t, (20.0, 0.02, 0.3))
+    few = replace(objective, count=jnp.int32(240)).sample(60)
+    np.testing.assert_array_equal(few.reference.grey, objective.reference.grey[:240:4])
+    everything = objective.sample(10_000)
+    np.testing.assert_array_equal(everything.reference.grey, objective.reference.grey)
+
+
 def test_settled_points_are_where_they_were_in_the_middle_of_the_readout() -> None:
     pair = smooth_pair(rim=1)
     reference = make_reference(PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in pair[1:3])), CAMERA)

@@ -195,6 +195,14 @@ def test_patience_does_not_change_what_is_found_before_the_stop() -> None:
     np.testing.assert_allclose(cut.history[:count], full.history[:count], rtol=1e-5)
 
 
+def test_a_level_ends_where_it_gains_less_than_it_should() -> None:
+    solver = replace(SOLVERS["pso"], iterations=(200, 200), patience=6, progress=(1e-4, 0.5))
+    lasted = [
+        int(jit_search(jax.random.key(0), solver.at_level(level), bowl(), GUESS, BOX).iterations) for level in (0, 1)
+    ]
+    assert 6 < lasted[1] < lasted[0] / 1.5
+
+
 def test_levels_pick_their_entries() -> None:
     solver = GeneticAlgorithm(population=(2, 4, 8), iterations=(0, 5, 6), spread=(1.0, 2.0, 3.0), mutation_step=None)
     assert solver.levels == (2, 1)
