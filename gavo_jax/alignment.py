@@ -19,7 +19,6 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
-    ESTIMATION_POINTS,
     Loss,
     Objective,
     PointsPerLevel,
@@ -107,6 +106,8 @@ class AlignmentOptions:
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
             None takes every pixel.
+        estimation_points: Largest number of points a view from which brightness, scales and curvature are estimated
+            before a level is searched (static); None takes all.
         views: Largest number of reference frames that are scored together, an entry a level (static); the first ones
             are.
         islands: Independent populations, an entry a level (static); the best ones go on to the next level.
@@ -133,6 +134,7 @@ class AlignmentOptions:
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: PointsPerLevel = static(4800)
+    estimation_points: int | None = static(1200)
     views: tuple[int, ...] = static((2, 2, 1, 1, 1))
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
@@ -383,12 +385,12 @@ def fit_objective(
         def estimate(reference: Reference) -> Brightness:
             return Brightness(*estimate_brightness(replace(few, reference=reference), guess))
 
-        few = objective.sample(ESTIMATION_POINTS)
+        few = objective.sample(options.estimation_points)
         estimated = jax.vmap(estimate)(few.reference)
         brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
     if options.robust_scale:
-        scales = estimate_scales(objective.sample(ESTIMATION_POINTS), guess, level.depth_weight)
+        scales = estimate_scales(objective.sample(options.estimation_points), guess, level.depth_weight)
         if options.doubt_depth:
             trust = jnp.where(level.is_first, 1.0, depth_trust(objective, guess, scales))
             scales = scales._replace(depth_weight=trust * scales.depth_weight)
@@ -514,7 +516,7 @@ def align_views(
         objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
         basis = jnp.eye(6)
         if options.precondition:
-            basis = preconditioner(reference_curvature(objective.sample(ESTIMATION_POINTS)))
+            basis = preconditioner(reference_curvature(objective.sample(options.estimation_points)))
         problem = Problem(objective, search.islands[0], basis, origins[0])
         places = search.islands.shape[0]
         keys = jax.random.split(jax.random.fold_in(key, level.number + LEVELS * level.is_again), places)

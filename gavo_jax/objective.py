@@ -266,8 +266,6 @@ LINEARIZED_CHUNK = 4800
 """Points of a view that are linearised at a time; there is only one candidate then."""
 CENTRING_POINTS = 480
 """Points a view that tell a motion's mean residual."""
-ESTIMATION_POINTS = 1200
-"""Points a view that tell brightness, scales and curvature before a level is searched."""
 MOST_CHUNKS = 16
 """On large images chunks grow so that there are no more than these."""
 
@@ -334,8 +332,10 @@ class Objective:
         r = replace(self.sample(CENTRING_POINTS), centred=None).residuals(target_T_reference)
         return jnp.where(self.centred, jnp.sum(r.grey) / jnp.maximum(jnp.sum(r.inside), 1.0), 0.0)
 
-    def sample(self, points: int) -> "Objective":
-        """The same error on at most so many points a view, spread evenly."""
+    def sample(self, points: int | None) -> "Objective":
+        """The same error on at most so many points a view, spread evenly; None: on all."""
+        if points is None:
+            return self
         available = self.reference.grey.shape[-1]
         size = min(points, available)
         places = jnp.arange(size) * (available if self.count is None else self.count) // size

@@ -129,6 +129,7 @@ WIDE_OBJECTIVE = AlignmentOptions(
     symmetric=True,
     refine=True,
     points=19200,
+    estimation_points=None,
     depth_weight=(1.0, 1.0, 1.0, 0.3, 0.3),
     doubt_depth=True,
     islands=(1, 1, 4, 16, 96),
