@@ -125,12 +125,12 @@ def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Refere
     grey_u, grey_v = central_gradient(level.grey)
     slope_u, slope_v = inverse_depth_slopes(level.inverse_depth)
     images = [level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v]
-    if cell == 1:
-        place = jnp.arange(height * width)
-    else:
+    place, flat = jnp.arange(height * width), [image.reshape(-1) for image in images]
+    if cell > 1:
         steepness = jnp.where(level.inverse_depth > 0, grey_u**2 + grey_v**2, -1.0)
         place = _largest_of_blocks(steepness, cell)
-    q, grey, grey_u, grey_v, slope_u, slope_v = (image.reshape(-1)[place] for image in images)
+        flat = [image[place] for image in flat]
+    q, grey, grey_u, grey_v, slope_u, slope_v = flat
     u, v = place % width, place // width
     near = jnp.maximum(q, 1e-3)
     facing = jax.lax.rsqrt(1.0 + (camera.fx * slope_u / near) ** 2 + (camera.fy * slope_v / near) ** 2)
