@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import AlignmentOptions, View, fit_objective, stack_levels
+from gavo_jax.alignment import AlignmentOptions, fit_objective, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
@@ -50,9 +50,7 @@ def own_optima(
     the Hessian of the mean cost there, residuals in units of their scale, and the covariance of its gradient.
     """
     motion = exp(after.motion)
-    levels = stack_levels(
-        (View(before.previous, jnp.eye(4)),), camera, solver.levels, options, None, camera.readout / after.seconds
-    )
+    levels = stack_levels((before.previous,), camera, solver.levels, options, None, camera.readout / after.seconds)
     found = []
     for place in range(len(solver.levels)):
         level = jax.tree.map(lambda leaf, place=place: leaf[place], levels)

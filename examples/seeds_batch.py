@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import gavo_jax as gavo
-from gavo_jax.alignment import View, align_views, prepare_pair
+from gavo_jax.alignment import align_views, prepare_pair
+from gavo_jax.objective import Reference
 from gavo_jax.pyramid import build_pyramid
 from gavo_jax.warp import Target
 
@@ -28,7 +29,7 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     before, after = (build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence)
     view, target, _ = prepare_pair(before, after, camera, SOLVER.levels, options)
 
-    def final_error(key: jax.Array, decay: jax.Array, view: View, target: Target) -> jax.Array:
+    def final_error(key: jax.Array, decay: jax.Array, view: Reference, target: Target) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
         return align_views((view,), target, camera, solver, options, key, still[None])[0].error
 

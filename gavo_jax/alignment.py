@@ -32,7 +32,6 @@ from gavo_jax.objective import (
     explained_share,
     geman_mcclure,
     make_references,
-    move_reference,
     preconditioner,
     reference_curvature,
 )
@@ -115,6 +114,9 @@ class AlignmentOptions:
             level.
         doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
             err by whole surfaces (static); see `objective.depth_trust`.
+        last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
+            curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
+            only evaluated end scattered about the minimum; this centres them.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -139,6 +141,7 @@ class AlignmentOptions:
     islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
     depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
     doubt_depth: bool = static(False)
+    last_step: bool = static(True)
     min_overlap: float = 0.35
     outside_cost: float | None = None
     bounds: tuple[float, float] = (0.5, 0.8)
@@ -215,15 +218,6 @@ SHARED_ERRORS = 9.0
 rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
 
 
-class View(NamedTuple):
-    """A frame that serves as reference, and where it stands."""
-
-    references: Reference
-    """Its points, [L, N], coarsest level first; see `prepare_reference`."""
-    anchor_T_view: Float[Array, "4 4"]
-    """Maps the view's points into the camera that the result is relative to."""
-
-
 class Exchanged(NamedTuple):
     """The two frames of a pair with their parts exchanged, for the symmetric error."""
 
@@ -247,9 +241,9 @@ def prepare_target(pyramid: Pyramid, levels: tuple[int, ...]) -> Target:
 
 def prepare_pair(
     reference: Pyramid, target: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
-) -> tuple[View, Target, Exchanged | None]:
+) -> tuple[Reference, Target, Exchanged | None]:
     """What a search needs of two frames."""
-    view = View(prepare_reference(reference, camera, levels, options), jnp.eye(4))
+    view = prepare_reference(reference, camera, levels, options)
     exchanged = None
     if options.symmetric:
         exchanged = Exchanged(prepare_reference(target, camera, levels, options), prepare_target(reference, levels))
@@ -289,7 +283,7 @@ class Level(NamedTuple):
 
 
 def stack_levels(
-    views: tuple[View, ...],
+    views: tuple[Reference, ...],
     camera: Camera,
     levels: tuple[int, ...],
     options: AlignmentOptions,
@@ -297,13 +291,12 @@ def stack_levels(
     readout: Float[Array, ""] | None = None,
 ) -> Level:
     """The visits of a search to the levels, [L], coarsest first."""
-    moved = [view.references if i == 0 else move_reference(*view) for i, view in enumerate(views)]
     cameras = [camera.level(level) for level in levels]
     cells = cells_of(cameras, levels, options.points)
     columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
     rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
     counted = jnp.array([min(options.views[level], len(views)) for level in levels])
-    reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *moved)
+    reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *views)
     left_out = jnp.arange(len(views))[:, None] >= counted[:, None, None]
     points = reference.points._replace(q=jnp.where(left_out, 0.0, reference.points.q))
     once = Level(
@@ -469,7 +462,7 @@ class Search(NamedTuple):
 
 
 def align_views(
-    views: tuple[View, ...],
+    views: tuple[Reference, ...],
     target: Target,
     camera: Camera,
     solver: Any,
@@ -485,8 +478,8 @@ def align_views(
     The levels are one `lax.scan`: what a level does is compiled once and serves all of them.
 
     Args:
-        views: Reference frames; the first one is the anchor, the others' points are moved into its camera.
-        target: Of `prepare_target`, as the views are of `prepare_reference`, for the same solver.
+        views: Of `prepare_reference`; the first one's frame is the anchor, in whose camera the others' points are too.
+        target: Of `prepare_target`, for the same solver.
         camera: Camera of level 0.
         solver: Any `solvers.base.Solver` with an entry a level.
         options: What is minimised.
@@ -673,7 +666,20 @@ def _conclude(
         (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
     ):
         status = jnp.where(found, jnp.int32(value), status)
-    return Alignment(problem.origin, log(problem.origin), model.error, model.overlap, covariance, status, history)
+    motion, error, overlap = problem.origin, model.error, model.overlap
+    if options.last_step:
+        stepped = motion @ exp(-inverse @ model.gradient)
+        its_error, its_overlap = objective.error(stepped)
+        better = its_error < error * (1.0 + LARGEST_RISE)
+        motion, error, overlap = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (stepped, its_error, its_overlap), (motion, error, overlap)
+        )
+    return Alignment(motion, log(motion), error, overlap, covariance, status, history)
+
+
+LARGEST_RISE = 0.003
+"""Share by which the last step may raise E: between pixels E is rough, by about that much, and the step's aim is the
+middle of its basin."""
 
 
 class Images(NamedTuple):

@@ -187,9 +187,9 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], p
     return jax.tree.map(fill, *references)
 
 
-def move_reference(reference: Reference, anchor_T_view: Float[Array, "4 4"]) -> Reference:
+def move_reference(reference: Reference, camera_T_reference: Float[Array, "4 4"]) -> Reference:
     """The same points as rays of another camera; what falls behind it loses its reading."""
-    r, t = anchor_T_view[:3, :3], anchor_T_view[:3, 3]
+    r, t = camera_T_reference[:3, :3], camera_T_reference[:3, 3]
     x, y, q = reference.points
     return reference._replace(points=_rays([r[i, 0] * x + r[i, 1] * y + (r[i, 2] + t[i] * q) for i in range(3)], q))
 
@@ -215,14 +215,6 @@ def _rays(moved: list[jax.Array], q: jax.Array) -> Points:
     before = (q > 0) & (moved[2] > 1e-3)
     depth = jnp.where(before, moved[2], 1.0)
     return Points(moved[0] / depth, moved[1] / depth, jnp.where(before, q / depth, 0.0))
-
-
-def share_in_view(
-    reference: Reference, target_T_reference: Float[Array, "4 4"], camera: Camera | ImagePlane
-) -> Float[Array, ""]:
-    """Share of the reference's points that land inside the target; nothing is sampled."""
-    inside = warp(reference.points, target_T_reference, camera).inside
-    return jnp.sum(inside) / jnp.maximum(jnp.sum(reference.points.q > 0), 1.0)
 
 
 class Scales(NamedTuple):

@@ -23,7 +23,6 @@ from gavo_jax.alignment import (
     AlignmentStatus,
     Exchanged,
     Population,
-    View,
     align_views,
     on_host,
     prepare_reference,
@@ -34,11 +33,11 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
-from gavo_jax.objective import Reference, settle_reference, share_in_view
+from gavo_jax.objective import Reference, move_reference, settle_reference
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.warp import Target, exp, synchronise_depth
+from gavo_jax.warp import Points, Target, exp, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -46,9 +45,9 @@ class TrackerState(NamedTuple):
 
     previous: Reference
     keyframe: Reference
+    """Points of earlier frames in the previous frame's camera; see `renew_keyframe`."""
     previous_image: Target
     """The previous frame, packed for sampling: what the symmetric error needs of it."""
-    previous_T_keyframe: Float[Array, "4 4"]
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
     seconds: Float[Array, ""]
@@ -77,6 +76,36 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
     return tuple(levels)
 
 
+KEYFRAME_SHARES = 16
+"""Shares of a keyframe's points that are renewed independently,"""
+KEYFRAME_SPREAD = 0.2
+"""each at its own overlap, evenly spread over a range of this width."""
+
+
+def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overlap: Any) -> Reference:
+    """A keyframe with the points that are going out of view replaced by the newest frame's.
+
+    A keyframe that is given up whole makes all that follows hang on which frame happens to be the first below a
+    threshold. Here the points are dealt into shares, the shares' thresholds differ, and so each is soon of
+    another frame.
+
+    Args:
+        keyframe: Points of earlier frames in the newest frame's camera, [L, N].
+        newest: The newest frame's points, alike.
+        camera: Of the last, finest level.
+        overlap: Part of a share that is in view when it is given up, on average over the shares.
+    """
+    places = np.arange(keyframe.grey.shape[-1])
+    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each all over the image
+    dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
+    x, y, q = (leaf[-1] for leaf in keyframe.points)
+    inside = warp(Points(x, y, q), jnp.eye(4), camera).inside
+    in_view = (inside @ dealt) / jnp.maximum((q > 0).astype(jnp.float32) @ dealt, 1.0)
+    thresholds = overlap + KEYFRAME_SPREAD * np.linspace(-0.5, 0.5, KEYFRAME_SHARES)
+    renewed = (in_view < thresholds)[share]
+    return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
+
+
 @partial(jax.jit, static_argnames="record")
 def _track(
     state: TrackerState,
@@ -97,9 +126,9 @@ def _track(
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
     readout = camera.readout / clock.elapsed if options.rolling_shutter else None
-    views = (View(state.previous, jnp.eye(4)),)
+    views = (state.previous,)
     if options.reference == "keyframe":
-        views += (View(state.keyframe, state.previous_T_keyframe),)
+        views += (state.keyframe,)
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
@@ -116,14 +145,9 @@ def _track(
     newest, keyframe = prepare_reference(target, camera, solver.levels, alignment), state.keyframe
     if readout is not None:
         newest, keyframe = (settle_reference(frame, result.xi * readout) for frame in (newest, keyframe))
-    target_T_keyframe = result.target_T_reference @ state.previous_T_keyframe
-    coarsest = jax.tree.map(lambda leaf: leaf[0], keyframe)
-    share = share_in_view(coarsest, target_T_keyframe, camera.level(max(solver.levels)))
-    renew = share < options.keyframe_overlap
-    keyframe, target_T_keyframe = jax.tree.map(
-        lambda new, old: jnp.where(renew, new, old), (newest, jnp.eye(4)), (keyframe, target_T_keyframe)
-    )
-    return TrackerState(newest, keyframe, packed, target_T_keyframe, result.xi, clock.elapsed), result, populations
+    keyframe = move_reference(keyframe, result.target_T_reference)
+    keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
+    return TrackerState(newest, keyframe, packed, result.xi, clock.elapsed), result, populations
 
 
 @jax.jit
@@ -134,7 +158,7 @@ def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignme
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     reference = prepare_reference(pyramid, camera, solver.levels, alignment)
     packed = prepare_target(pyramid, solver.levels)
-    return TrackerState(reference, reference, packed, jnp.eye(4), jnp.zeros(6), jnp.float32(1.0))
+    return TrackerState(reference, reference, packed, jnp.zeros(6), jnp.float32(1.0))
 
 
 @dataclass(frozen=True)

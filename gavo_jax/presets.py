@@ -36,7 +36,7 @@ class OdometryOptions:
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")
-    keyframe_overlap: float = 0.75
+    keyframe_overlap: float = 0.7
     prior: bool = static(True)
     synchronise: bool = static(True)
     rolling_shutter: bool = static(True)
@@ -58,6 +58,7 @@ PAPER_OBJECTIVE = AlignmentOptions(
     depth=False,
     brightness=False,
     robust_scale=False,
+    last_step=False,
     precondition=False,
     points=None,
     min_overlap=0.5,

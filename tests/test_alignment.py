@@ -107,6 +107,22 @@ def test_coarse_levels_see_the_first_view_alone(sequence: SyntheticSequence, fra
     assert has_reading.tolist() == [[True, False], [True, True]]
 
 
+def test_a_last_step_centres_what_a_short_search_leaves(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    solver = GeneticAlgorithm(population=16, iterations=(0, 2, 3, 8, 10))
+    truth = target_T_reference(sequence, 0, 1)
+
+    def off(last_step: bool) -> tuple[list[float], list[float]]:
+        options = AlignmentOptions(last_step=last_step)
+        found = [
+            align(frames[0], frames[1], sequence.camera, solver, jax.random.key(k), None, options) for k in range(5)
+        ]
+        return [difference(a.target_T_reference, truth)[0] for a in found], [float(a.error) for a in found]
+
+    (with_step, error), (without, error_before) = off(True), off(False)
+    assert np.median(with_step) < np.median(without) / 2
+    assert np.all(np.array(error) <= 1.003 * np.array(error_before))
+
+
 def test_a_search_that_refines_visits_its_levels_again(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     options = AlignmentOptions(islands=(1, 1, 1, 1, 3), scouts=32, refine=True)
     assert visited_levels((4, 3), options) == (4, 4, 3)

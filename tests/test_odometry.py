@@ -10,18 +10,22 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.alignment import AlignmentOptions, AlignmentStatus, prepare_reference
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry, OdometryRun, Step, no_alignment, run_odometry, track
+from gavo_jax.objective import move_reference
+from gavo_jax.odometry import Odometry, OdometryRun, Step, no_alignment, renew_keyframe, run_odometry, track
 from gavo_jax.presets import OdometryOptions
+from gavo_jax.pyramid import build_pyramid
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.trajectory import Trajectory
+from gavo_jax.warp import exp
 
 CAMERA = DEFAULT_CAMERA.level(1)
 FRAMES = 12
@@ -424,6 +428,28 @@ def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticS
         assert state is not None
         pending.append([bool(np.any(frame.row_time)) for frame in (state.previous, state.keyframe)])
     assert pending == [[True, True], [False, False]]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.25, 0.3, 0.6])
+def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSequence) -> None:
+    frame, camera = sequence[0], CAMERA.level(1)
+    pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
+    first = prepare_reference(pyramid, CAMERA, SOLVER.levels, AlignmentOptions())
+    keyframe = move_reference(first, exp(jnp.array([0.0, 0, 0, 0, turn, 0])))
+    renewed = renew_keyframe(keyframe, first._replace(grey=first.grey + 1000.0), camera, 0.7).grey > 500.0
+
+    x, y, q = (leaf[-1] for leaf in keyframe.points)
+    seen = q > 0
+    u, v = x * camera.fx + camera.cx, y * camera.fy + camera.cy
+    inside = seen & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    overlap = float(jnp.sum(inside) / jnp.sum(seen))
+    expected = np.clip((0.8 - overlap) / 0.2, 0.0, 1.0)
+    share = float(jnp.mean(renewed[-1]))
+    assert share == pytest.approx(expected, abs=0.13) and (share in (0.0, 1.0)) == (expected in (0.0, 1.0))
+    places = np.arange(renewed.shape[1]) % 80 < 40  # each share is spread over the whole image
+    left, right = (float(jnp.mean(renewed[-1][side])) for side in (places, ~places))
+    assert left == pytest.approx(right, abs=0.03)
+    np.testing.assert_array_equal(renewed[0], renewed[-1])
 
 
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
