@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Integer
 from gavo_jax.camera import Camera
 from gavo_jax.pyramid import Pyramid, PyramidLevel
 from gavo_jax.warp import (
-    GENERATORS,
     DepthSample,
     GreySample,
     ImagePlane,
@@ -28,6 +27,7 @@ from gavo_jax.warp import (
     Slopes,
     Target,
     Warped,
+    adjoint,
     delay,
     delayed_slopes,
     exp,
@@ -491,25 +491,15 @@ class Linearization(NamedTuple):
     hessian: Float[Array, "6 6"]
 
 
-def _jacobian(
-    slopes: Slopes, warped: Warped, points: Points, camera: Camera | ImagePlane, tangent: Float[Array, "4 4 6"]
-) -> Float[Array, "6 ..."]:
-    """Chain rule from (u, v, 1/z) of the warped points to six coordinates; `tangent` is ∂(4x4 motion)/∂x."""
-    along_u, along_v, along_inverse_depth = slopes
-    per_depth = warped.inverse_depth / jnp.maximum(points.q, 1e-6)
-    from_x = along_u * camera.fx * per_depth
-    from_y = along_v * camera.fy * per_depth
-    from_z = -(
-        along_u * (warped.u - camera.cx) + along_v * (warped.v - camera.cy) + along_inverse_depth * warped.inverse_depth
-    )
-    from_z *= per_depth
-    x, y, q = points
-
-    def column(t: jax.Array) -> jax.Array:
-        moved = [t[i, 0] * x + t[i, 1] * y + (t[i, 2] + t[i, 3] * q) for i in range(3)]
-        return from_x * moved[0] + from_y * moved[1] + from_z * moved[2]
-
-    return jnp.stack([column(tangent[:, :, k]) for k in range(6)])
+def _jacobian(slopes: Slopes, warped: Warped, camera: Camera | ImagePlane) -> Float[Array, "6 n"]:
+    """Derivative by a step δ on the target's side, exp(δ) · target_T_reference, by way of u, v and 1/z."""
+    x, y, q = (warped.u - camera.cx) / camera.fx, (warped.v - camera.cy) / camera.fy, warped.inverse_depth
+    pull_x, pull_y = slopes.along_u * camera.fx, slopes.along_v * camera.fy
+    pull_z = -(pull_x * x + pull_y * y + slopes.along_inverse_depth * q)
+    # held back, or XLA would compute what is sampled once more for each of the six rows
+    x, y, q, pull_x, pull_y, pull_z = jax.lax.optimization_barrier((x, y, q, pull_x, pull_y, pull_z))
+    turns = (y * pull_z - pull_y, pull_x - x * pull_z, x * pull_y - y * pull_x)
+    return jnp.stack([q * pull_x, q * pull_y, q * pull_z, *turns]).reshape(6, -1)
 
 
 Term = tuple[Float[Array, "6 n"], Float[Array, " n"], Float[Array, " n"]]
@@ -569,7 +559,7 @@ class Problem:
         if backward is None:
             return model
         inverse = rigid_inverse(motion)
-        other = _linearize(backward, inverse, -jnp.einsum("ij,jkm,kl->ilm", inverse, tangent, inverse))
+        other = _linearize(backward, inverse, -adjoint(inverse) @ tangent)
         error, overlap = _mean(model[:2], other[:2])
         return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
 
@@ -583,48 +573,49 @@ class Problem:
         objective, plane = self.objective, self.objective.plane
         motion, tangent = self._tangent(x)
         r = objective.residuals(motion)
-        terms = _weighted_terms(objective, tangent, objective.reference, r)
+        terms = _weighted_terms(objective, objective.reference, r)
         sums = objective._sums(objective._cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
         tile = jax.nn.one_hot((row * TILES[0] + column).reshape(-1), TILES[0] * TILES[1])
         pull = jnp.asarray(sum(jacobian * (weight * residual) for jacobian, residual, weight in terms))
-        by_tile = pull @ tile
+        by_tile = tangent.T @ (pull @ tile)
         by_tile *= 2.0 / objective._divisor(sums[1])
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
-        return _linearization(objective, sums, *_normal_equations(terms)), scatter, r
+        return _linearization(objective, tangent, sums, *_normal_equations(terms)), scatter, r
 
-    def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "4 4 6"]]:
-        """The motion, and its derivative by x."""
+    def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
+        """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
         motion = self.transform(x)
-        step = GENERATORS @ (right_jacobian(self.basis @ x) @ self.basis)
-        return motion, jnp.einsum("ij,jkm->ikm", motion, step)
+        return motion, adjoint(motion) @ right_jacobian(self.basis @ x) @ self.basis
 
 
-def _linearize(objective: Objective, motion: Float[Array, "4 4"], tangent: Float[Array, "4 4 6"]) -> Linearization:
-    """E of one direction and its first two derivatives at a motion whose derivative is `tangent`."""
+def _linearize(objective: Objective, motion: Float[Array, "4 4"], tangent: Float[Array, "6 6"]) -> Linearization:
+    """E of one direction and its first two derivatives at a motion, by coordinates of which exp(tangent · dx) follows
+    it.
+    """
     mean = objective.mean_residual(motion)
 
     def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
         r = objective.residuals(motion, reference, mean)
-        gradient, hessian = _normal_equations(_weighted_terms(objective, tangent, reference, r))
+        gradient, hessian = _normal_equations(_weighted_terms(objective, reference, r))
         return objective._sums(objective._cost(r)), gradient, hessian
 
-    return _linearization(objective, *objective.sum_over_points(part, LINEARIZED_CHUNK))
+    return _linearization(objective, tangent, *objective.sum_over_points(part, LINEARIZED_CHUNK))
 
 
-def _linearization(objective: Objective, sums: jax.Array, gradient: jax.Array, hessian: jax.Array) -> Linearization:
+def _linearization(
+    objective: Objective, tangent: Float[Array, "6 6"], sums: jax.Array, gradient: jax.Array, hessian: jax.Array
+) -> Linearization:
     error, overlap = objective._conclude(sums)
     factor = 2.0 / objective._divisor(sums[1])
-    return Linearization(error, overlap, factor * gradient, factor * hessian)
+    return Linearization(error, overlap, factor * tangent.T @ gradient, factor * tangent.T @ hessian @ tangent)
 
 
-def _weighted_terms(
-    objective: Objective, tangent: Float[Array, "4 4 6"], reference: Reference, r: Residuals
-) -> list[Term]:
-    """For each channel J of [6, N], r and w of [N]: half of E's gradient is Σ J w r over the number of points, half its
-    Gauss-Newton Hessian Σ w J Jᵀ.
+def _weighted_terms(objective: Objective, reference: Reference, r: Residuals) -> list[Term]:
+    """For each channel J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is Σ J w r
+    over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
     """
     scales, facing, shutter = objective.scales, reference.facing, objective.shutter(reference)
     grey, depth = r.grey_sample, r.depth_sample
@@ -639,12 +630,11 @@ def _weighted_terms(
     for residual, scale, mask, factor, slopes in channels:
         if shutter is not None:
             slopes = delayed_slopes(slopes, reference.points, r.warped, shutter, objective.plane)
-        jacobian = _jacobian(slopes, r.warped, reference.points, objective.plane, tangent)
-        jacobian = jnp.where(mask > 0, jacobian, 0.0)
+        jacobian = jnp.where(mask.reshape(-1) > 0, _jacobian(slopes, r.warped, objective.plane), 0.0)
         s = (residual / scale) ** 2
         _, slope = jax.jvp(objective.loss, (s,), (jnp.ones_like(s),))
         weight = factor * jnp.where(mask > 0, slope, 0.0)
-        terms.append((jacobian.reshape(6, -1), residual.reshape(-1), weight.reshape(-1)))
+        terms.append((jacobian, residual.reshape(-1), weight.reshape(-1)))
     return terms
 
 
@@ -669,8 +659,7 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
     warped = Warped(points.x * plane.fx + plane.cx, points.y * plane.fy + plane.cy, points.q, valid)
 
     def curvature(slopes: Slopes) -> jax.Array:
-        jacobian = _jacobian(slopes, warped, points, plane, jnp.asarray(GENERATORS)) * valid
-        jacobian = jacobian.reshape(6, -1)
+        jacobian = _jacobian(slopes, warped, plane) * valid.reshape(-1)
         return jacobian @ jacobian.T / jnp.maximum(jnp.sum(valid), 1.0)
 
     total = curvature(Slopes(reference.grey_u, reference.grey_v, jnp.zeros_like(valid)))

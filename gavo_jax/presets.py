@@ -102,7 +102,7 @@ _DEFAULT = {"ga": GeneticAlgorithm(), "pso": ParticleSwarm(), "gauss-newton": Ga
 _FAST = {
     "ga": GeneticAlgorithm(
         population=(0, 16, 16, 24, 48),
-        iterations=(0, 5, 5, 7, 10),
+        iterations=(0, 3, 5, 7, 10),
         patience=2,
         progress=(0.003, 0.01, 0.03, 0.03, 0.03),
     ),

@@ -56,13 +56,20 @@ GENERATORS = _generators()
 
 def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
     """J with exp(ξ + δ) ≈ exp(ξ) exp(J δ), to second order in ξ: I − ad/2 + ad²/6."""
+    v, w = _cross(xi[:3]), _cross(xi[3:])
+    ad = jnp.block([[w, v], [jnp.zeros((3, 3)), w]])
+    return jnp.eye(6) - 0.5 * ad + ad @ ad / 6.0
 
-    def cross(a: jax.Array) -> jax.Array:
-        return jnp.asarray(GENERATORS[:3, :3, 3:]) @ a
 
-    v, w = cross(xi[:3]), cross(xi[3:])
-    adjoint = jnp.block([[w, v], [jnp.zeros((3, 3)), w]])
-    return jnp.eye(6) - 0.5 * adjoint + adjoint @ adjoint / 6.0
+def adjoint(transform: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
+    """A with transform · exp(δ) = exp(A δ) · transform."""
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    return jnp.block([[rotation, _cross(translation) @ rotation], [jnp.zeros((3, 3)), rotation]])
+
+
+def _cross(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Matrix of the cross product with a vector."""
+    return jnp.asarray(GENERATORS[:3, :3, 3:]) @ a
 
 
 class Points(NamedTuple):

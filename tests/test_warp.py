@@ -24,6 +24,7 @@ from gavo_jax.warp import (
     Target,
     Warped,
     Words,
+    adjoint,
     delay,
     delayed_slopes,
     exp,
@@ -107,6 +108,13 @@ def test_right_jacobian_to_second_order(xi: np.ndarray, direction: np.ndarray) -
     tangent = np.linalg.inv(base) @ (moved[0] - moved[1]) / (2 * h)
     third_order = np.linalg.norm(xi) ** 3 * np.linalg.norm(direction)
     assert np.abs(tangent - hat(np.asarray(jit_jacobian(xi)) @ direction)).max() <= 0.1 * third_order + 1e-5
+
+
+@given(twists(1.0), twists(1.0))
+def test_adjoint_takes_a_step_to_the_other_side(xi: np.ndarray, step: np.ndarray) -> None:
+    motion = scipy.linalg.expm(hat(xi))
+    moved = hat(np.asarray(jax.jit(adjoint)(jnp.asarray(motion, jnp.float32))) @ step) @ motion
+    np.testing.assert_allclose(moved, motion @ hat(step), atol=1e-5)
 
 
 def grid_points(camera: Camera, inverse_depth: np.ndarray) -> Points:

@@ -87,12 +87,15 @@ class GeneticAlgorithm(PerLevel):
         error = jnp.concatenate([state.error, new_error])
         keep = jnp.argsort(error)[:places]
         state = state._replace(population=x[keep], error=jnp.where(present, error[keep], jnp.inf))
-        cross_key, mutate_key = jax.random.split(key)
+        chance = jax.random.uniform(key, (places, 8), minval=SMALLEST_CHANCE)
+        parents = state.population[self._select(chance[:, 6:], state.error)]
         last = population - 1
         mutants = jnp.round(self.mutants * jnp.float32(population)).astype(jnp.int32)
         own = jnp.arange(places)[:, None]
         offspring = jnp.where(
-            own > last - int(self.surrogate) - mutants, self._mutate(mutate_key, state), self._cross(cross_key, state)
+            own > last - int(self.surrogate) - mutants,
+            self._mutate(chance, parents, state),
+            self._cross(chance, parents),
         )
         if self.surrogate:
             offspring = jnp.where(own == last, surrogate_minimum(state.population, state.error), offspring)
@@ -108,28 +111,32 @@ class GeneticAlgorithm(PerLevel):
         present = jnp.arange(state.error.shape[0]) < self.here(self.population)
         return Candidates(jnp.where(present[:, None], state.population, jnp.nan), state.error)
 
-    def _select(self, key: PRNGKeyArray, error: Float[Array, " p"], count: int) -> Integer[Array, " n"]:
+    def _select(self, chance: Float[Array, "p 2"], error: Float[Array, " p"]) -> Integer[Array, "p 2"]:
         """Roulette wheel (11): indices drawn in proportion to the fitness f = exp(−8 E/E_min) (10)."""
         fitness = jnp.exp(-self.pressure * (error / jnp.maximum(error[0], 1e-12) - 1.0))
         wheel = jnp.cumsum(jnp.where(jnp.isfinite(error), fitness, 0.0))
-        draws = jax.random.uniform(key, (count,)) * wheel[-1]
-        return jnp.minimum(jnp.searchsorted(wheel, draws), error.shape[0] - 1)
+        # all compared at once: a binary search is a loop, whose turns cost more than they save on a population
+        places = jnp.searchsorted(wheel, chance * wheel[-1], method="compare_all")
+        return jnp.minimum(places, error.shape[0] - 1)
 
-    def _cross(self, key: PRNGKeyArray, state: GeneticState) -> Float[Array, "p 6"]:
+    def _cross(self, chance: Float[Array, "p 8"], parents: Float[Array, "p 2 6"]) -> Float[Array, "p 6"]:
         """Intermediate crossover with an extra range (13): a + α (b − a), α drawn for every gene."""
-        places = state.error.shape[0]
-        select_key, alpha_key = jax.random.split(key)
-        parents = state.population[self._select(select_key, state.error, 2 * places)]
-        first, second = parents[:places], parents[places:]
+        first, second = parents[:, 0], parents[:, 1]
         width = self.crossover_range
-        alpha = -width + (1.0 + 2.0 * width) * jax.random.uniform(alpha_key, first.shape)
+        alpha = -width + (1.0 + 2.0 * width) * chance[:, :6]
         return first + alpha * (second - first)
 
-    def _mutate(self, key: PRNGKeyArray, state: GeneticState) -> Float[Array, "p 6"]:
+    def _mutate(
+        self, chance: Float[Array, "p 8"], parents: Float[Array, "p 2 6"], state: GeneticState
+    ) -> Float[Array, "p 6"]:
         """Mutation (12): ξ' = ξ + δ randn, of chromosomes drawn by the wheel."""
-        select_key, noise_key = jax.random.split(key)
-        chosen = state.population[self._select(select_key, state.error, state.error.shape[0])]
-        return chosen + state.mutation_step * jax.random.normal(noise_key, chosen.shape)
+        randn = jnp.sqrt(2.0) * jax.lax.erf_inv(2.0 * chance[:, :6] - 1.0)
+        return parents[:, 0] + state.mutation_step * randn
+
+
+SMALLEST_CHANCE = 2.0**-24
+"""A generation's random numbers are drawn at once, eight for each offspring, uniform from here to 1: six for its genes,
+which are either crossed or mutated, and two for its parents. 0 would be a mutation of infinite size."""
 
 
 def first_candidates(
