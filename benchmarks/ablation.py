@@ -56,6 +56,7 @@ VARIANTS: dict[str, tuple[str, Callable[[Preset], Preset]]] = {
         lambda preset: replace(preset, solver=replace(preset.solver, surrogate=False)),
     ),
     "robust": ("plain L2", _alignment(loss=l2)),
+    "last_step": ("the best candidate as it is", _alignment(last_step=False)),
     "depth": ("no depth term", _alignment(depth=False)),
     "brightness": ("no brightness model", _alignment(brightness=False)),
     "synchronise": ("depth as it was read", _odometry(synchronise=False)),
