@@ -668,15 +668,19 @@ def _conclude(
         status = jnp.where(found, jnp.int32(value), status)
     motion, error, overlap = problem.origin, model.error, model.overlap
     if options.last_step:
-        stepped = motion @ exp(-inverse @ model.gradient)
+        step = -inverse @ model.gradient
+        stepped = motion @ exp(step)
         its_error, its_overlap = objective.error(stepped)
-        better = its_error < error * (1.0 + LARGEST_RISE)
+        better = (its_error < error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
         motion, error, overlap = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (stepped, its_error, its_overlap), (motion, error, overlap)
         )
     return Alignment(motion, log(motion), error, overlap, covariance, status, history)
 
 
+LARGEST_STEP = 0.01
+"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
+images leave open; it is not taken."""
 LARGEST_RISE = 0.003
 """Share by which the last step may raise E: between pixels E is rough, by about that much, and the step's aim is the
 middle of its basin."""

@@ -86,8 +86,8 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     """A keyframe with the points that are going out of view replaced by the newest frame's.
 
     A keyframe that is given up whole makes all that follows hang on which frame happens to be the first below a
-    threshold. Here the points are dealt into shares, the shares' thresholds differ, and so each is soon of
-    another frame.
+    threshold. Here the points are dealt into shares, each with its own threshold, so that the shares are soon of
+    different frames.
 
     Args:
         keyframe: Points of earlier frames in the newest frame's camera, [L, N].

@@ -26,7 +26,8 @@ class OdometryOptions:
     Attributes:
         reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
             at once, their points scored together.
-        keyframe_overlap: A new keyframe is taken when less than this share of the old one's points is in view.
+        keyframe_overlap: Part of the keyframe's points that is still in view when they are replaced by a newer frame's;
+            the mean over its shares, see `odometry.renew_keyframe`.
         prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
         synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
             sequence tells both stamps.
