@@ -116,7 +116,8 @@ class AlignmentOptions:
             err by whole surfaces (static); see `objective.depth_trust`.
         last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
             curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
-            only evaluated end scattered about the minimum; this centres them.
+            only evaluated end scattered about the minimum; this centres them. Not where the error is `symmetric`: slope
+            and curvature are known of one direction alone.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             None, and on the levels that refine one motion: (2) as printed.
@@ -667,7 +668,7 @@ def _conclude(
     ):
         status = jnp.where(found, jnp.int32(value), status)
     motion, error, overlap = problem.origin, model.error, model.overlap
-    if options.last_step:
+    if options.last_step and not options.symmetric:
         step = -inverse @ model.gradient
         stepped = motion @ exp(step)
         its_error, its_overlap = objective.error(stepped)

@@ -129,7 +129,6 @@ _WIDE = {
 WIDE_OBJECTIVE = AlignmentOptions(
     centred=True,
     symmetric=True,
-    last_step=False,
     refine=True,
     points=19200,
     estimation_points=None,
@@ -146,8 +145,8 @@ WIDE_OBJECTIVE = AlignmentOptions(
 16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
 so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
 their mean, and once few modes are left depth may count as much as grey does. Over a wide baseline one frame may be
-blurred and each sees what the other does not, so both directions count (and there is no last step, which would follow
-one of them alone); the winner is refined from the coarsest level again, on more points than tracking takes."""
+blurred and each sees what the other does not, so both directions count; the winner is refined from the coarsest level
+again, on more points than tracking takes."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:
