@@ -535,7 +535,7 @@ def align_views(
     iterations = [solver.iterations[level] for level in visited_levels(solver.levels, options)]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness)
-    return _conclude(objective, search, finest, options, history), populations
+    return _conclude(objective, search, finest, options, history, origins[0]), populations
 
 
 def _search_island(
@@ -632,9 +632,14 @@ CLEARED = 1e9
 
 
 def _conclude(
-    objective: Objective, search: Search, finest: Level, options: AlignmentOptions, history: jax.Array
+    objective: Objective,
+    search: Search,
+    finest: Level,
+    options: AlignmentOptions,
+    history: jax.Array,
+    centre: Float[Array, "4 4"],
 ) -> Alignment:
-    """Error, covariance and status at the motion that the search ended with.
+    """Error, covariance and status at the motion that the search, held about a centre, ended with.
 
     The scales are estimated there once more, so that errors of different solvers can be compared.
     """
@@ -642,7 +647,8 @@ def _conclude(
     scales = estimate_scales(objective, target_T_reference, finest.depth_weight)
     if options.robust_scale:
         objective = replace(objective, scales=scales)
-    problem = Problem(objective, target_T_reference, jnp.eye(6))
+    reach = jnp.stack([search.box[0], search.box[3]])
+    problem = Problem(objective, target_T_reference, jnp.eye(6), centre, reach)
     model, scatter, residuals = problem.examine(jnp.zeros(6))
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
     inverse = jnp.linalg.inv(model.hessian + ridge)
@@ -672,7 +678,8 @@ def _conclude(
         step = -inverse @ model.gradient
         stepped = motion @ exp(step)
         its_error, its_overlap = objective.error(stepped)
-        better = (its_error < error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
+        better = (its_error < error * (1.0 + LARGEST_RISE)) & ~problem.is_out_of_reach(stepped)
+        better &= jnp.all(jnp.abs(step) < LARGEST_STEP)
         motion, error, overlap = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (stepped, its_error, its_overlap), (motion, error, overlap)
         )

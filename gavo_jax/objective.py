@@ -544,12 +544,15 @@ class Problem:
         motions = self.transform(x)
         counted = jnp.ones(x.shape[0], bool) if counted is None else counted
         error, overlap = self.objective.score(motions, counted & self.searched)
-        if self.centre is not None and self.reach is not None:
-            offset = jnp.linalg.inv(self.centre) @ motions
-            cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
-            far = (jnp.linalg.norm(offset[:, :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
-            error = jnp.where(far, jnp.inf, error)
-        return jnp.where(jnp.isnan(error), jnp.inf, error), overlap
+        return jnp.where(jnp.isnan(error) | self.is_out_of_reach(motions), jnp.inf, error), overlap
+
+    def is_out_of_reach(self, motions: Float[Array, "*p 4 4"]) -> Bool[Array, "*p"]:
+        """Which motions lie further from the centre than the search is held."""
+        if self.centre is None or self.reach is None:
+            return jnp.zeros(motions.shape[:-2], bool)
+        offset = jnp.linalg.inv(self.centre) @ motions
+        cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
+        return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
 
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
