@@ -37,7 +37,7 @@ from gavo_jax.objective import Reference, move_reference, settle_reference
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.warp import Points, Target, exp, synchronise_depth, warp
+from gavo_jax.warp import Target, exp, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -98,9 +98,9 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     places = np.arange(keyframe.grey.shape[-1])
     share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each all over the image
     dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
-    x, y, q = (leaf[-1] for leaf in keyframe.points)
-    inside = warp(Points(x, y, q), jnp.eye(4), camera).inside
-    in_view = (inside @ dealt) / jnp.maximum((q > 0).astype(jnp.float32) @ dealt, 1.0)
+    finest = jax.tree.map(lambda leaf: leaf[-1], keyframe.points)
+    inside = warp(finest, jnp.eye(4), camera).inside
+    in_view = (inside @ dealt) / jnp.maximum((finest.q > 0).astype(jnp.float32) @ dealt, 1.0)
     thresholds = overlap + KEYFRAME_SPREAD * np.linspace(-0.5, 0.5, KEYFRAME_SHARES)
     renewed = (in_view < thresholds)[share]
     return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
