@@ -132,7 +132,7 @@ WIDE_OBJECTIVE = AlignmentOptions(
     refine=True,
     points=19200,
     estimation_points=None,
-    depth_weight=(1.0, 1.0, 1.0, 0.3, 0.3),
+    depth_weight=(0.3, 0.3, 1.0, 0.3, 0.3),
     doubt_depth=True,
     islands=(1, 1, 4, 16, 96),
     scouts=8192,
@@ -144,9 +144,10 @@ WIDE_OBJECTIVE = AlignmentOptions(
 """Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
 16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
 so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
-their mean, and once few modes are left depth may count as much as grey does. Over a wide baseline one frame may be
-blurred and each sees what the other does not, so both directions count; the winner is refined from the coarsest level
-again, on more points than tracking takes."""
+their mean, and while a few modes compete that grey tells apart badly, depth counts as much as grey does; at the finest
+levels, which decide how far the result is off, less. Over a wide baseline one frame may be blurred and each sees what
+the other does not, so both directions count; the winner is refined from the coarsest level again, on more points than
+tracking takes."""
 
 
 def get_preset(method: str = "ga", name: str = "default") -> Preset:

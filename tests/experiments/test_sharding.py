@@ -29,7 +29,7 @@ def start(out: Path, devices: int, *distributed: object) -> subprocess.Popen[str
     environment = {
         **os.environ,
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}",
     }
     command = [sys.executable, str(SCRIPT), str(out), *map(str, distributed)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
