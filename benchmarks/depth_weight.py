@@ -76,7 +76,8 @@ def optimum(objective: Objective, motion: jax.Array, unit: jax.Array) -> tuple[j
         return x - jnp.linalg.solve(model.hessian, model.gradient)
 
     x = jax.lax.fori_loop(0, STEPS, step, jnp.zeros(6))
-    model, scatter, _ = problem.examine(x)
+    found = replace(problem, origin=problem.transform(x))
+    model, scatter = found.examine(objective.residuals(found.origin))
     return x, model.hessian / unit, scatter / unit**2
 
 

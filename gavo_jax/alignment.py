@@ -19,6 +19,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
+    Brightness,
     Loss,
     Objective,
     PointsPerLevel,
@@ -34,6 +35,7 @@ from gavo_jax.objective import (
     make_references,
     preconditioner,
     reference_curvature,
+    unconditioner,
 )
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
 from gavo_jax.solvers.base import Bounds, Candidates, solve, static
@@ -257,8 +259,6 @@ class Level(NamedTuple):
     number: Integer[Array, ""]
     """In the pyramid; 0 is the full image."""
     is_first: Bool[Array, ""]
-    is_again: Bool[Array, ""]
-    """Whether one motion is refined, after a search in which several competed."""
     plane: ImagePlane
     reference: Reference
     """[V, N]: the points of all views as rays of the anchor camera."""
@@ -303,7 +303,6 @@ def stack_levels(
     once = Level(
         jnp.array(levels),
         jnp.arange(len(levels)) == 0,
-        jnp.zeros(len(levels), bool),
         image_planes(camera, levels),
         reference._replace(points=points),
         jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
@@ -321,7 +320,7 @@ def stack_levels(
     order = jnp.array([levels.index(level) for level in visits])
     rounds = jax.tree.map(lambda leaf: leaf[order], once)
     islands = jnp.where(first_round, rounds.islands, 1)
-    return rounds._replace(is_first=rounds.is_first & first_round, is_again=~first_round, islands=islands)
+    return rounds._replace(is_first=rounds.is_first & first_round, islands=islands)
 
 
 def visited_levels(levels: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
@@ -329,17 +328,9 @@ def visited_levels(levels: tuple[int, ...], options: AlignmentOptions) -> tuple[
     return tuple(level for level in levels if options.refine and options.islands[level] > 1) + levels
 
 
-class Brightness(NamedTuple):
-    """Gain and bias of every view, [V]: I_{t+1}(ω(ξ, p)) ≈ gain · I_t(p) + bias."""
-
-    gain: Float[Array, " v"]
-    bias: Float[Array, " v"]
-
-
 def level_objective(level: Level, target: Target, options: AlignmentOptions, brightness: Brightness) -> Objective:
     """E of one level under a brightness model, its scales still those of (2)."""
-    gain, bias = brightness
-    reference = level.reference._replace(grey=gain[:, None] * level.reference.grey + bias[:, None])
+    reference = level.reference._replace(grey=brightness.seen(level.reference.grey))
     charge = 0.0 if options.outside_cost is None else jnp.where(level.islands > 1, options.outside_cost, 0.0)
     return Objective(
         reference,
@@ -374,17 +365,17 @@ def fit_objective(
     """
     brightness = unchanged_brightness(level)
     objective = level_objective(level, target, options, brightness)
+    few = objective.sample(options.estimation_points)
+    residuals = few.residuals(guess)
     if options.brightness:
-
-        def estimate(reference: Reference) -> Brightness:
-            return Brightness(*estimate_brightness(replace(few, reference=reference), guess))
-
-        few = objective.sample(options.estimation_points)
-        estimated = jax.vmap(estimate)(few.reference)
+        grey = few.reference.grey
+        estimated = estimate_brightness(grey, residuals)
         brightness = jax.tree.map(lambda a, b: jnp.where(level.is_undecided, a, b), brightness, estimated)
         objective = level_objective(level, target, options, brightness)
+        relit = residuals.grey + residuals.inside * (grey - brightness.seen(grey))
+        residuals = residuals._replace(grey=relit)
     if options.robust_scale:
-        scales = estimate_scales(objective.sample(options.estimation_points), guess, level.depth_weight)
+        scales = estimate_scales(residuals, level.depth_weight)
         if options.doubt_depth:
             trust = jnp.where(level.is_first, 1.0, depth_trust(objective, guess, scales))
             scales = scales._replace(depth_weight=trust * scales.depth_weight)
@@ -415,8 +406,7 @@ def objectives_of(
 
 def unchanged_brightness(level: Level) -> Brightness:
     """Every view as bright as the target."""
-    views = level.reference.grey.shape[0]
-    return Brightness(jnp.ones(views), jnp.zeros(views))
+    return Brightness.unchanged(level.reference.grey.shape[0])
 
 
 def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[Array, "4 4"]:
@@ -497,8 +487,9 @@ def align_views(
     """
     levels = stack_levels(views, camera, solver.levels, options, exchanged, readout)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
-    start_key, key = jax.random.split(key)
-    origins = _origins(first, target, options, guesses, start_key, exchanged)
+    places, visits = max(options.islands), len(visited_levels(solver.levels, options))
+    keys = jax.random.split(key, (visits + 1, places))
+    origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
     start = Search(
         origins,
         jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
@@ -506,14 +497,15 @@ def align_views(
         jnp.float32(jnp.inf),
     )
 
-    def search_level(search: Search, level: Level) -> tuple[Search, tuple[jax.Array, Population | None]]:
+    def search_level(
+        search: Search, visit: tuple[Level, PRNGKeyArray]
+    ) -> tuple[Search, tuple[jax.Array, Population | None]]:
+        level, keys = visit
         objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
         basis = jnp.eye(6)
         if options.precondition:
             basis = preconditioner(reference_curvature(objective.sample(options.estimation_points)))
         problem = Problem(objective, search.islands[0], basis, origins[0])
-        places = search.islands.shape[0]
-        keys = jax.random.split(jax.random.fold_in(key, level.number + LEVELS * level.is_again), places)
         island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
         if places == 1:
@@ -531,7 +523,7 @@ def align_views(
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
         return search, (history[order[0]], population)
 
-    search, (histories, populations) = jax.lax.scan(search_level, start, levels)
+    search, (histories, populations) = jax.lax.scan(search_level, start, (levels, keys[:-1]))
     iterations = [solver.iterations[level] for level in visited_levels(solver.levels, options)]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness)
@@ -551,7 +543,7 @@ def _search_island(
     """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]), searched=inhabited)
-        reach = jnp.abs(jnp.linalg.inv(problem.basis)) @ box
+        reach = jnp.abs(unconditioner(problem.basis)) @ box
         bounds = Bounds(-reach, reach)
         guess = jnp.zeros((1, 6))
     else:
@@ -644,12 +636,13 @@ def _conclude(
     The scales are estimated there once more, so that errors of different solvers can be compared.
     """
     target_T_reference = search.islands[0]
-    scales = estimate_scales(objective, target_T_reference, finest.depth_weight)
+    residuals = objective.residuals(target_T_reference)
+    scales = estimate_scales(residuals, finest.depth_weight)
     if options.robust_scale:
         objective = replace(objective, scales=scales)
     reach = jnp.stack([search.box[0], search.box[3]])
     problem = Problem(objective, target_T_reference, jnp.eye(6), centre, reach)
-    model, scatter, residuals = problem.examine(jnp.zeros(6))
+    model, scatter = problem.examine(residuals)
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
     inverse = jnp.linalg.inv(model.hessian + ridge)
     covariance = SHARED_ERRORS * inverse @ scatter @ inverse.T

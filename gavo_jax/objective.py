@@ -531,7 +531,7 @@ class Problem:
 
     def coordinates(self, target_T_reference: Float[Array, "4 4"]) -> Float[Array, " 6"]:
         """Search coordinates of a motion, the inverse of `transform`."""
-        return jnp.linalg.solve(self.basis, log(jnp.linalg.inv(self.origin) @ target_T_reference))
+        return jnp.linalg.solve(self.basis, log(rigid_inverse(self.origin) @ target_T_reference))
 
     def score(
         self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None
@@ -550,7 +550,7 @@ class Problem:
         """Which motions lie further from the centre than the search is held."""
         if self.centre is None or self.reach is None:
             return jnp.zeros(motions.shape[:-2], bool)
-        offset = jnp.linalg.inv(self.centre) @ motions
+        offset = rigid_inverse(self.centre) @ motions
         cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
         return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
 
@@ -566,16 +566,16 @@ class Problem:
         error, overlap = _mean(model[:2], other[:2])
         return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
 
-    def examine(self, x: Float[Array, " 6"]) -> tuple[Linearization, Float[Array, "6 6"], Residuals]:
-        """E's derivatives, the covariance of its gradient, and the residuals; from the reference to the target alone.
+    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
+        """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient; from the
+        reference to the target alone.
 
         The covariance comes from the gradient's spread over tiles of the target image: residuals of neighbouring
         pixels are correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both
         sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
         """
         objective, plane = self.objective, self.objective.plane
-        motion, tangent = self._tangent(x)
-        r = objective.residuals(motion)
+        tangent = adjoint(self.origin) @ self.basis
         terms = _weighted_terms(objective, objective.reference, r)
         sums = objective._sums(objective._cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
@@ -586,7 +586,7 @@ class Problem:
         by_tile *= 2.0 / objective._divisor(sums[1])
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
-        return _linearization(objective, tangent, sums, *_normal_equations(terms)), scatter, r
+        return _linearization(objective, tangent, sums, *_normal_equations(terms)), scatter
 
     def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
         """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
@@ -683,21 +683,29 @@ def preconditioner(curvature: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-9))
 
 
+def unconditioner(basis: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """The inverse of a `preconditioner`, whose columns are at right angles."""
+    return (basis / jnp.sum(basis**2, axis=0)).T
+
+
 ROUNDS = 6
 """Rounds of the re-weighted estimates below; each contracts the remaining error several times."""
 
 
-def _t_variance(square: jax.Array, mask: jax.Array, variance: jax.Array) -> jax.Array:
-    """One fixed-point round for the squared scale of a t distribution, 5 degrees of freedom (Kerl et al. 2013)."""
-    weighted = mask * square * 6.0 / (5.0 + square / jnp.maximum(variance, 1e-20))
-    return jnp.sum(weighted) / jnp.maximum(jnp.sum(mask), 1.0)
+def _t_weight(square: Float[Array, "*n"], variance: Float[Array, "*#n"]) -> Float[Array, "*n"]:
+    """Weight of squared residuals under a t distribution, 5 degrees of freedom (Kerl et al. 2013)."""
+    return 6.0 / (5.0 + square / jnp.maximum(variance, 1e-20))
 
 
-def _t_scale(residual: jax.Array, mask: jax.Array) -> jax.Array:
-    """Scale of a t distribution fitted to the masked residuals."""
-    square = residual**2
-    start = jnp.sum(mask * square) / jnp.maximum(jnp.sum(mask), 1.0)
-    return jnp.sqrt(jax.lax.fori_loop(0, ROUNDS, lambda _, variance: _t_variance(square, mask, variance), start))
+def _t_scales(residual: Float[Array, "c n"], mask: Float[Array, "c n"]) -> Float[Array, " c"]:
+    """Scales of t distributions fitted to the masked residuals of some channels, by fixed-point rounds."""
+    square = mask * residual**2
+    count = jnp.maximum(jnp.sum(mask, axis=1), 1.0)
+
+    def refine(_: int, variance: jax.Array) -> jax.Array:
+        return jnp.sum(square * _t_weight(square, variance[:, None]), axis=1) / count
+
+    return jnp.sqrt(jax.lax.fori_loop(0, ROUNDS, refine, jnp.sum(square, axis=1) / count))
 
 
 SMALLEST_GREY_SCALE = 0.5
@@ -744,40 +752,59 @@ def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], s
     return jnp.clip(depth / grey / FULL_DEPTH_RATIO, LEAST_DEPTH_TRUST, 1.0)
 
 
-def estimate_scales(
-    objective: Objective, target_T_reference: Float[Array, "4 4"], depth_weight: jax.Array | float
-) -> Scales:
-    """Scales of the grey and the depth residuals at one motion, with the weight that depth is given."""
-    r = objective.residuals(target_T_reference)
-    grey = jnp.maximum(_t_scale(r.grey, r.inside), SMALLEST_GREY_SCALE)
-    depth = jnp.maximum(_t_scale(r.depth, r.depth_valid), SMALLEST_DEPTH_SCALE)
-    return Scales(grey, depth, jnp.float32(depth_weight))
+def estimate_scales(r: Residuals, depth_weight: jax.Array | float) -> Scales:
+    """Scales of the grey and the depth residuals of one motion, with the weight that depth is given."""
+    residual = jnp.stack([r.grey, r.depth]).reshape(2, -1)
+    mask = jnp.stack([r.inside, r.depth_valid]).reshape(2, -1)
+    found = jnp.maximum(_t_scales(residual, mask), jnp.array([SMALLEST_GREY_SCALE, SMALLEST_DEPTH_SCALE]))
+    return Scales(found[0], found[1], jnp.float32(depth_weight))
 
 
-def estimate_brightness(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
-    """Gain and bias with I_{t+1}(ω(ξ, p)) ≈ gain · I_t(p) + bias at one motion, by re-weighted regression.
+class Brightness(NamedTuple):
+    """Gain and bias of every view, [V]: I_{t+1}(ω(ξ, p)) ≈ gain · I_t(p) + bias."""
+
+    gain: Float[Array, "*v"]
+    bias: Float[Array, "*v"]
+
+    @classmethod
+    def unchanged(cls, views: int) -> "Brightness":
+        """Every view as bright as the target."""
+        return cls(jnp.ones(views), jnp.zeros(views))
+
+    def seen(self, grey: Float[Array, "v n"]) -> Float[Array, "v n"]:
+        """Grey of the views' points as the target shows them."""
+        return self.gain[:, None] * grey + self.bias[:, None]
+
+
+def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
+    """Brightness of each view at one motion, by re-weighted regression of what was sampled on the reference's grey.
 
     The gain leans to 1 where the image has little contrast.
     """
-    r = objective.residuals(target_T_reference)
-    source, mask = objective.reference.grey, r.inside
-    sample = jnp.where(mask > 0, r.grey_sample.value, 0.0)
+    mask = r.inside
+    sample = jnp.where(mask > 0, r.grey_sample.value, MIDDLE_GREY) - MIDDLE_GREY
+    features = jnp.stack([jnp.ones_like(grey), grey - MIDDLE_GREY, sample], axis=1)
 
-    def refine(_: int, estimate: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        gain, bias, variance = estimate
-        square = (sample - (gain * source + bias)) ** 2
-        variance = jnp.maximum(_t_variance(square, mask, variance), SMALLEST_GREY_SCALE**2)
-        weight = mask * 6.0 / (5.0 + square / variance)
-        total = jnp.maximum(jnp.sum(weight), 1e-6)
-        mean_source, mean_sample = jnp.sum(weight * source) / total, jnp.sum(weight * sample) / total
-        covariance = jnp.sum(weight * (source - mean_source) * (sample - mean_sample)) / total
-        spread = jnp.sum(weight * (source - mean_source) ** 2) / total
+    def refine(_: int, estimate: tuple[Brightness, jax.Array]) -> tuple[Brightness, jax.Array]:
+        brightness, variance = estimate
+        square = (sample + MIDDLE_GREY - brightness.seen(grey)) ** 2
+        mean = jnp.sum(mask * square * _t_weight(square, variance), axis=1) / jnp.maximum(jnp.sum(mask, axis=1), 1.0)
+        variance = jnp.maximum(mean, SMALLEST_GREY_SCALE**2)[:, None]
+        weight = mask * _t_weight(square, variance)
+        moments = jnp.einsum("vin,vn,vjn->vij", features, weight, features)
+        moments /= jnp.maximum(moments[:, :1, :1], 1e-6)
+        mean_source, mean_sample = moments[:, 0, 1], moments[:, 0, 2]
+        spread, covariance = moments[:, 1, 1] - mean_source**2, moments[:, 1, 2] - mean_source * mean_sample
         gain = jnp.clip((covariance + GAIN_PRIOR) / (spread + GAIN_PRIOR), 0.7, 1.4)
-        return gain, mean_sample - gain * mean_source, variance
+        bias = mean_sample + MIDDLE_GREY - gain * (mean_source + MIDDLE_GREY)
+        return Brightness(gain, bias), variance
 
-    start = (jnp.float32(1.0), jnp.float32(0.0), jnp.float32(1e4))
-    gain, bias, _ = jax.lax.fori_loop(0, ROUNDS, refine, start)
-    return gain, bias
+    start = (Brightness.unchanged(grey.shape[0]), jnp.full((grey.shape[0], 1), 1e4))
+    return jax.lax.fori_loop(0, ROUNDS, refine, start)[0]
+
+
+MIDDLE_GREY = 128.0
+"""Grey levels that moments are taken about, so that they lose no digits."""
 
 
 GAIN_PRIOR = 100.0

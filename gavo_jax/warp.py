@@ -24,8 +24,25 @@ SLOPE_STEP = 1.0 / 4096.0
 
 
 def exp(xi: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
-    """g(ξ) = exp(ξ̂) of a twist ξ = (v, w), translation (m) first, rotation in radians. Equation (3)."""
-    return jaxlie.SE3.exp(xi).as_matrix()
+    """g(ξ) = exp(ξ̂) of a twist ξ = (v, w), translation (m) first, rotation in radians. Equation (3).
+
+    With θ = |w| the series ends: I + ξ̂ + (1 − cos θ)/θ² ξ̂² + (θ − sin θ)/θ³ ξ̂³ (Murray, Li and Sastry 1994). A frame's
+    program needs it in many places, so it is written in few operations: each is a kernel to compile.
+    """
+    hat = jnp.sum(GENERATORS * xi[..., None, None, :], axis=-1)
+    angle = jnp.sqrt(jnp.maximum(jnp.sum(xi[..., 3:] ** 2, axis=-1), SMALL_ANGLE**2))[..., None, None]
+    second = 2.0 * (jnp.sin(0.5 * angle) / angle) ** 2
+    third = (angle - jnp.sin(angle)) / angle**3
+    return jnp.eye(4) + hat + _product(second * jnp.eye(4) + third * hat, _product(hat, hat))
+
+
+def _product(a: Float[Array, "*batch i j"], b: Float[Array, "*batch j k"]) -> Float[Array, "*batch i k"]:
+    """Product of small matrices; a fused sum is quicker than a batch of matrix products."""
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+
+
+SMALL_ANGLE = 0.01
+"""Radians: below, the coefficients of `exp` are as good as constant."""
 
 
 def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
@@ -148,7 +165,7 @@ def synchronise_depth(
     read = jnp.where(inside, flat[jnp.where(inside, row * width + column, 0)], 0.0)
     x_read = (column.astype(jnp.float32) - camera.cx) / camera.fx
     y_read = (row.astype(jnp.float32) - camera.cy) / camera.fy
-    back = jnp.linalg.inv(depth_T_colour)
+    back = rigid_inverse(depth_T_colour)
     depth_back = back[2, 0] * x_read + back[2, 1] * y_read + (back[2, 2] + back[2, 3] * read)
     return jnp.where(depth_back > 1e-3, read / depth_back, 0.0).reshape(height, width)
 
@@ -246,13 +263,11 @@ def inverse_depth_slopes(
 
     `limit` is the largest relative step between neighbours that is still one surface.
     """
+    q = inverse_depth
+    # beyond the border there is no reading
+    padded = jnp.pad(q, 1)
 
-    def along(q: jax.Array, axis: int) -> jax.Array:
-        width = [(int(a == axis), int(a == axis)) for a in range(2)]
-        # beyond the border there is no reading
-        padded = jnp.pad(q, width)
-        size = q.shape[axis]
-        last, following = (jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in (0, 2))
+    def along(last: jax.Array, following: jax.Array) -> jax.Array:
         ahead, behind = following - q, q - last
         near_ahead = (following > 0) & (jnp.abs(ahead) < limit * q)
         near_behind = (last > 0) & (jnp.abs(behind) < limit * q)
@@ -260,7 +275,7 @@ def inverse_depth_slopes(
         count = near_ahead.astype(jnp.float32) + near_behind.astype(jnp.float32)
         return total / jnp.maximum(count, 1.0)
 
-    return along(inverse_depth, 1), along(inverse_depth, 0)
+    return along(padded[1:-1, :-2], padded[1:-1, 2:]), along(padded[:-2, 1:-1], padded[2:, 1:-1])
 
 
 def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
@@ -269,14 +284,12 @@ def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
 
     Each of the four readings says by its own slopes what lies in the middle; those on the nearest surface are averaged.
     """
-    slopes = inverse_depth_slopes(inverse_depth)
-    width = [(0, 1), (0, 1)]
-
-    def taps(image: jax.Array) -> list[jax.Array]:
-        padded, (height, columns) = jnp.pad(image, width), image.shape
-        return [padded[i : i + height, j : j + columns] for i in (0, 1) for j in (0, 1)]
-
-    values, along_u, along_v = taps(inverse_depth), *map(taps, slopes)
+    height, width = inverse_depth.shape
+    planes = jnp.stack([inverse_depth, *inverse_depth_slopes(inverse_depth)])
+    padded = jnp.pad(planes, [(0, 0), (0, 1), (0, 1)])
+    values, along_u, along_v = (
+        [plane[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)] for plane in padded
+    )
     nearest = jnp.max(jnp.stack(values), axis=0)
     keep = [(value > 0) & (value > nearest * (1.0 - SAME_SURFACE)) for value in values]
     count = jnp.maximum(sum(k.astype(jnp.float32) for k in keep), 1.0)

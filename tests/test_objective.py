@@ -16,6 +16,7 @@ from gavo_jax import objective as objective_module
 from gavo_jax.camera import Camera
 from gavo_jax.objective import (
     LOSSES,
+    Brightness,
     Loss,
     Objective,
     Problem,
@@ -33,6 +34,7 @@ from gavo_jax.objective import (
     reference_curvature,
     settle_reference,
     student_t,
+    unconditioner,
 )
 from gavo_jax.pyramid import PyramidLevel
 from gavo_jax.solvers.base import Bounds, solve
@@ -98,7 +100,18 @@ def prepare(
 jit_error = jax.jit(lambda objective, motion: objective.error(motion))
 jit_score = jax.jit(lambda objective, motions: objective.score(motions))
 jit_problem_score = jax.jit(lambda problem, x: problem.score(x))
-jit_scales, jit_brightness, jit_trust = map(jax.jit, (estimate_scales, estimate_brightness, depth_trust))
+jit_scales = jax.jit(lambda objective, motion, weight: estimate_scales(objective.residuals(motion), weight))
+jit_trust = jax.jit(depth_trust)
+
+
+@jax.jit
+def jit_brightness(objective: Objective, motion: jax.Array) -> Brightness:
+    """Of one view."""
+    one = jax.tree.map(lambda leaf: leaf[None], objective.reference)
+    found = estimate_brightness(one.grey, replace(objective, reference=one).residuals(motion))
+    return jax.tree.map(lambda leaf: leaf[0], found)
+
+
 jit_explained = jax.jit(lambda objective, motion: explained_share(objective.residuals(motion)))
 jit_linearize = jax.jit(lambda problem, x: problem.linearize(x))
 
@@ -545,6 +558,11 @@ def test_preconditioner_of_a_blank_image_is_finite_and_small() -> None:
     assert np.isfinite(basis).all() and np.abs(basis).max() <= 0.1
 
 
+def test_unconditioner_is_the_preconditioners_inverse() -> None:
+    problem, _ = preconditioned(0.3)
+    np.testing.assert_allclose(unconditioner(problem.basis) @ problem.basis, np.eye(6), atol=1e-5)
+
+
 @pytest.mark.parametrize("depth_weight", [0.0, 0.3])
 def test_curvature_is_half_the_hessian_of_a_perfect_match(depth_weight: float) -> None:
     problem, curvature = preconditioned(depth_weight)
@@ -646,7 +664,7 @@ def test_explained_share() -> None:
 def test_gradient_scatter_is_a_covariance() -> None:
     noise = np.random.default_rng(4).normal(0, 3, (48, 64))
     problem = Problem(build(noisy_pair(noise), student_t, (3.0, 0.01, 0.3)), jnp.eye(4), jnp.eye(6))
-    scatter = np.asarray(problem.examine(jnp.zeros(6))[1], float)
+    scatter = np.asarray(problem.examine(problem.objective.residuals(problem.origin))[1], float)
     np.testing.assert_allclose(scatter, scatter.T, rtol=1e-4, atol=1e-4 * np.abs(scatter).max())
     assert np.linalg.eigvalsh(scatter).min() > -1e-5 * np.linalg.eigvalsh(scatter).max()
     assert np.linalg.eigvalsh(scatter).max() > 0

@@ -160,8 +160,9 @@ def solve(
 
     With `record` (static) the candidates of every iteration are kept for people to look at.
     """
-    init_key, loop_key = jax.random.split(key)
-    state = solver.init(init_key, problem, guess, bounds)
+    longest = largest(solver.iterations)
+    keys = jax.random.split(key, longest + 1)
+    state = solver.init(keys[-1], problem, guess, bounds)
     iterations, least = solver.here(solver.iterations), solver.here(solver.progress)
 
     def entry(state: Any, best: Best) -> tuple[jax.Array, Candidates | None]:
@@ -172,7 +173,7 @@ def solve(
 
     def iterate(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, best, count, stale, log = carry
-        state = solver.step(jax.random.fold_in(loop_key, count), state, problem)
+        state = solver.step(keys[count], state, problem)
         new = solver.best(state)
         progress = new.error < best.error * (1.0 - least)
         best = jax.tree.map(lambda a, b: jnp.where(new.error < best.error, a, b), new, best)
@@ -180,7 +181,6 @@ def solve(
         return state, best, count + 1, jnp.where(progress, 0, stale + 1), log
 
     best = solver.best(state)
-    longest = largest(solver.iterations)
     log = jax.tree.map(lambda row: jnp.full((longest, *row.shape), jnp.nan), entry(state, best))
     start = (state, best, jnp.int32(0), jnp.int32(0), log)
     state, best, count, _, (history, trail) = jax.lax.while_loop(go_on, iterate, start)

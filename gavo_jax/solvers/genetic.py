@@ -114,7 +114,8 @@ class GeneticAlgorithm(PerLevel):
     def _select(self, chance: Float[Array, "p 2"], error: Float[Array, " p"]) -> Integer[Array, "p 2"]:
         """Roulette wheel (11): indices drawn in proportion to the fitness f = exp(−8 E/E_min) (10)."""
         fitness = jnp.exp(-self.pressure * (error / jnp.maximum(error[0], 1e-12) - 1.0))
-        wheel = jnp.cumsum(jnp.where(jnp.isfinite(error), fitness, 0.0))
+        up_to = np.triu(np.ones((error.shape[0],) * 2, np.float32))
+        wheel = jnp.where(jnp.isfinite(error), fitness, 0.0) @ up_to  # a cumulative sum is many steps, this is one
         # all compared at once: a binary search is a loop, whose turns cost more than they save on a population
         places = jnp.searchsorted(wheel, chance * wheel[-1], method="compare_all")
         return jnp.minimum(places, error.shape[0] - 1)
@@ -130,13 +131,17 @@ class GeneticAlgorithm(PerLevel):
         self, chance: Float[Array, "p 8"], parents: Float[Array, "p 2 6"], state: GeneticState
     ) -> Float[Array, "p 6"]:
         """Mutation (12): ξ' = ξ + δ randn, of chromosomes drawn by the wheel."""
-        randn = jnp.sqrt(2.0) * jax.lax.erf_inv(2.0 * chance[:, :6] - 1.0)
-        return parents[:, 0] + state.mutation_step * randn
+        return parents[:, 0] + state.mutation_step * _randn(chance[:, :6])
 
 
 SMALLEST_CHANCE = 2.0**-24
 """A generation's random numbers are drawn at once, eight for each offspring, uniform from here to 1: six for its genes,
 which are either crossed or mutated, and two for its parents. 0 would be a mutation of infinite size."""
+
+
+def _randn(chance: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Standard normal numbers from uniform ones."""
+    return jnp.sqrt(2.0) * jax.lax.erf_inv(2.0 * chance - 1.0)
 
 
 def first_candidates(
@@ -148,10 +153,8 @@ def first_candidates(
 ) -> Float[Array, "p 6"]:
     """First population: the guesses themselves, then a cloud about them, or uniform draws where `spread` is None."""
     about = guess[jnp.arange(count) % guess.shape[0]]
-    if spread is None:
-        x = bounds.lower + (bounds.upper - bounds.lower) * jax.random.uniform(key, (count, 6))
-    else:
-        x = about + spread * jax.random.normal(key, (count, 6))
+    chance = jax.random.uniform(key, (count, 8), minval=SMALLEST_CHANCE)[:, :6]
+    x = bounds.lower + (bounds.upper - bounds.lower) * chance if spread is None else about + spread * _randn(chance)
     kept = jnp.arange(count)[:, None] < guess.shape[0]
     return jnp.clip(jnp.where(kept, about, x), bounds.lower, bounds.upper)
 
