@@ -119,7 +119,13 @@ def _track(
     options: OdometryOptions,
     record: bool,
 ) -> tuple[TrackerState, Alignment, Population | None]:
-    """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's."""
+    """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's.
+
+    Before the first frame the state holds no reading: that frame becomes both references, and nothing is known of the
+    motion, so that its points are still where their rows' moments left them. The same program serves, as another one
+    would have to be compiled too.
+    """
+    is_first = ~jnp.any(state.previous.points.q > 0)
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     predicted = state.motion * (clock.elapsed / state.seconds)
     finest = min(solver.levels)
@@ -140,21 +146,22 @@ def _track(
     result, populations = align_views(
         views, packed, camera, solver, alignment, key, guesses, record, exchanged, readout
     )
+    motion = jnp.where(is_first, 0.0, result.xi)
     if options.synchronise:
-        target = _synchronised(raw, camera, delay * result.xi, finest)
+        target = _synchronised(raw, camera, delay * motion, finest)
     newest, keyframe = prepare_reference(target, camera, solver.levels, alignment), state.keyframe
     if readout is not None:
-        newest, keyframe = (settle_reference(frame, result.xi * readout) for frame in (newest, keyframe))
-    keyframe = move_reference(keyframe, result.target_T_reference)
+        unsettled = newest.row_time
+        newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
+        newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
+    keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
     keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
-    return TrackerState(newest, keyframe, packed, result.xi, clock.elapsed), result, populations
+    return TrackerState(newest, keyframe, packed, motion, clock.elapsed), result, populations
 
 
 @jax.jit
-def _first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignment: AlignmentOptions) -> TrackerState:
-    """State after the first frame: it is both references, and nothing is known of the motion, so that their points are
-    still where their rows' moments left them.
-    """
+def first_state(grey: Array, depth: Array, camera: Camera, solver: Any, alignment: AlignmentOptions) -> TrackerState:
+    """State after the first frame, by a program of its own."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     reference = prepare_reference(pyramid, camera, solver.levels, alignment)
     packed = prepare_target(pyramid, solver.levels)
@@ -256,12 +263,15 @@ class Odometry:
     def warm_up(self) -> float:
         """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
         start = time.perf_counter()
-        self._run(self.blank_state(), self._blank(), Clock(np.float32(1.0), np.float32(0.0), np.uint32(1)))
+        self._start(self._blank())
         return time.perf_counter() - start
 
     def blank_state(self) -> TrackerState:
-        """A state with the shapes and types of every state of this driver."""
-        return self._start(self._blank())
+        """The state before the first frame: nothing, in the shapes and types of every state of this driver."""
+        frame = self._blank()
+        shapes = jax.eval_shape(first_state, frame.grey, frame.depth, self.camera, self.solver, self.alignment)
+        nothing: TrackerState = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+        return nothing._replace(seconds=np.float32(1.0))
 
     def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
         """Track one more frame.
@@ -313,7 +323,10 @@ class Odometry:
         return Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
 
     def _start(self, frame: Frame) -> TrackerState:
-        return _first_state(frame.grey, frame.depth, self.camera, self.solver, self.alignment)
+        """The state after a first frame."""
+        state, _ = self._run(self.blank_state(), frame, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0)))
+        self.populations = ()
+        return state
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
         """Make a frame the only reference, standing where the camera is recorded to be."""

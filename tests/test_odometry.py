@@ -6,6 +6,7 @@ import tracemalloc
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,16 @@ from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import move_reference
-from gavo_jax.odometry import Odometry, OdometryRun, Step, no_alignment, renew_keyframe, run_odometry, track
+from gavo_jax.odometry import (
+    Odometry,
+    OdometryRun,
+    Step,
+    first_state,
+    no_alignment,
+    renew_keyframe,
+    run_odometry,
+    track,
+)
 from gavo_jax.presets import OdometryOptions
 from gavo_jax.pyramid import build_pyramid
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -430,6 +440,24 @@ def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticS
     assert pending == [[True, True], [False, False]]
 
 
+def test_the_program_for_every_frame_makes_the_first_state_too(sequence: SyntheticSequence) -> None:
+    frame, camera = sequence[0], replace(CAMERA, readout=0.03)
+    odometry = Odometry(camera, SOLVER, options=PLAIN)
+    odometry.register(frame, 0.0)
+    expected = first_state(frame.grey, frame.depth, camera, SOLVER, odometry.alignment)
+    state = odometry.progress.tracker
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), state, expected)
+
+
+def test_one_program_serves_every_frame(sequence: SyntheticSequence) -> None:
+    odometry = Odometry(replace(CAMERA, readout=0.03), SOLVER, options=PLAIN)
+    blank = odometry.blank_state()
+    odometry.register(sequence[0], 0.0)
+    states = blank, odometry.progress.tracker
+    types = [[jax.typeof(leaf) for leaf in jax.tree.leaves(state)] for state in states]
+    assert types[0] == types[1]
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.2, 0.25, 0.3, 0.6])
 def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSequence) -> None:
     frame, camera = sequence[0], CAMERA.level(1)
@@ -520,8 +548,8 @@ def test_a_high_error_is_used_if_the_wide_search_agrees(monkeypatch: pytest.Monk
     sequence = Rendered(frames=2, camera=CAMERA, noise=NONE)
     for wide, lost in ((near, False), (far, True)):
         odometry = Odometry(CAMERA, GaussNewton())
-        state, attempts = odometry.blank_state(), [still, still._replace(target_T_reference=wide)]
-        monkeypatch.setattr(odometry, "_run", lambda *_, s=state, a=attempts: (s, a.pop(0)))
         odometry.register(sequence[0], 0.0)
+        state, attempts = odometry.progress.tracker, [still, still._replace(target_T_reference=wide)]
+        monkeypatch.setattr(odometry, "_run", lambda *_, s=state, a=attempts: (s, a.pop(0)))
         step = odometry.register(sequence[1], 1 / 30)
         assert step is not None and step.lost is lost and step.alignment.status is AlignmentStatus.HIGH_ERROR

@@ -20,7 +20,7 @@ from gavo_jax.alignment import Alignment, AlignmentOptions, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.odometry import Clock, Odometry, Progress, Step, TrackerState, _traced, _track, decoded
+from gavo_jax.odometry import Clock, Odometry, Progress, Step, TrackerState, _traced, _track, decoded, first_state
 from gavo_jax.presets import OdometryOptions, Preset
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
@@ -151,6 +151,10 @@ class _Lane(Odometry):
         if solver is None and self.first_attempt is not None:
             return NEW_ROW, self.first_attempt
         return super()._run(state, frame, clock, solver, alignment, options)
+
+    def _start(self, frame: Frame) -> TrackerState:
+        """As of a single run, whose program the stack has no other use for."""
+        return first_state(frame.grey, frame.depth, self.camera, self.solver, self.alignment)
 
 
 class _Stack:
