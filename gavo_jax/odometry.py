@@ -323,9 +323,10 @@ class Odometry:
         return Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
 
     def _start(self, frame: Frame) -> TrackerState:
-        """The state after a first frame."""
+        """The state after a first frame; its search, which has nothing to find, leaves no candidates."""
+        populations = self.populations
         state, _ = self._run(self.blank_state(), frame, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0)))
-        self.populations = ()
+        self.populations = populations
         return state
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
