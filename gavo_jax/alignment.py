@@ -26,18 +26,18 @@ from gavo_jax.objective import (
     Problem,
     Reference,
     Scales,
-    cells_of,
     depth_trust,
     estimate_brightness,
     estimate_scales,
     explained_share,
     geman_mcclure,
+    grids_of,
     make_references,
     preconditioner,
     reference_curvature,
     unconditioner,
 )
-from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid
+from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
 from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target, rigid_inverse
@@ -239,7 +239,7 @@ def prepare_reference(
 
 def prepare_target(pyramid: Pyramid, levels: tuple[int, ...]) -> Target:
     """What a search needs of a target frame: a solver's levels packed for sampling, coarsest first."""
-    return pack_target(*(pyramid[level] for level in levels))
+    return pack_target(make_atlas([pyramid[level] for level in levels]))
 
 
 def prepare_pair(
@@ -292,10 +292,7 @@ def stack_levels(
     readout: Float[Array, ""] | None = None,
 ) -> Level:
     """The visits of a search to the levels, [L], coarsest first."""
-    cameras = [camera.level(level) for level in levels]
-    cells = cells_of(cameras, levels, options.points)
-    columns = [c.width // cell for c, cell in zip(cameras, cells, strict=True)]
-    rows = [c.height // cell for c, cell in zip(cameras, cells, strict=True)]
+    rows, columns = np.array(grids_of(camera, levels, options.points)).T
     counted = jnp.array([min(options.views[level], len(views)) for level in levels])
     reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *views)
     left_out = jnp.arange(len(views))[:, None] >= counted[:, None, None]
@@ -305,7 +302,7 @@ def stack_levels(
         jnp.arange(len(levels)) == 0,
         image_planes(camera, levels),
         reference._replace(points=points),
-        jnp.array([r * c for r, c in zip(rows, columns, strict=True)]),
+        jnp.array(rows * columns),
         jnp.array(columns),
         counted,
         jnp.array([options.islands[level] for level in levels]),
@@ -504,7 +501,7 @@ def align_views(
         objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
         basis = jnp.eye(6)
         if options.precondition:
-            basis = preconditioner(reference_curvature(objective.sample(options.estimation_points)))
+            basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
         problem = Problem(objective, search.islands[0], basis, origins[0])
         island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
@@ -526,7 +523,7 @@ def align_views(
     search, (histories, populations) = jax.lax.scan(search_level, start, (levels, keys[:-1]))
     iterations = [solver.iterations[level] for level in visited_levels(solver.levels, options)]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
-    objective = level_objective(finest, target, options, search.brightness)
+    objective = level_objective(finest, target, options, search.brightness).merged()
     return _conclude(objective, search, finest, options, history, origins[0]), populations
 
 
@@ -649,7 +646,7 @@ def _conclude(
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
-    depth_share = jnp.sum(has_reading) / (has_reading.shape[0] * has_reading.shape[1])
+    depth_share = jnp.mean(has_reading)
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(problem.origin)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
     explained = explained_share(residuals)

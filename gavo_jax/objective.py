@@ -7,17 +7,18 @@ residual 1/z_{t+1}(ω(ξ, p_i)) − 1/z_i(ξ). Inverse depth is the right quanti
 so the noise of 1/z is the same at every range and one scale serves all pixels.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.camera import Camera
-from gavo_jax.pyramid import Pyramid, PyramidLevel
+from gavo_jax.pyramid import NO_PIXEL, Pyramid, atlas_layout, make_atlas
 from gavo_jax.warp import (
     DepthSample,
     GreySample,
@@ -31,7 +32,9 @@ from gavo_jax.warp import (
     delay,
     delayed_slopes,
     exp,
+    image_planes,
     inverse_depth_slopes,
+    level_sizes,
     log,
     look_up,
     right_jacobian,
@@ -107,46 +110,20 @@ class Reference(NamedTuple):
     """When the point's row was exposed; see `Shutter`."""
 
 
-def central_gradient(image: Float[Array, "h w"]) -> tuple[jax.Array, jax.Array]:
-    """∂/∂u and ∂/∂v by central differences; borders replicate."""
-    wide = jnp.pad(image, 1, mode="edge")
-    return 0.5 * (wide[1:-1, 2:] - wide[1:-1, :-2]), 0.5 * (wide[2:, 1:-1] - wide[:-2, 1:-1])
-
-
-def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Reference:
-    """Points of a reference level; with cell > 1, one a cell x cell block: that of the steepest grey with a reading.
-
-    Args:
-        level: Reference image and inverse depth, [h, w].
-        camera: Camera of that level.
-        cell: Side of the blocks, pixels. The choice is stratified, so its cost in accuracy is small, and N is static.
+def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """∂/∂u and ∂/∂v by central differences of an image with a margin of one pixel; a neighbour that is `NO_PIXEL`
+    counts as the pixel itself.
     """
-    height, width = level.grey.shape
-    grey_u, grey_v = central_gradient(level.grey)
-    slope_u, slope_v = inverse_depth_slopes(level.inverse_depth)
-    images = [level.inverse_depth, level.grey, grey_u, grey_v, slope_u, slope_v]
-    place, flat = jnp.arange(height * width), [image.reshape(-1) for image in images]
-    if cell > 1:
-        steepness = jnp.where(level.inverse_depth > 0, grey_u**2 + grey_v**2, -1.0)
-        place = _largest_of_blocks(steepness, cell)
-        flat = [image[place] for image in flat]
-    q, grey, grey_u, grey_v, slope_u, slope_v = flat
-    u, v = (axis.astype(jnp.float32) for axis in (place % width, place // width))
-    near = jnp.maximum(q, 1e-3)
-    facing = jax.lax.rsqrt(1.0 + (camera.fx * slope_u / near) ** 2 + (camera.fy * slope_v / near) ** 2)
-    points = Points((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, q)
-    return Reference(points, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, camera))
+    middle = grey[1:-1, 1:-1]
+
+    def along(before: jax.Array, after: jax.Array) -> jax.Array:
+        return 0.5 * (jnp.where(after == NO_PIXEL, middle, after) - jnp.where(before == NO_PIXEL, middle, before))
+
+    return along(grey[1:-1, :-2], grey[1:-1, 2:]), along(grey[:-2, 1:-1], grey[2:, 1:-1])
 
 
-def _largest_of_blocks(image: Float[Array, "h w"], cell: int) -> Integer[Array, " n"]:
-    """Place of the largest pixel of each cell x cell block in the flat image; the first of equal ones."""
-    height, width = image.shape
-    rows, columns = height // cell, width // cell
-    blocks = image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
-    within = jnp.argmax(blocks.reshape(rows, columns, cell * cell), axis=-1)
-    u = jnp.arange(columns) * cell + within % cell
-    v = jnp.arange(rows)[:, None] * cell + within // cell
-    return (v * width + u).reshape(-1)
+PointsPerLevel = int | None | tuple[int, ...]
+"""Largest number of points: of every level alike, None for every pixel, or an entry a level of the pyramid."""
 
 
 def cell_of(camera: Camera, points: int | None) -> int:
@@ -157,18 +134,23 @@ def cell_of(camera: Camera, points: int | None) -> int:
     return cell
 
 
-PointsPerLevel = int | None | tuple[int, ...]
-"""Largest number of points: of every level alike, None for every pixel, or an entry a level of the pyramid."""
-
-
-def cells_of(cameras: Sequence[Camera], levels: tuple[int, ...], points: PointsPerLevel) -> list[int]:
-    """`cell_of` some levels, each with its camera."""
+def cells_of(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> list[int]:
+    """`cell_of` some levels of a camera."""
     most = [points[level] if isinstance(points, tuple) else points for level in levels]
-    return [cell_of(*view) for view in zip(cameras, most, strict=True)]
+    return [cell_of(camera.level(level), count) for level, count in zip(levels, most, strict=True)]
+
+
+def grids_of(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> list[tuple[int, int]]:
+    """Rows and columns of the points of some levels."""
+    cells = cells_of(camera, levels, points)
+    return [(h // cell, w // cell) for (h, w), cell in zip(level_sizes(camera, levels), cells, strict=True)]
 
 
 def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> Reference:
-    """Points of some levels, [L, N]: shorter levels are filled up with points without a reading.
+    """Points of some levels, [L, N]: one a square block of pixels, that of the steepest grey with a reading.
+
+    The choice is stratified, so its cost in accuracy is small, and N is static. Shorter levels are filled up with
+    points without a reading.
 
     Args:
         pyramid: Of the reference frame.
@@ -176,15 +158,37 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], p
         levels: Which ones, in the order of the result.
         points: Largest number of points a level.
     """
-    cameras = [camera.level(level) for level in levels]
-    cells = cells_of(cameras, levels, points)
-    references = [make_reference(pyramid[k], c, cell) for k, c, cell in zip(levels, cameras, cells, strict=True)]
-    longest = max(reference.grey.shape[0] for reference in references)
+    layout, planes = atlas_layout(level_sizes(camera, levels)), image_planes(camera, levels)
+    grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[level] for level in levels]))
+    gradient, slopes = central_gradient(grey), inverse_depth_slopes(inverse_depth)
+    grey, inverse_depth = grey[1:-1, 1:-1], inverse_depth[1:-1, 1:-1]
+    steepness = jnp.where(inverse_depth > 0, gradient[0] ** 2 + gradient[1] ** 2, -1.0)
+    cells = cells_of(camera, levels, points)
+    longest = max(rows * columns for rows, columns in grids_of(camera, levels, points))
+    chosen = []
+    for (height, width), (row, column), cell in zip(level_sizes(camera, levels), layout.corners, cells, strict=True):
+        u, v = _steepest_of_blocks(steepness[row : row + height, column : column + width], cell)
+        places = ((v + row) * layout.width + u + column).reshape(-1)
+        chosen.append(jnp.pad(places, (0, longest - places.shape[0]), constant_values=layout.gap))
+    place = jnp.stack(chosen)
+    q, grey, grey_u, grey_v, slope_u, slope_v = (
+        image.reshape(-1).at[place].get(mode="promise_in_bounds") for image in (inverse_depth, grey, *gradient, *slopes)
+    )
+    plane = jax.tree.map(lambda leaf: leaf[:, None], planes)
+    row, column = np.array(layout.corners).T[..., None]
+    u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
+    near = jnp.maximum(q, 1e-3)
+    facing = jax.lax.rsqrt(1.0 + (plane.fx * slope_u / near) ** 2 + (plane.fy * slope_v / near) ** 2)
+    rays = Points((u - plane.cx) / plane.fx, (v - plane.cy) / plane.fy, q)
+    return Reference(rays, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, plane))
 
-    def fill(*leaves: jax.Array) -> jax.Array:
-        return jnp.stack([jnp.pad(leaf, (0, longest - leaf.shape[0])) for leaf in leaves])
 
-    return jax.tree.map(fill, *references)
+def _steepest_of_blocks(steepness: Float[Array, "h w"], cell: int) -> tuple[Integer[Array, "r c"], ...]:
+    """Column and row of the largest pixel of each cell x cell block, the first of equal ones."""
+    rows, columns = (size // cell for size in steepness.shape)
+    blocks = steepness[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
+    within = jnp.argmax(blocks.reshape(rows, columns, cell * cell), axis=-1)
+    return jnp.arange(columns) * cell + within % cell, jnp.arange(rows)[:, None] * cell + within // cell
 
 
 def move_reference(reference: Reference, camera_T_reference: Float[Array, "4 4"]) -> Reference:
@@ -334,6 +338,12 @@ class Objective:
         some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
         return replace(self, reference=some, count=None)
 
+    def merged(self) -> "Objective":
+        """The same error with the points of all views in one flat array: sums over them then need no arithmetic on
+        indices.
+        """
+        return replace(self, reference=jax.tree.map(jnp.ravel, self.reference), count=None, views=None)
+
     def residuals(
         self,
         target_T_reference: Float[Array, "4 4"],
@@ -381,7 +391,7 @@ class Objective:
     def _conclude(self, sums: Float[Array, "2 ..."]) -> tuple[Float[Array, "*p"], Float[Array, "*p"]]:
         """Errors and overlaps from the sums over all points."""
         total, inside = sums
-        valid = jnp.maximum(jnp.sum(self.reference.points.q > 0), 1.0)
+        valid = jnp.maximum(self._readings(), 1.0)
         typical = self.loss(jnp.float32(1.0))
         if self.use_depth:
             typical += self.scales.depth_weight * typical
@@ -392,8 +402,11 @@ class Objective:
 
     def _divisor(self, inside: Float[Array, "*p"]) -> Float[Array, "*p"]:
         """Number of points that E is the mean over."""
-        valid = jnp.sum(self.reference.points.q > 0).astype(jnp.float32)
-        return jnp.maximum(jnp.where(self.outside_cost > 0, valid, inside), 1.0)
+        return jnp.maximum(jnp.where(self.outside_cost > 0, self._readings(), inside), 1.0)
+
+    def _readings(self) -> Float[Array, ""]:
+        """Number of reference points with a reading."""
+        return _lane_sum((self.reference.points.q > 0).astype(jnp.float32))
 
     def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
         """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
@@ -580,9 +593,10 @@ class Problem:
         sums = objective._sums(objective._cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
-        tile = jax.nn.one_hot((row * TILES[0] + column).reshape(-1), TILES[0] * TILES[1])
+        tile = (row * TILES[0] + column).reshape(-1)
         pull = jnp.asarray(sum(jacobian * (weight * residual) for jacobian, residual, weight in terms))
-        by_tile = tangent.T @ (pull @ tile)
+        sum_by_tile = partial(jax.ops.segment_sum, segment_ids=tile, num_segments=TILES[0] * TILES[1])
+        by_tile = tangent.T @ jax.vmap(sum_by_tile)(pull)
         by_tile *= 2.0 / objective._divisor(sums[1])
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)

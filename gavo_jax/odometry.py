@@ -33,11 +33,11 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
-from gavo_jax.objective import Reference, move_reference, settle_reference
+from gavo_jax.objective import Reference, grids_of, move_reference, settle_reference
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
-from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
+from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.warp import Target, exp, synchronise_depth, warp
+from gavo_jax.warp import Points, Target, exp, level_sizes, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -65,6 +65,7 @@ class Clock(NamedTuple):
     """Index in the sequence; with the run's key it makes the frame's random numbers."""
 
 
+@partial(jax.jit, static_argnames="finest")
 def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], finest: int) -> Pyramid:
     """The pyramid with depth moved along a twist (colour moment to depth moment), from level `finest` upwards."""
     levels = list(pyramid)
@@ -192,16 +193,15 @@ class Step:
 
 def no_alignment(status: AlignmentStatus) -> Alignment:
     """The result of a pair that could not be aligned at all: no motion, nothing known."""
-    nothing = Alignment(
-        target_T_reference=jnp.eye(4),
-        xi=jnp.zeros(6),
-        error=jnp.float32(jnp.nan),
-        overlap=jnp.float32(0.0),
-        covariance=jnp.full((6, 6), jnp.nan),
-        status=status,
-        history=jnp.zeros(0),
-    )
-    return on_host(nothing)
+    nothing: dict[str, Any] = {
+        "target_T_reference": np.eye(4, dtype=np.float32),
+        "xi": np.zeros(6, np.float32),
+        "error": np.float32(np.nan),
+        "overlap": np.float32(0.0),
+        "covariance": np.full((6, 6), np.nan, np.float32),
+        "history": np.zeros(0, np.float32),
+    }
+    return Alignment(**nothing, status=status)
 
 
 MAX_HELD = 3
@@ -268,10 +268,14 @@ class Odometry:
 
     def blank_state(self) -> TrackerState:
         """The state before the first frame: nothing, in the shapes and types of every state of this driver."""
-        frame = self._blank()
-        shapes = jax.eval_shape(first_state, frame.grey, frame.depth, self.camera, self.solver, self.alignment)
-        nothing: TrackerState = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-        return nothing._replace(seconds=np.float32(1.0))
+        levels = self.solver.levels
+        grids = grids_of(self.camera, levels, self.alignment.points)
+        row: Any = np.zeros((len(levels), max(rows * columns for rows, columns in grids)), np.float32)
+        layout = atlas_layout(level_sizes(self.camera, levels))
+        words: Any = np.zeros((layout.height, layout.width), np.uint32)
+        reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
+        still: Any = np.zeros(6, np.float32), np.float32(1.0)
+        return TrackerState(reference, reference, Target(words, words), *still)
 
     def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
         """Track one more frame.

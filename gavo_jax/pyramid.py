@@ -4,8 +4,10 @@ Level 0 is the full image; each level halves the last. Pixel centres are integer
 the middle of a 2x2 block of level k (`Camera.level` holds the same convention).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
@@ -31,11 +33,17 @@ Pyramid = tuple[PyramidLevel, ...]
 def halve_grey(grey: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     """Halve an image with the binomial kernel [1 3 3 1]/8, which is centred on the 2x2 block; borders replicate."""
     height, width = (size // 2 * 2 for size in grey.shape)
-    padded = jnp.pad(grey[:height, :width], 1, mode="edge")
-    rows = [padded[k : k + height : 2] for k in range(4)]
-    along_v = 0.375 * (rows[1] + rows[2]) + 0.125 * (rows[0] + rows[3])
-    columns = [along_v[:, k : k + width : 2] for k in range(4)]
-    return 0.375 * (columns[1] + columns[2]) + 0.125 * (columns[0] + columns[3])
+    padded = jnp.pad(grey[:height, :width], 1)
+    along_v = _halve([padded[k : k + height : 2] for k in range(4)], axis=0)
+    return _halve([along_v[:, k : k + width : 2] for k in range(4)], axis=1)
+
+
+def _halve(taps: Sequence[jax.Array], axis: int) -> jax.Array:
+    """[1 3 3 1]/8 of four taps; the first and the last place of an axis have none outside."""
+    place = jax.lax.broadcasted_iota(jnp.int32, taps[0].shape, axis)
+    before = jnp.where(place == 0, taps[1], taps[0])
+    after = jnp.where(place == taps[0].shape[axis] - 1, taps[2], taps[3])
+    return 0.375 * (taps[1] + taps[2]) + 0.125 * (before + after)
 
 
 def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
@@ -79,3 +87,56 @@ def build_pyramid(
     for _ in range(levels - 1):
         pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
     return tuple(pyramid)
+
+
+class AtlasLayout(NamedTuple):
+    """Where levels lie in an atlas: the largest on top, the others from left to right below, a pixel between them."""
+
+    height: int
+    width: int
+    corners: tuple[tuple[int, int], ...]
+    """Row and column of each level's first pixel."""
+    gap: int
+    """Place, in the flat image, of a pixel that belongs to no level."""
+
+
+def atlas_layout(sizes: Sequence[tuple[int, int]]) -> AtlasLayout:
+    """The layout of levels of some sizes (height, width), whose order `corners` keeps."""
+    top = max(sizes)
+    corners, column, below = [], 0, 0
+    for size in sizes:
+        corners.append((0, 0) if size == top else (top[0] + 1, column))
+        if size != top:
+            column, below = column + size[1] + 1, max(below, size[0])
+    width = max(top[1], column)
+    return AtlasLayout(top[0] + 1 + below, width, tuple(corners), top[0] * width)
+
+
+class Atlas(NamedTuple):
+    """Levels of a frame in one image, so that a step of the work on them is one operation and not one a level.
+
+    Around what the layout says lies a margin of no pixels, one row and column before and two behind: a pixel's
+    neighbours are slices of the image.
+    """
+
+    grey: Float[Array, "h+3 w+3"]
+    """`NO_PIXEL` in the margin and between the levels."""
+    inverse_depth: Float[Array, "h+3 w+3"]
+    """0 there."""
+
+
+NO_PIXEL = -1.0
+"""Grey of what is no pixel."""
+
+
+def make_atlas(levels: Sequence[PyramidLevel]) -> Atlas:
+    """The atlas of some levels, laid out as `atlas_layout` says."""
+    layout = atlas_layout([(level.grey.shape[0], level.grey.shape[1]) for level in levels])
+
+    size = (layout.height + 3, layout.width + 3)
+    grey, inverse_depth = jnp.full(size, NO_PIXEL), jnp.zeros(size)
+    for level, (row, column) in zip(levels, layout.corners, strict=True):
+        corner = (row + 1, column + 1)
+        grey = jax.lax.dynamic_update_slice(grey, jnp.maximum(level.grey, 0.0), corner)
+        inverse_depth = jax.lax.dynamic_update_slice(inverse_depth, level.inverse_depth, corner)
+    return Atlas(grey, inverse_depth)

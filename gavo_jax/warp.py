@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer, UInt32
 
 from gavo_jax.camera import Camera
+from gavo_jax.pyramid import Atlas, atlas_layout
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
 """1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a hundredth of the sensor's noise."""
@@ -103,23 +104,33 @@ class ImagePlane(NamedTuple):
     serves every level.
     """
 
-    fx: Float[Array, ""]
-    fy: Float[Array, ""]
-    cx: Float[Array, ""]
-    cy: Float[Array, ""]
-    width: Integer[Array, ""]
-    height: Integer[Array, ""]
-    offset: Integer[Array, ""]
+    fx: Float[Array, "*l"]
+    fy: Float[Array, "*l"]
+    cx: Float[Array, "*l"]
+    cy: Float[Array, "*l"]
+    width: Integer[Array, "*l"]
+    height: Integer[Array, "*l"]
+    offset: Integer[Array, "*l"]
     """Of the level's first pixel in the packed target."""
+    stride: Integer[Array, "*l"]
+    """From a pixel in the packed target to the one below it."""
 
 
 def image_planes(camera: Camera, levels: tuple[int, ...]) -> ImagePlane:
-    """Planes of some levels, [L], one after the other in the packed target."""
-    cameras = [camera.level(level) for level in levels]
-    sizes = [c.width * c.height for c in cameras]
-    offsets = [sum(sizes[:i]) for i in range(len(sizes))]
-    columns = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height, o) for c, o in zip(cameras, offsets, strict=True)]
-    return ImagePlane(*(jnp.stack([jnp.asarray(entry) for entry in column]) for column in zip(*columns, strict=True)))
+    """Planes of some levels, [L], packed together."""
+    scale = np.float32(0.5) ** np.array(levels, np.float32)
+    sizes = level_sizes(camera, levels)
+    layout, (height, width) = atlas_layout(sizes), np.array(sizes).T
+    offset = [row * layout.width + column for row, column in layout.corners]
+    focal = [f * scale for f in (camera.fx, camera.fy)]
+    centre = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
+    columns = (*focal, *centre, width, height, offset, [layout.width] * len(levels))
+    return ImagePlane(*(jnp.asarray(column) for column in columns))
+
+
+def level_sizes(camera: Camera, levels: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Height and width of some levels."""
+    return [(camera.height >> level, camera.width >> level) for level in levels]
 
 
 def image_plane(camera: Camera) -> ImagePlane:
@@ -152,30 +163,33 @@ def synchronise_depth(
         depth_T_colour: Maps points of the camera at the colour image's moment into the camera at the depth image's.
     """
     height, width = inverse_depth.shape
-    x = jnp.broadcast_to((jnp.arange(width) - camera.cx) / camera.fx, (height, width)).reshape(-1)
-    y = jnp.broadcast_to(((jnp.arange(height) - camera.cy) / camera.fy)[:, None], (height, width)).reshape(-1)
-    flat = inverse_depth.reshape(-1)
+    x = (jnp.arange(width) - camera.cx) / camera.fx
+    y = ((jnp.arange(height) - camera.cy) / camera.fy)[:, None]
     r, t = depth_T_colour[:3, :3], depth_T_colour[:3, 3]
-    depth = r[2, 0] * x + r[2, 1] * y + (r[2, 2] + t[2] * flat)
-    u = camera.fx * (r[0, 0] * x + r[0, 1] * y + (r[0, 2] + t[0] * flat)) / depth + camera.cx
-    v = camera.fy * (r[1, 0] * x + r[1, 1] * y + (r[1, 2] + t[1] * flat)) / depth + camera.cy
+    depth = r[2, 0] * x + r[2, 1] * y + (r[2, 2] + t[2] * inverse_depth)
+    u = camera.fx * (r[0, 0] * x + r[0, 1] * y + (r[0, 2] + t[0] * inverse_depth)) / depth + camera.cx
+    v = camera.fy * (r[1, 0] * x + r[1, 1] * y + (r[1, 2] + t[1] * inverse_depth)) / depth + camera.cy
     inside = (depth > 1e-3) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
     column = jnp.clip((u + 0.5).astype(jnp.int32), 0, width - 1)
     row = jnp.clip((v + 0.5).astype(jnp.int32), 0, height - 1)
-    read = jnp.where(inside, flat[jnp.where(inside, row * width + column, 0)], 0.0)
+    pixel = jnp.where(inside, row * width + column, 0)
+    read = jnp.where(inside, inverse_depth.reshape(-1).at[pixel].get(mode="promise_in_bounds"), 0.0)
     x_read = (column.astype(jnp.float32) - camera.cx) / camera.fx
     y_read = (row.astype(jnp.float32) - camera.cy) / camera.fy
     back = rigid_inverse(depth_T_colour)
     depth_back = back[2, 0] * x_read + back[2, 1] * y_read + (back[2, 2] + back[2, 3] * read)
-    return jnp.where(depth_back > 1e-3, read / depth_back, 0.0).reshape(height, width)
+    return jnp.where(depth_back > 1e-3, read / depth_back, 0.0)
 
 
 class Target(NamedTuple):
-    """Levels of the target frame, packed for sampling with one gather a channel; flat, level after level."""
+    """Levels of the target frame, packed for sampling with one gather a channel; laid out as an `Atlas`.
 
-    grey: UInt32[Array, " m"]
+    Flat arrays would do as well, but to write them XLA would divide every place into row and column.
+    """
+
+    grey: UInt32[Array, "h w"]
     """Four 8-bit grey levels of the 2x2 block that starts at the pixel: (v, u), (v, u+1), (v+1, u), (v+1, u+1)."""
-    depth: UInt32[Array, " m"]
+    depth: UInt32[Array, "h w"]
     """The same block as a plane: 16 bits of inverse depth in its middle (0 = no reading) and 8 bits for each slope."""
 
 
@@ -247,25 +261,23 @@ def _passed(
     return share, (warped.u - u, warped.v - v, warped.inverse_depth - points.q)
 
 
-def pack_grey(grey: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
-    """The 2x2 neighbourhood of every pixel in one word; rounding to 8 bits is far below the image's noise."""
+def pack_grey(grey: Float[Array, "h+1 w+1"]) -> UInt32[Array, "h w"]:
+    """The 2x2 neighbourhood of every pixel but the last ones in one word; rounding to 8 bits is far below the noise."""
     rounded = jnp.clip(jnp.round(grey), 0, 255).astype(jnp.uint32)
-    right = jnp.concatenate([rounded[:, 1:], rounded[:, -1:]], axis=1)
-    pair = rounded | (right << 8)
-    below = jnp.concatenate([pair[1:], pair[-1:]], axis=0)
-    return pair | (below << 16)
+    pair = rounded[:, :-1] | (rounded[:, 1:] << 8)
+    return pair[:-1] | (pair[1:] << 16)
 
 
 def inverse_depth_slopes(
-    inverse_depth: Float[Array, "h w"], limit: float = SAME_SURFACE
-) -> tuple[jax.Array, jax.Array]:
+    inverse_depth: Float[Array, "h+2 w+2"], limit: float = SAME_SURFACE
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from whichever neighbours lie on the same surface; 0 where none does.
 
-    `limit` is the largest relative step between neighbours that is still one surface.
+    Args:
+        inverse_depth: 1/m, 0 = no reading, with a margin of one pixel.
+        limit: Largest relative step between neighbours that is still one surface.
     """
-    q = inverse_depth
-    # beyond the border there is no reading
-    padded = jnp.pad(q, 1)
+    q = inverse_depth[1:-1, 1:-1]
 
     def along(last: jax.Array, following: jax.Array) -> jax.Array:
         ahead, behind = following - q, q - last
@@ -275,20 +287,23 @@ def inverse_depth_slopes(
         count = near_ahead.astype(jnp.float32) + near_behind.astype(jnp.float32)
         return total / jnp.maximum(count, 1.0)
 
-    return along(padded[1:-1, :-2], padded[1:-1, 2:]), along(padded[:-2, 1:-1], padded[2:, 1:-1])
+    along_u = along(inverse_depth[1:-1, :-2], inverse_depth[1:-1, 2:])
+    return along_u, along(inverse_depth[:-2, 1:-1], inverse_depth[2:, 1:-1])
 
 
-def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
+def pack_depth(inverse_depth: Float[Array, "h+3 w+3"]) -> UInt32[Array, "h w"]:
     """Inverse depth and its slopes in one word: a plane about the middle of the 2x2 block that starts at the pixel, so
     that sampling between pixels needs no neighbours.
 
     Each of the four readings says by its own slopes what lies in the middle; those on the nearest surface are averaged.
+
+    Args:
+        inverse_depth: 1/m, 0 = no reading, with the margin of an `Atlas`.
     """
-    height, width = inverse_depth.shape
-    planes = jnp.stack([inverse_depth, *inverse_depth_slopes(inverse_depth)])
-    padded = jnp.pad(planes, [(0, 0), (0, 1), (0, 1)])
+    planes = (inverse_depth[1:-1, 1:-1], *inverse_depth_slopes(inverse_depth))
+    height, width = (size - 3 for size in inverse_depth.shape)
     values, along_u, along_v = (
-        [plane[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)] for plane in padded
+        [plane[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)] for plane in planes
     )
     nearest = jnp.max(jnp.stack(values), axis=0)
     keep = [(value > 0) & (value > nearest * (1.0 - SAME_SURFACE)) for value in values]
@@ -307,10 +322,9 @@ def pack_depth(inverse_depth: Float[Array, "h w"]) -> UInt32[Array, "h w"]:
     return value | (slope(mean(along_u)) << 16) | (slope(mean(along_v)) << 24)
 
 
-def pack_target(*levels: tuple[Float[Array, "h w"], Float[Array, "h w"]]) -> Target:
-    """Pack levels of a frame, each its grey and inverse depth, for sampling."""
-    packed = [(pack_grey(grey).reshape(-1), pack_depth(inverse_depth).reshape(-1)) for grey, inverse_depth in levels]
-    return Target(*(jnp.concatenate(channel) for channel in zip(*packed, strict=True)))
+def pack_target(atlas: Atlas) -> Target:
+    """Pack levels of a frame for sampling."""
+    return Target(pack_grey(atlas.grey[1:-1, 1:-1]), pack_depth(atlas.inverse_depth))
 
 
 class Words(NamedTuple):
@@ -325,9 +339,10 @@ def look_up(target: Target, warped: Warped, plane: ImagePlane) -> Words:
 
     The barrier keeps XLA from reading a word anew for each of its bytes (`benchmarks/kernel.py`).
     """
-    pixel = plane.offset + warped.v.astype(jnp.int32) * plane.width + warped.u.astype(jnp.int32)
+    pixel = plane.offset + warped.v.astype(jnp.int32) * plane.stride + warped.u.astype(jnp.int32)
     pixel = jnp.where(warped.inside > 0, pixel, 0)
-    return jax.lax.optimization_barrier(Words(*(channel.at[pixel].get(mode="promise_in_bounds") for channel in target)))
+    words = (channel.reshape(-1).at[pixel].get(mode="promise_in_bounds") for channel in target)
+    return jax.lax.optimization_barrier(Words(*words))
 
 
 class GreySample(NamedTuple):

@@ -22,13 +22,14 @@ from gavo_jax.objective import (
     Problem,
     Reference,
     Scales,
+    central_gradient,
     depth_trust,
     estimate_brightness,
     estimate_scales,
     explained_share,
     huber,
     l2,
-    make_reference,
+    make_references,
     move_reference,
     preconditioner,
     reference_curvature,
@@ -36,7 +37,7 @@ from gavo_jax.objective import (
     student_t,
     unconditioner,
 )
-from gavo_jax.pyramid import PyramidLevel
+from gavo_jax.pyramid import NO_PIXEL, PyramidLevel, make_atlas
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.particle_swarm import ParticleSwarm
@@ -44,6 +45,12 @@ from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, exp, image_plane, pack_tar
 
 SMALL = Camera(24.0, 23.0, 11.3, 8.8, 24, 18)
 CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)
+
+
+def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Reference:
+    """The points of one level, one a cell x cell block."""
+    points = (camera.width // cell) * (camera.height // cell)
+    return jax.tree.map(lambda leaf: leaf[0], make_references((level,), camera, (0,), points))
 
 
 @cache
@@ -94,7 +101,7 @@ def prepare(
 ) -> tuple[Reference, Target]:
     """What the objective keeps of either frame."""
     reference = make_reference(PyramidLevel(grey, inverse_depth), camera)
-    return reference, pack_target((target_grey, target_inverse_depth))
+    return reference, pack_target(make_atlas([PyramidLevel(target_grey, target_inverse_depth)]))
 
 
 jit_error = jax.jit(lambda objective, motion: objective.error(motion))
@@ -295,6 +302,28 @@ def test_a_cell_gives_its_steepest_point_with_a_reading(cell: int) -> None:
         block = np.s_[rows[i] // cell * cell :, columns[i] // cell * cell :]
         inside = np.where(seen, steepness, -1)[block][:cell, :cell]
         assert np.where(seen, steepness, -1)[rows[i], columns[i]] == inside.max()
+
+
+def test_several_levels_give_the_points_of_each_alone() -> None:
+    levels = [PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in random_pair(6)[1:3]))]
+    rng = np.random.default_rng(2)
+    for size in ((9, 12), (4, 6)):
+        levels.append(PyramidLevel(*(jnp.asarray(rng.uniform(0.1, 200.0, size), jnp.float32) for _ in range(2))))
+    points = (48, 30, 48)
+    together = make_references(tuple(levels), SMALL, (2, 1, 0), points)
+    for row, level, cell in ((0, 2, 1), (1, 1, 2), (2, 0, 3)):
+        alone = make_reference(levels[level], SMALL.level(level), cell)
+        count = alone.grey.shape[0]
+        for seen, expected in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(seen[row, :count], expected, rtol=1e-6)
+        assert not np.any(together.points.q[row, count:])
+
+
+def test_gradients_at_the_border_take_the_pixel_for_what_is_missing() -> None:
+    grey = np.random.default_rng(3).uniform(0, 255, (6, 7)).astype(np.float32)
+    wide = np.pad(grey, 1, mode="edge")
+    expected = [0.5 * (wide[1:-1, 2:] - wide[1:-1, :-2]), 0.5 * (wide[2:, 1:-1] - wide[:-2, 1:-1])]
+    np.testing.assert_allclose(central_gradient(jnp.pad(grey, 1, constant_values=NO_PIXEL)), expected, rtol=1e-5)
 
 
 def test_moved_points_are_seen_as_from_their_own_camera() -> None:

@@ -1,5 +1,7 @@
 """Pyramids: half-pixel convention, depth that is never mixed across an edge, missing readings that stay missing."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from gavo_jax.camera import Camera
-from gavo_jax.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
+from gavo_jax.pyramid import (
+    LEVELS,
+    NO_PIXEL,
+    PyramidLevel,
+    atlas_layout,
+    build_pyramid,
+    halve_grey,
+    halve_inverse_depth,
+    make_atlas,
+)
 
 CAMERA = Camera(131.0, 130.0, 78.3, 61.2, 160, 120)
 
@@ -115,3 +126,39 @@ def test_zeros_stay_zeros_on_every_level() -> None:
         assert isinstance(level, PyramidLevel)
         seen = (depth > 0).reshape(64 >> k, 1 << k, 64 >> k, 1 << k).any(axis=(1, 3))
         np.testing.assert_array_equal(np.asarray(level.inverse_depth) > 0, seen)
+
+
+@given(st.integers(16, 700), st.integers(16, 700), st.sets(st.integers(0, LEVELS - 1), min_size=1), st.randoms())
+def test_levels_in_an_atlas_keep_a_pixel_between_them(height: int, width: int, some: set[int], order: Any) -> None:
+    levels = sorted(some)
+    order.shuffle(levels)
+    sizes = [(height >> level, width >> level) for level in levels]
+    layout = atlas_layout(sizes)
+    count = np.zeros((layout.height + 1, layout.width + 1), int)
+    for (h, w), (row, column) in zip(sizes, layout.corners, strict=True):
+        assert row + h <= layout.height and column + w <= layout.width
+        count[row : row + h + 1, column : column + w + 1] += 1  # with a pixel behind and below
+        count[row + h, column : column + w + 1] -= 1
+        count[row : row + h, column + w] -= 1
+        count[row : row + h, column : column + w] += 10
+    assert set(np.unique(count)) <= {0, 11}, "two levels touch or overlap"
+    assert count[: layout.height, : layout.width].reshape(-1)[layout.gap] == 0
+
+
+def test_an_atlas_shows_its_levels_and_nothing_else() -> None:
+    levels = [
+        PyramidLevel(jnp.full(size, value), jnp.full(size, value)) for size, value in (((3, 4), 2.0), ((7, 9), 5.0))
+    ]
+    atlas = make_atlas(levels)
+    assert atlas.grey.shape == (7 + 1 + 3 + 3, 9 + 3)
+    for image, empty in ((atlas.grey, NO_PIXEL), (atlas.inverse_depth, 0.0)):
+        expected = np.full((14, 12), empty)
+        expected[1:8, 1:10], expected[9:12, 1:5] = 5.0, 2.0
+        np.testing.assert_array_equal(image, expected)
+
+
+def test_halving_replicates_the_border() -> None:
+    grey = np.random.default_rng(1).uniform(0, 255, (8, 10)).astype(np.float32)
+    wide, kernel = np.pad(grey, 1, mode="edge"), np.array([1, 3, 3, 1]) / 8
+    blocks = np.lib.stride_tricks.sliding_window_view(wide, (4, 4))[::2, ::2]
+    np.testing.assert_allclose(halve_grey(jnp.asarray(grey)), blocks @ kernel @ kernel, rtol=1e-5)

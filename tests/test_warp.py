@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
-from gavo_jax.pyramid import build_pyramid
+from gavo_jax.pyramid import PyramidLevel, build_pyramid, make_atlas
 from gavo_jax.warp import (
     GENERATORS,
     INVERSE_DEPTH_STEP,
@@ -29,6 +29,7 @@ from gavo_jax.warp import (
     delayed_slopes,
     exp,
     image_plane,
+    image_planes,
     inverse_depth_slopes,
     log,
     look_up,
@@ -67,14 +68,18 @@ def words_of(target: Target, warped: Warped, height: int, width: int) -> Words:
     return look_up(target, warped, image_plane(Camera(1.0, 1.0, 0.0, 0.0, width, height)))
 
 
+def packed(grey: jax.Array, inverse_depth: jax.Array) -> Target:
+    return pack_target(make_atlas([PyramidLevel(grey, inverse_depth)]))
+
+
 @jax.jit
 def pack_and_sample(image: jax.Array, warped: Warped) -> GreySample:
-    return sample_grey(words_of(pack_target((image, jnp.zeros_like(image))), warped, *image.shape), warped)
+    return sample_grey(words_of(packed(image, jnp.zeros_like(image)), warped, *image.shape), warped)
 
 
 @jax.jit
 def pack_and_sample_depth(inverse_depth: jax.Array, warped: Warped) -> DepthSample:
-    target = pack_target((jnp.zeros_like(inverse_depth), inverse_depth))
+    target = packed(jnp.zeros_like(inverse_depth), inverse_depth)
     return sample_depth(words_of(target, warped, *inverse_depth.shape), warped)
 
 
@@ -203,7 +208,7 @@ def test_a_point_outside_samples_something_finite() -> None:
     far = jnp.array([-1e9, 1e9, 1e30, -5.0], jnp.float32)
     warped = Warped(far, far, jnp.ones(4), jnp.zeros(4))
     assert pack_and_sample(jnp.full((48, 64), 9.0), warped).value.shape == (4,)
-    words = words_of(pack_target((jnp.full((48, 64), 9.0), jnp.full((48, 64), 0.5))), warped, 48, 64)
+    words = words_of(packed(jnp.full((48, 64), 9.0), jnp.full((48, 64), 0.5)), warped, 48, 64)
     assert np.unique(words.grey).size == 1 and np.unique(words.depth).size == 1
 
 
@@ -213,9 +218,14 @@ def plane(a: float, b: float, c: float) -> np.ndarray:
     return (a + b * u + c * v).astype(np.float32)
 
 
+def slopes_of(inverse_depth: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Slopes of an image beyond whose border there is no reading."""
+    return tuple(np.asarray(slope) for slope in inverse_depth_slopes(jnp.pad(jnp.asarray(inverse_depth), 1)))
+
+
 @given(st.floats(0.3, 1.0), st.floats(-2e-3, 2e-3), st.floats(-2e-3, 2e-3))
 def test_slopes_of_a_plane(a: float, b: float, c: float) -> None:
-    along_u, along_v = inverse_depth_slopes(jnp.asarray(plane(a, b, c)))
+    along_u, along_v = slopes_of(plane(a, b, c))
     np.testing.assert_allclose(along_u, b, atol=2e-6)
     np.testing.assert_allclose(along_v, c, atol=2e-6)
 
@@ -224,7 +234,7 @@ def test_slopes_do_not_cross_edges_or_gaps() -> None:
     inverse_depth = plane(0.5, 1e-3, -1e-3)
     inverse_depth[:, 30:] += 0.5
     inverse_depth[20, 10:20] = 0
-    along_u, along_v = (np.asarray(s) for s in inverse_depth_slopes(jnp.asarray(inverse_depth)))
+    along_u, along_v = slopes_of(inverse_depth)
     seen = inverse_depth > 0
     np.testing.assert_allclose(along_u[seen], 1e-3, atol=2e-6)
     np.testing.assert_allclose(along_v[seen], -1e-3, atol=2e-6)
@@ -233,7 +243,7 @@ def test_slopes_do_not_cross_edges_or_gaps() -> None:
 def test_a_lonely_reading_has_no_slope() -> None:
     inverse_depth = np.zeros((48, 64), np.float32)
     inverse_depth[10, 10] = 0.7
-    along_u, along_v = inverse_depth_slopes(jnp.asarray(inverse_depth))
+    along_u, along_v = slopes_of(inverse_depth)
     assert float(along_u[10, 10]) == float(along_v[10, 10]) == 0.0
 
 
@@ -350,3 +360,19 @@ def test_synchronised_depth_of_the_room() -> None:
     after = np.abs(moved - exact)[seen]
     assert np.median(after) < 0.2 * np.median(before)
     assert np.mean(after) < 0.5 * np.mean(before)
+
+
+def test_levels_are_sampled_out_of_one_atlas() -> None:
+    camera, rng = Camera(40.0, 41.0, 23.1, 17.2, 45, 35), np.random.default_rng(5)
+    grey, depth = rng.uniform(0, 255, (35, 45)), rng.choice([0.0, 1.0, 1.02, 1.7], (35, 45))
+    pyramid, levels = build_pyramid(jnp.asarray(grey), jnp.asarray(depth), 1.0, 4), (3, 2, 0)
+    target, planes = pack_target(make_atlas([pyramid[level] for level in levels])), image_planes(camera, levels)
+    for i, level in enumerate(levels):
+        plane = jax.tree.map(lambda leaf, i=i: leaf[i], planes)
+        alone, view = packed(*pyramid[level]), camera.level(level)
+        assert (plane.height, plane.width) == (view.height, view.width) == pyramid[level].grey.shape
+        np.testing.assert_allclose([plane.fx, plane.fy, plane.cx, plane.cy], [view.fx, view.fy, view.cx, view.cy])
+        v, u = (axis.ravel().astype(np.float32) for axis in np.mgrid[: view.height - 1, : view.width - 1])
+        warped = Warped(u, v, np.ones_like(u), np.ones_like(u))
+        expected = words_of(alone, warped, view.height, view.width)
+        jax.tree.map(np.testing.assert_array_equal, look_up(target, warped, plane), expected)
