@@ -7,6 +7,7 @@ fails one is told apart by its `AlignmentStatus`, and by what it may still be us
 import enum
 import math
 import zlib
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -108,13 +109,13 @@ def check_frame(
     history = history._replace(checksum=checksum)
     if not _is_finite(grey).all():
         return _refused(AlignmentStatus.NOT_FINITE), history
-    clipped = float(np.mean((grey <= BLACK) | (grey >= WHITE)))
+    clipped = np.count_nonzero((grey <= BLACK) | (grey >= WHITE)) / grey.size
     status = _check_image(grey, clipped)
     if status is not AlignmentStatus.OK:
         return _refused(status), history
     if checksum == repeated:
         return _refused(AlignmentStatus.FROZEN), history
-    if history.clipped and clipped - np.median(history.clipped) > MAX_CLIPPED_JUMP:
+    if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
         return _doubt(_refused(AlignmentStatus.BLANK), history)
     depth, history = _check_depth(np.asarray(frame.depth)[::ROW_STEP], camera.depth_scale, history)
     if depth.use is Use.NOTHING:
@@ -142,7 +143,7 @@ def _check_timestamp(frame: Frame | FrameError | None, timestamp: float, history
     if isinstance(frame, Frame) and not math.isfinite(frame.depth_timestamp or 0.0):
         return _refused(AlignmentStatus.BAD_TIMESTAMP)
     if history.timestamp is not None and len(history.intervals) >= MIN_INTERVALS:
-        if timestamp - history.timestamp > MAX_INTERVAL_RATIO * float(np.median(history.intervals)):
+        if timestamp - history.timestamp > MAX_INTERVAL_RATIO * median(history.intervals):
             return Finding(AlignmentStatus.GAP, Use.ALL)
     return Finding(AlignmentStatus.OK, Use.ALL)
 
@@ -158,10 +159,11 @@ def _check_image(grey: np.ndarray, clipped: float) -> AlignmentStatus:
     """Status of an image by itself."""
     values = grey.astype(np.float32)
     values -= values.mean()
-    variance = float(np.mean(values**2))
+    variance = float(np.vdot(values, values)) / values.size
     if variance < MIN_CONTRAST**2 or clipped > MAX_CLIPPED:
         return AlignmentStatus.BLANK
-    if float(np.mean(values[:, 1:] * values[:, :-1])) < MIN_CORRELATION * variance:
+    neighbours = float(np.einsum("ij,ij->", values[:, 1:], values[:, :-1])) / values[:, 1:].size
+    if neighbours < MIN_CORRELATION * variance:
         return AlignmentStatus.NOISE
     return AlignmentStatus.OK
 
@@ -172,7 +174,7 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     coverage = readings.size / depth.size
     if coverage < MIN_DEPTH_SHARE:
         return Finding(AlignmentStatus.NO_DEPTH, Use.TARGET), history
-    usual = np.median(history.coverages) if history.coverages else coverage
+    usual = median(history.coverages) if history.coverages else coverage
     history = history._replace(coverages=_remember(history.coverages, coverage))
     range_m = float(np.median(readings[::ROW_STEP])) / depth_scale
     if history.range is not None:

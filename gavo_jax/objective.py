@@ -310,14 +310,14 @@ class Objective:
             return part(self.reference)
         fill = chunks * size - points
         whole = jax.tree.map(lambda a: jnp.pad(a.reshape(views, points), [(0, 0), (0, fill)]), self.reference)
-        used_chunks = chunks if self.count is None else -(-self.count // size)
+        used_chunks = jnp.int32(chunks) if self.count is None else -(-self.count // size)
         used_views = views if self.views is None else jnp.minimum(self.views, views)
 
-        def chunk(k: jax.Array | int) -> Reference:
-            start = (k // used_chunks, k % used_chunks * size)
+        def chunk(k: jax.Array) -> Reference:
+            start = (jax.lax.div(k, used_chunks), jax.lax.rem(k, used_chunks) * size)
             return jax.tree.map(lambda a: jax.lax.dynamic_slice(a, start, (1, size))[0], whole)
 
-        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: part(chunk(0))))
+        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: part(chunk(jnp.int32(0)))))
         add = partial(jax.tree.map, jnp.add)
         return jax.lax.fori_loop(0, used_views * used_chunks, lambda k, total: add(total, part(chunk(k))), zero)
 
@@ -386,7 +386,8 @@ class Objective:
 
     def _sums(self, cost: Float[Array, "*n"]) -> Float[Array, " 2"]:
         """Sum of the costs inside, and the number of points there."""
-        return jnp.stack([_lane_sum(jnp.maximum(cost, 0.0)), _lane_sum((cost >= 0).astype(jnp.float32))])
+        inside = _lane_sum((cost >= 0).astype(jnp.float32))
+        return jnp.stack([_lane_sum(cost) + (cost.size - inside), inside])
 
     def _conclude(self, sums: Float[Array, "2 ..."]) -> tuple[Float[Array, "*p"], Float[Array, "*p"]]:
         """Errors and overlaps from the sums over all points."""
@@ -554,7 +555,8 @@ class Problem:
         Candidates that are not `counted` cost nothing and have an error of +inf: a population that is smaller on one
         level than on another leaves places empty.
         """
-        motions = self.transform(x)
+        # held back, or XLA would compute each motion anew for each of its 16 entries
+        motions = jax.lax.optimization_barrier(self.transform(x))
         counted = jnp.ones(x.shape[0], bool) if counted is None else counted
         error, overlap = self.objective.score(motions, counted & self.searched)
         return jnp.where(jnp.isnan(error) | self.is_out_of_reach(motions), jnp.inf, error), overlap
