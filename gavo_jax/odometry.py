@@ -4,6 +4,7 @@ For every new frame one compiled program builds its pyramid, aligns it with the 
 and makes it the next reference; the images stay on the device, and a thread decodes the next frame meanwhile.
 """
 
+import gc
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -262,8 +263,13 @@ class Odometry:
 
     def warm_up(self) -> float:
         """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
-        start = time.perf_counter()
-        self._start(self._blank())
+        start, collects = time.perf_counter(), gc.isenabled()
+        gc.disable()  # tracing makes objects by the hundred thousand that all stay; looking through them takes a fifth
+        try:
+            self._start(self._blank())
+        finally:
+            if collects:
+                gc.enable()
         return time.perf_counter() - start
 
     def blank_state(self) -> TrackerState:
