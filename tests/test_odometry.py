@@ -458,6 +458,17 @@ def test_one_program_serves_every_frame(sequence: SyntheticSequence) -> None:
     assert types[0] == types[1]
 
 
+@pytest.mark.parametrize("collects", [False, True])
+def test_warming_up_leaves_the_garbage_collector_as_it_was(collects: bool) -> None:
+    before = gc.isenabled()
+    try:
+        (gc.enable if collects else gc.disable)()
+        Odometry(CAMERA, SOLVER, options=PLAIN).warm_up()
+        assert gc.isenabled() == collects
+    finally:
+        (gc.enable if before else gc.disable)()
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.2, 0.25, 0.3, 0.6])
 def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSequence) -> None:
     frame, camera = sequence[0], CAMERA.level(1)
