@@ -158,23 +158,24 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], p
         levels: Which ones, in the order of the result.
         points: Largest number of points a level.
     """
-    layout, planes = atlas_layout(level_sizes(camera, levels)), image_planes(camera, levels)
+    sizes = level_sizes(camera, levels)
+    layout = atlas_layout(sizes)
     grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[level] for level in levels]))
     gradient, slopes = central_gradient(grey), inverse_depth_slopes(inverse_depth)
     grey, inverse_depth = grey[1:-1, 1:-1], inverse_depth[1:-1, 1:-1]
     steepness = jnp.where(inverse_depth > 0, gradient[0] ** 2 + gradient[1] ** 2, -1.0)
-    cells = cells_of(camera, levels, points)
-    longest = max(rows * columns for rows, columns in grids_of(camera, levels, points))
     chosen = []
-    for (height, width), (row, column), cell in zip(level_sizes(camera, levels), layout.corners, cells, strict=True):
+    for (height, width), (row, column), cell in zip(
+        sizes, layout.corners, cells_of(camera, levels, points), strict=True
+    ):
         u, v = _steepest_of_blocks(steepness[row : row + height, column : column + width], cell)
-        places = ((v + row) * layout.width + u + column).reshape(-1)
-        chosen.append(jnp.pad(places, (0, longest - places.shape[0]), constant_values=layout.gap))
-    place = jnp.stack(chosen)
+        chosen.append(((v + row) * layout.width + u + column).reshape(-1))
+    longest = max(places.shape[0] for places in chosen)
+    place = jnp.stack([jnp.pad(p, (0, longest - p.shape[0]), constant_values=layout.gap) for p in chosen])
     q, grey, grey_u, grey_v, slope_u, slope_v = (
         image.reshape(-1).at[place].get(mode="promise_in_bounds") for image in (inverse_depth, grey, *gradient, *slopes)
     )
-    plane = jax.tree.map(lambda leaf: leaf[:, None], planes)
+    plane = jax.tree.map(lambda leaf: leaf[:, None], image_planes(camera, levels))
     row, column = np.array(layout.corners).T[..., None]
     u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
     near = jnp.maximum(q, 1e-3)

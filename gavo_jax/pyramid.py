@@ -132,7 +132,6 @@ NO_PIXEL = -1.0
 def make_atlas(levels: Sequence[PyramidLevel]) -> Atlas:
     """The atlas of some levels, laid out as `atlas_layout` says."""
     layout = atlas_layout([(level.grey.shape[0], level.grey.shape[1]) for level in levels])
-
     size = (layout.height + 3, layout.width + 3)
     grey, inverse_depth = jnp.full(size, NO_PIXEL), jnp.zeros(size)
     for level, (row, column) in zip(levels, layout.corners, strict=True):
