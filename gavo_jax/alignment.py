@@ -37,6 +37,7 @@ from gavo_jax.objective import (
     reference_curvature,
     unconditioner,
 )
+from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
 from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
@@ -707,7 +708,7 @@ def _align_images(
     return align_views((view,), packed, camera, solver, options, key, guess[None], exchanged=exchanged)[0]
 
 
-@jax.jit
+@partial(CachedProgram, returns=(Alignment,))
 def _align_pairs(count, references, targets, camera, solver, options, keys, guesses):
     """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere.
 

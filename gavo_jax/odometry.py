@@ -36,6 +36,7 @@ from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relat
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.objective import Reference, grids_of, move_reference, settle_reference
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
+from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
 from gavo_jax.trajectory import Trajectory, inverse
 from gavo_jax.warp import Points, Target, exp, level_sizes, synchronise_depth, warp
@@ -108,7 +109,7 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
 
 
-@partial(jax.jit, static_argnames="record")
+@partial(CachedProgram, static=("record",), returns=(TrackerState, Reference, Points, Target, Alignment, Population))
 def _track(
     state: TrackerState,
     grey: Array,
@@ -119,6 +120,7 @@ def _track(
     solver: Any,
     alignment: AlignmentOptions,
     options: OdometryOptions,
+    *,
     record: bool,
 ) -> tuple[TrackerState, Alignment, Population | None]:
     """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's.
@@ -440,7 +442,7 @@ class Odometry:
         solver, alignment = solver or self.solver, alignment or self.alignment
         options = options or self.options
         images, settings = (frame.grey, frame.depth), (self.camera, solver, alignment, _traced(options))
-        state, result, populations = _track(state, *images, clock, self.key, *settings, self.record)
+        state, result, populations = _track(state, *images, clock, self.key, *settings, record=self.record)
         result = on_host(result)
         if populations is not None:
             host = jax.device_get(populations)

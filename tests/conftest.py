@@ -6,7 +6,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-# programs compiled by the tests are kept between runs; JAX reads this when it is imported, so it comes first
+# programs of the tests are kept between runs; JAX reads this when it is imported, so it comes first
+os.environ.setdefault("GAVO_CACHE_DIR", str(Path.home() / ".cache" / "gavo-jax" / "test"))
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "gavo-jax" / "test-jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
@@ -22,6 +23,8 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from gavo_jax.program_cache import keep_programs_in  # noqa: E402
+
 settings.register_profile("gavo", deadline=None, derandomize=True)
 settings.load_profile("gavo")
 
@@ -31,6 +34,7 @@ def _few_programs_at_a_time() -> Iterator[None]:
     """Let go of a module's compiled programs: each holds maps of memory, of which a process has only so many."""
     yield
     jax.clear_caches()
+    keep_programs_in(None)
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import jax
 
+from gavo_jax.program_cache import keep_programs_in
+
 
 def cache_folder() -> Path | None:
     """Return `GAVO_CACHE_DIR`, else the user's cache folder for this package; None where there is no home."""
@@ -18,12 +20,14 @@ def cache_folder() -> Path | None:
 
 
 def enable_compilation_cache() -> None:
-    """Have JAX keep compiled programs in `cache_folder()`, unless `JAX_COMPILATION_CACHE_DIR` says where.
+    """Keep traced programs in `cache_folder()`, and have JAX keep compiled ones there, unless
+    `JAX_COMPILATION_CACHE_DIR` says where.
 
     An entry that cannot be read or written (torn by a kill, a full disk) costs a compilation and no word.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
     folder = cache_folder()
+    keep_programs_in(folder and folder / "traced")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR") or folder is None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))

@@ -1,0 +1,202 @@
+"""Large programs whose traced form is kept between processes.
+
+JAX's own cache keeps what XLA made of a program, but to look it up there the program is needed first: Python traces the
+function and lowers it, and for a frame's program that takes longer than all that follows (`benchmarks/footprint.py`).
+So the lowered form is kept too, as `jax.export` writes it. A file's name says which program it holds (function,
+settings, shapes, JAX's configuration), its seal what that was made from (this package's code, versions): once any of
+this has changed, the program is traced anew.
+"""
+
+import dataclasses
+import hashlib
+import inspect
+import os
+import platform
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache, update_wrapper
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
+
+import jax
+from jax import export
+from jax.core import Tracer
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+OURS = __name__.partition(".")[0]
+TRACED_WITH = ("jax", "jaxlib", "jaxlie", "numpy", "optax")
+"""Packages whose code is traced along with ours; their versions tell whether it has changed."""
+
+_folder: Path | None = None
+_loaded: dict[Any, Callable[..., Any]] = {}
+_lock = threading.Lock()
+
+
+def keep_programs_in(folder: Path | None) -> None:
+    """Have every `CachedProgram` keep its traced forms in a folder; None, as at first: nowhere."""
+    global _folder
+    _folder = folder
+    _loaded.clear()
+
+
+class Kind(NamedTuple):
+    """What a program needs to know of an input."""
+
+    shape: tuple[int, ...]
+    type: Any
+    """Of numbers: NumPy's or JAX's, or a Python number's own."""
+    weak: bool
+    """Whether the type gives way to others', as a Python number's does."""
+
+    @classmethod
+    def of(cls, leaf: Any) -> "Kind":
+        """An array's, or a number's."""
+        if type(leaf) in (bool, int, float):
+            return cls((), type(leaf), True)
+        return cls(leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False))
+
+    def __repr__(self) -> str:
+        return f"{self.type}{self.shape}{'*' * self.weak}"
+
+
+class CachedProgram(Generic[P, R]):
+    """A function as `jax.jit` makes it, with its traced form kept where `keep_programs_in` says.
+
+    Somebody else's code among the settings (a loss, a solver) is not known to be the same the next time: with it, and
+    inside another program, this is `jax.jit` and nothing else.
+
+    Args:
+        function: Of trees of arrays and numbers by position, and of `static` arguments by keyword.
+        static: Names of keyword arguments that are part of the program.
+        returns: The NamedTuples in what it returns.
+    """
+
+    def __init__(self, function: Callable[P, R], static: tuple[str, ...] = (), returns: tuple[type, ...] = ()):
+        self._function, self._jitted = function, jax.jit(function, static_argnames=static)
+        for node in returns:
+            _register(node)
+        update_wrapper(self, function)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run it."""
+        leaves, structure = jax.tree.flatten(args)
+        is_traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+        if _folder is None or is_traced or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+            return self._jitted(*args, **kwargs)
+        kinds = tuple(map(Kind.of, leaves))
+        signature = (self._function, structure, kinds, tuple(kwargs.items()))
+        with _lock:
+            program = _loaded.get(signature)
+            if program is None:
+                program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)
+        return program(*leaves)
+
+    def _load(
+        self, folder: Path, leaves: list[Any], structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]
+    ) -> Callable[..., R]:
+        """The program as a function of the leaves: from its file, or traced and written there."""
+
+        def of_leaves(*leaves: Any) -> R:
+            return self._function(*jax.tree.unflatten(structure, leaves), **static)
+
+        jitted = jax.jit(of_leaves)
+        try:
+            settings = identify((jax.tree.unflatten(structure, kinds), static))
+        except Foreign:
+            return jitted
+        configuration = [(name, getattr(jax.config, name, None)) for name in sorted(jax.config.values)]
+        digest = hashlib.sha256(repr((settings, configuration, jax.default_backend())).encode()).hexdigest()
+        path = folder / f"{self._function.__name__.strip('_')}-{digest[:32]}"
+        data = _read(path)
+        if data is None:
+            try:
+                data = bytes(export.export(jitted)(*leaves).serialize())
+            except (NotImplementedError, ValueError):  # an operation of this backend that JAX does not export
+                return jitted
+            _write(path, data)
+        # compiled here, as a call of the jitted form would compile once more when it is given its own results
+        return jax.jit(export.deserialize(bytearray(data)).call).lower(*leaves).compile()
+
+
+def _register(node: type) -> None:
+    """Tell JAX how to write down a NamedTuple."""
+    try:
+        export.register_namedtuple_serialization(node, serialized_name=f"{node.__module__}.{node.__qualname__}")
+    except ValueError:  # another program returns it too
+        pass
+
+
+class Foreign(Exception):
+    """Code of which nothing tells whether it has changed."""
+
+
+def identify(value: Any) -> Any:
+    """Settings as text, in every process the same.
+
+    Raises:
+        Foreign: There is something among them that is neither known code nor a plain value.
+    """
+    if isinstance(value, Kind | str | bool | int | float | None):
+        return repr(value)
+    if isinstance(value, type) or inspect.isfunction(value):
+        return _known(value)
+    if isinstance(value, dict):
+        return [(name, identify(entry)) for name, entry in value.items()]
+    if type(value) in (tuple, list):
+        return [type(value).__name__, *map(identify, value)]
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return [_known(type(value)), *map(identify, value)]
+    if dataclasses.is_dataclass(value):
+        fields = (field.name for field in dataclasses.fields(value))
+        return [_known(type(value)), *((name, identify(getattr(value, name))) for name in fields)]
+    raise Foreign
+
+
+def _known(code: Any) -> str:
+    """Full name of a class or function that a module of this package, or of those it is traced with, has by it."""
+    module = sys.modules.get(code.__module__)
+    is_ours = code.__module__.partition(".")[0] in (OURS, *TRACED_WITH)
+    if not is_ours or getattr(module, code.__name__, None) is not code:
+        raise Foreign
+    return f"{code.__module__}.{code.__name__}"
+
+
+@cache
+def _made_from() -> bytes:
+    """Digest of this package's code and of what it is traced with."""
+    digest = hashlib.sha256(repr([platform.python_version(), *map(version, TRACED_WITH)]).encode())
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    return digest.digest()
+
+
+def _seal(data: bytes) -> bytes:
+    return hashlib.sha256(_made_from() + data).digest()
+
+
+def _read(path: Path) -> bytes | None:
+    """What the same code wrote to a file; None where the file is missing, stale or damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    seal, data = content[:32], content[32:]
+    return data if seal == _seal(data) else None
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file, whole, if that can be done: whether it is there decides about time alone."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(_seal(data) + data)
+        os.replace(partial, path)
+    except OSError:
+        with suppress(OSError):
+            partial.unlink()
