@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,6 +11,7 @@ from gavo_jax.alignment import Alignment, AlignmentOptions, objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.plots import Landscape
+from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.warp import exp
 
@@ -42,11 +42,11 @@ def error_landscape(
     steps = np.linspace(-REACH, REACH, STEPS)
     images = (reference.grey, reference.depth, target.grey, target.depth)
     motion = jnp.asarray(alignment.target_T_reference, jnp.float32)
-    errors = _score(images, camera, motion, jnp.float32(directions), jnp.float32(steps), options, tuple(levels))
+    errors = _score(images, camera, motion, jnp.float32(directions), jnp.float32(steps), options, levels=tuple(levels))
     return Landscape(steps, directions, {k: np.asarray(e) for k, e in zip(levels, errors, strict=True)})
 
 
-@partial(jax.jit, static_argnames=("levels",))
+@partial(CachedProgram, static=("levels",))
 def _score(
     images: tuple[Array, ...],
     camera: Camera,
@@ -54,6 +54,7 @@ def _score(
     directions: Float[Array, "2 6"],
     steps: Float[Array, " n"],
     options: AlignmentOptions,
+    *,
     levels: tuple[int, ...],
 ) -> list[Float[Array, "2 n"]]:
     reference, target = (build_pyramid(images[i], images[i + 1], camera.depth_scale, LEVELS) for i in (0, 2))

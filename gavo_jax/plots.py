@@ -114,12 +114,14 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
             ended: its last error is carried on.
     """
     figure = _figure(3.0 * len(histories), 3.6, "convergence")
-    for axes, (level, history) in zip(_panels(figure, len(histories)), histories.items(), strict=True):
+    panels = _panels(figure, len(histories), one_scale=True)
+    for axes, (level, history) in zip(panels, histories.items(), strict=True):
         error = _carry_on(history)
         excess = 100.0 * (error[:, :-1] / np.maximum(error[:, -1:], 1e-12) - 1.0)
         iterations = np.arange(1, excess.shape[1] + 1)
         _draw_band(axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of them")
         axes.set(title=f"level {level}", xlabel="iteration", yscale="log")
+        axes.minorticks_off()
     figure.axes[0].set_ylabel("excess of E (%)")
     figure.axes[0].legend(fontsize="small")
     return figure
@@ -226,15 +228,26 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     Raises:
         GavoError: a file cannot be written.
     """
-    paths = [Path(folder) / f"{name}.{suffix}" for suffix in FORMATS]
-    for path in paths:
-        options: dict[str, Any] = (
-            {"metadata": {"Date": None}} if path.suffix == ".svg" else {"pil_kwargs": {"optimize": True}}
-        )
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    def write_png(path: Path) -> None:
+        FigureCanvasAgg(figure).print_png(path, pil_kwargs={"optimize": True})
+
+    def write_svg(path: Path) -> None:
+        FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None})
+
+    # not by `savefig`, which draws twice for each file and lays out anew: that takes the most time
+    figure.set_dpi(120)
+    paths = []
+    for suffix, write in zip(FORMATS, (write_png, write_svg), strict=True):
+        path = Path(folder) / f"{name}.{suffix}"
         try:
-            figure.savefig(path, dpi=120, **options)
+            write(path)
         except OSError as error:
             raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+        figure.set_layout_engine("none")
+        paths.append(path)
     return paths
 
 
@@ -260,9 +273,9 @@ def _number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
     axes.secondary_xaxis("top", functions=(frame_at, time_of)).set_xlabel("frame")
 
 
-def _panels(figure: Figure, count: int) -> list[Any]:
-    """Return panels side by side."""
-    panels = list(figure.subplots(1, count, squeeze=False)[0])
+def _panels(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
+    """Return panels side by side, each with a scale of its own upwards, or all with one."""
+    panels = list(figure.subplots(1, count, squeeze=False, sharey=one_scale)[0])
     for axes in panels:
         axes.grid(alpha=0.3)
         axes.locator_params(axis="x", integer=True)

@@ -1,5 +1,6 @@
 """Figures: what they show, and what they are written to."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -54,6 +55,17 @@ def test_save(tmp_path):
     assert paths[0].read_bytes().startswith(b"\x89PNG") and "<svg" in paths[1].read_text()
     with pytest.raises(GavoError, match="nowhere"):
         plots.save(figure, tmp_path / "nowhere", "trajectory")
+
+
+def test_a_saved_figure_is_filled_to_its_edges(tmp_path):
+    figure = plots.plot_convergence({1: np.array([[4.0, 2.0, 1.0]]), 2: np.array([[9.0, 2.0, 1.0]])})
+    picture, vector = plots.save(figure, tmp_path, "convergence")
+    ink = np.argwhere(np.asarray(cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)) < 128)
+    size = np.array([0.9 * 3.6, 6.0]) * 120  # inches by dots; the caption leaves room at the right
+    assert np.all(ink.min(axis=0) < 0.06 * size) and np.all(ink.max(axis=0) > 0.94 * size)
+    frames = [axes.get_window_extent() for axes in figure.axes]
+    assert frames[0].x1 < frames[1].x0 and frames[1].x1 > 0.94 * figure.bbox.width
+    assert 'width="432pt" height="259.2pt"' in vector.read_text()
 
 
 def labels(axes) -> list[str]:
