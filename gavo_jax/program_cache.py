@@ -40,8 +40,9 @@ _lock = threading.Lock()
 def keep_programs_in(folder: Path | None) -> None:
     """Have every `CachedProgram` keep its traced forms in a folder; None, as at first: nowhere."""
     global _folder
+    if folder != _folder:
+        _loaded.clear()
     _folder = folder
-    _loaded.clear()
 
 
 class Kind(NamedTuple):

@@ -56,6 +56,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 def start_anew(folder: Path) -> None:
     """As if another process began: nothing is known but what the folder holds."""
     jax.clear_caches()
+    keep_programs_in(None)
     keep_programs_in(folder)
 
 
