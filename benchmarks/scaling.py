@@ -8,7 +8,7 @@ host to the results there, and the pairs a second. Each figure is the median of 
     python benchmarks/scaling.py
     python benchmarks/scaling.py --populations 64,256,1024,4096 --batches 16,64,256,1024 --json scaling.json
 
-On 2 cores the defaults take about two minutes, compilation included: each size of batch is a program.
+On 2 cores the defaults take about four minutes, compilation included: each size of batch is a program.
 """
 
 import time
@@ -38,7 +38,7 @@ def main(
     populations: str = "8,16,32,64,128,256",
     batches: str = "1,2,4,8",
     methods: str = "ga,ga:fast",
-    rounds: int = 5,
+    rounds: int = 15,
     json: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, print and return the figures.

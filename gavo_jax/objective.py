@@ -258,13 +258,13 @@ GROUP = 8
 """Candidates that are scored side by side on a CPU; a population's size is best a multiple of it."""
 CHUNK = 1200
 """Points of a view on which a group of candidates is scored at a time on a CPU; what lies between two loops stays in
-the cache (`benchmarks/kernel.py`)."""
+the cache (`benchmarks/kernel.py`). Twice as many suit an image of more than `FEW_POINTS`, but of several levels in
+arrays of one length the short ones would be scored with what fills them up."""
+FEW_POINTS = 9600
 LINEARIZED_CHUNK = 4800
 """Points of a view that are linearised at a time; there is only one candidate then."""
 CENTRING_POINTS = 480
 """Points a view that tell a motion's mean residual."""
-MOST_CHUNKS = 16
-"""On large images chunks grow so that there are no more than these."""
 
 
 @jax.tree_util.register_dataclass
@@ -305,7 +305,7 @@ class Objective:
     def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
         """Sum of `part` over chunks of the reference's points, view after view, as far as there are any."""
         views, points = self.reference.grey.reshape(-1, self.reference.grey.shape[-1]).shape
-        size = max(min(chunk_size, points), -(-points // MOST_CHUNKS))
+        size = min(chunk_size, points)
         chunks = -(-points // size)
         if chunks * views == 1:
             return part(self.reference)
@@ -448,7 +448,8 @@ def _score_side_by_side(objective: Objective, motions: jax.Array, counted: jax.A
 
 def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Groups of candidates on chunks of points: what a CPU wants. Both loops run only as far as there is something."""
-    candidates = motions.shape[0]
+    candidates, points = motions.shape[0], objective.reference.grey.shape[-1]
+    size = CHUNK if points <= FEW_POINTS else 2 * CHUNK
     group = min(GROUP, candidates)
     groups = -(-candidates // group)
     order = jnp.argsort(~counted, stable=True)
@@ -465,7 +466,7 @@ def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Arra
 
             return jax.vmap(sums, out_axes=1)(chosen, means)
 
-        return sums.at[:, members].set(objective.sum_over_points(chunk_sums, CHUNK), mode="drop")
+        return sums.at[:, members].set(objective.sum_over_points(chunk_sums, size), mode="drop")
 
     busy = -(-jnp.sum(counted) // group)
     sums = jax.lax.fori_loop(0, busy, score_group, jnp.zeros((2, candidates)))
