@@ -110,9 +110,11 @@ class CachedProgram(Generic[P, R]):
             settings = identify((jax.tree.unflatten(structure, kinds), static))
         except Foreign:
             return jitted
+        function = self._function
         configuration = [(name, getattr(jax.config, name, None)) for name in sorted(jax.config.values)]
-        digest = hashlib.sha256(repr((settings, configuration, jax.default_backend())).encode()).hexdigest()
-        path = folder / f"{self._function.__name__.strip('_')}-{digest[:32]}"
+        program = (function.__module__, function.__qualname__, settings, configuration, jax.default_backend())
+        digest = hashlib.sha256(repr(program).encode()).hexdigest()
+        path = folder / f"{function.__name__.strip('_')}-{digest[:32]}"
         data = _read(path)
         if data is None:
             try:

@@ -82,6 +82,19 @@ def test_its_own_results_are_no_new_program(folder: Path) -> None:
     assert len(program_cache._loaded) == 1
 
 
+def test_functions_of_one_name_are_different_programs(folder: Path) -> None:
+    def make(factor: float) -> Any:
+        def double(numbers: jax.Array) -> jax.Array:
+            return factor * numbers
+
+        double.__module__ = f"tests.of_{factor}"
+        return CachedProgram(double)
+
+    for factor in (2.0, 3.0):
+        np.testing.assert_array_equal(make(factor)(NUMBERS), factor * NUMBERS)
+    assert len(list(folder.iterdir())) == 2
+
+
 @pytest.mark.parametrize(
     ("change", "is_new"),
     [
