@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
 
 import jax
+import numpy as np
 from jax import export
 from jax.core import Tracer
 
@@ -122,6 +123,8 @@ class CachedProgram(Generic[P, R]):
             except (NotImplementedError, ValueError):  # an operation of this backend that JAX does not export
                 return jitted
             _write(path, data)
+        # JAX sets LAPACK up when it lowers a call of it, and some versions at no other time: jax-ml/jax#29610
+        jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
         # compiled here, as a call of the jitted form would compile once more when it is given its own results
         return jax.jit(export.deserialize(bytearray(data)).call).lower(*leaves).compile()
 
