@@ -708,9 +708,15 @@ def _align_images(
     return align_views((view,), packed, camera, solver, options, key, guess[None], exchanged=exchanged)[0]
 
 
+POINTS_SIDE_BY_SIDE = 2**20
+"""Points a level of the pairs that an accelerator aligns at once, some 200 pairs by most presets: each takes memory for
+its images' pyramids (some 10 MB) and its candidates' residuals. Reckoned, not measured."""
+
+
 @partial(CachedProgram, returns=(Alignment,))
 def _align_pairs(count, references, targets, camera, solver, options, keys, guesses):
-    """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere.
+    """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere,
+    `POINTS_SIDE_BY_SIDE` at a time.
 
     The count is an input, so that XLA compiles one and the same loop body for one pair and for many, whose results then
     agree to the last bit; unrolled, a single pair would round differently.
@@ -721,7 +727,8 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
         return _align_images(reference, target, camera, solver, options, key, guess)
 
     if jax.default_backend() != "cpu":
-        return jax.vmap(one)(jnp.arange(keys.shape[0]))
+        most = max(rows * columns for rows, columns in grids_of(camera, solver.levels, options.points))
+        return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=max(1, POINTS_SIDE_BY_SIDE // most))
     empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
     return jax.lax.fori_loop(
         0, count, lambda i, results: jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i)), empty
@@ -788,7 +795,7 @@ def align_batch(
     guesses: Float[Array, "b 4 4"] | None = None,
     options: AlignmentOptions | None = None,
 ) -> Alignment:
-    """Align B pairs in one compiled call.
+    """Align B pairs in one compiled call; what it takes of memory beside the images does not grow with a large B.
 
     Args:
         references: B frames: a list of `Frame` or of (grey, depth), or a pair of arrays of [B, H, W] from a camera

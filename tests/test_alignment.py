@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gavo_jax import alignment as alignment_module
 from gavo_jax.alignment import (
     Alignment,
     AlignmentOptions,
@@ -213,6 +214,29 @@ def test_a_batch_of_arrays_is_a_batch_of_frames(
     again = align_batch(stacked((0, 8)), stacked((1, 9)), sequence.camera, keys=keys)
     for a, b in zip(batch, again, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_an_accelerator_aligns_a_batch_in_chunks(
+    sequence: SyntheticSequence, frames: dict[int, Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    references, targets = ([frames[i] for i in side] for side in ((0, 8, 1), (1, 9, 0)))
+    expected = align_batch(references, targets, sequence.camera, QUICK)
+    jax.clear_caches()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(alignment_module, "POINTS_SIDE_BY_SIDE", 2 * 4800 + 1)
+    sizes, plain = [], jax.lax.map
+
+    def noted(function: Callable[..., Any], rows: Any, batch_size: int) -> Any:
+        sizes.append(batch_size)
+        return plain(function, rows, batch_size=batch_size)
+
+    monkeypatch.setattr(jax.lax, "map", noted)
+    found = align_batch(references, targets, sequence.camera, QUICK)
+    jax.clear_caches()
+    assert sizes == [2]
+    assert found.xi.shape == (3, 6)
+    np.testing.assert_allclose(found.target_T_reference, expected.target_T_reference, atol=1e-5)
+    np.testing.assert_array_equal(found.status, expected.status)
 
 
 def test_arrays_of_metres_are_frames_of_raw_depth(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
