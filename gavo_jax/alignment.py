@@ -33,6 +33,7 @@ from gavo_jax.objective import (
     geman_mcclure,
     grids_of,
     make_references,
+    most_points,
     preconditioner,
     reference_curvature,
     unconditioner,
@@ -727,7 +728,7 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
         return _align_images(reference, target, camera, solver, options, key, guess)
 
     if jax.default_backend() != "cpu":
-        most = max(rows * columns for rows, columns in grids_of(camera, solver.levels, options.points))
+        most = most_points(camera, solver.levels, options.points)
         return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=max(1, POINTS_SIDE_BY_SIDE // most))
     empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
     return jax.lax.fori_loop(

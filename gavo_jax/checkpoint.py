@@ -9,10 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry import Progress, TrackerState
-from gavo_jax.trajectory import write_bytes
 
 NUMBERS, POSES = "numbers", ("world_T_reference", "world_T_camera")
 

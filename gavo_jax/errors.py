@@ -1,5 +1,6 @@
-"""Bad input as one kind of exception, and the text files that users hand in."""
+"""Bad input as one kind of exception, the text files that users hand in, and files that are written whole."""
 
+import os
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 MAX_TEXT_BYTES = 128 * 2**20
 MAX_SHOWN = 100
 """Characters of a value that a message shows."""
+PARTIAL = ".partial"
+"""Suffix of a file that is being written."""
 
 
 class GavoError(ValueError):
@@ -60,3 +63,19 @@ def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[s
         if fields and not fields[0].startswith("#"):
             rows.append((f"{path}:{number}", fields))
     return rows
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file whole or not at all: beside it first, then renamed into place.
+
+    Raises:
+        GavoError: the file cannot be written.
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None

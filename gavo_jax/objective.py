@@ -146,6 +146,11 @@ def grids_of(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) ->
     return [(h // cell, w // cell) for (h, w), cell in zip(level_sizes(camera, levels), cells, strict=True)]
 
 
+def most_points(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> int:
+    """Points of the level that has the most, N of `make_references`."""
+    return max(rows * columns for rows, columns in grids_of(camera, levels, points))
+
+
 def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> Reference:
     """Points of some levels, [L, N]: one a square block of pixels, that of the steepest grey with a reading.
 

@@ -34,7 +34,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
-from gavo_jax.objective import Reference, grids_of, move_reference, settle_reference
+from gavo_jax.objective import Reference, most_points, move_reference, settle_reference
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
@@ -277,8 +277,7 @@ class Odometry:
     def blank_state(self) -> TrackerState:
         """The state before the first frame: nothing, in the shapes and types of every state of this driver."""
         levels = self.solver.levels
-        grids = grids_of(self.camera, levels, self.alignment.points)
-        row: Any = np.zeros((len(levels), max(rows * columns for rows, columns in grids)), np.float32)
+        row: Any = np.zeros((len(levels), most_points(self.camera, levels, self.alignment.points)), np.float32)
         layout = atlas_layout(level_sizes(self.camera, levels))
         words: Any = np.zeros((layout.height, layout.width), np.uint32)
         reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)

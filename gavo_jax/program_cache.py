@@ -10,7 +10,6 @@ this has changed, the program is traced anew.
 import dataclasses
 import hashlib
 import inspect
-import os
 import platform
 import sys
 import threading
@@ -25,6 +24,8 @@ import jax
 import numpy as np
 from jax import export
 from jax.core import Tracer
+
+from gavo_jax.errors import GavoError, write_bytes
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -166,8 +167,8 @@ def identify(value: Any) -> Any:
 def _known(code: Any) -> str:
     """Full name of a class or function that a module of this package, or of those it is traced with, has by it."""
     module = sys.modules.get(code.__module__)
-    is_ours = code.__module__.partition(".")[0] in (OURS, *TRACED_WITH)
-    if not is_ours or getattr(module, code.__name__, None) is not code:
+    may_be_known = code.__module__.partition(".")[0] in (OURS, *TRACED_WITH)
+    if not may_be_known or getattr(module, code.__name__, None) is not code:
         raise Foreign
     return f"{code.__module__}.{code.__name__}"
 
@@ -198,11 +199,6 @@ def _read(path: Path) -> bytes | None:
 
 def _write(path: Path, data: bytes) -> None:
     """Write a file, whole, if that can be done: whether it is there decides about time alone."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}")
-    try:
+    with suppress(OSError, GavoError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(_seal(data) + data)
-        os.replace(partial, path)
-    except OSError:
-        with suppress(OSError):
-            partial.unlink()
+        write_bytes(path, _seal(data) + data)

@@ -2,7 +2,6 @@
 
 import heapq
 import math
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.errors import GavoError, data_rows, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -18,9 +17,6 @@ MAX_GAP = 0.1
 MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
-
-PARTIAL = ".partial"
-"""Suffix of a file that is being written."""
 
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
@@ -273,19 +269,3 @@ def write_lines(path: str | Path, lines: Iterable[str]) -> None:
         GavoError: the file cannot be written.
     """
     write_bytes(path, ("\n".join(lines) + "\n").encode("utf-8"))
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file whole or not at all: beside it first, then renamed into place.
-
-    Raises:
-        GavoError: the file cannot be written.
-    """
-    path = Path(path)
-    partial = path.with_name(path.name + PARTIAL)
-    try:
-        partial.write_bytes(data)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
