@@ -1,5 +1,9 @@
 """Dense RGB-D visual odometry by genetic algorithm, in JAX."""
 
+from gavo_jax.compiler import prepare_process
+
+prepare_process()  # before anything imports JAX
+
 from gavo_jax.alignment import Alignment as Alignment
 from gavo_jax.alignment import AlignmentOptions as AlignmentOptions
 from gavo_jax.alignment import AlignmentStatus as AlignmentStatus
@@ -7,6 +11,7 @@ from gavo_jax.alignment import align as align
 from gavo_jax.alignment import align_batch as align_batch
 from gavo_jax.camera import Camera as Camera
 from gavo_jax.camera import load_camera as load_camera
+from gavo_jax.compiler import CompilerWarning as CompilerWarning
 from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 
+from gavo_jax.compiler import processor_digest
 from gavo_jax.program_cache import keep_programs_in
 
 
@@ -21,7 +22,8 @@ def cache_folder() -> Path | None:
 
 def enable_compilation_cache() -> None:
     """Keep traced programs in `cache_folder()`, and have JAX keep compiled ones there, unless
-    `JAX_COMPILATION_CACHE_DIR` says where.
+    `JAX_COMPILATION_CACHE_DIR` says where. Each kind of processor has a folder of its own: JAX would load what another
+    one compiled, and could run into instructions that this one lacks.
 
     An entry that cannot be read or written (torn by a kill, a full disk) costs a compilation and no word.
     """
@@ -30,5 +32,5 @@ def enable_compilation_cache() -> None:
     keep_programs_in(folder and folder / "traced")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR") or folder is None:
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+    jax.config.update("jax_compilation_cache_dir", str(folder / "jax" / processor_digest()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
