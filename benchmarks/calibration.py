@@ -25,8 +25,8 @@ from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.se3 import log
 from gavo_jax.trajectory import inverse
-from gavo_jax.warp import log
 
 ELLIPSOID = float(chi2.ppf(0.95, 6))
 NOISE = {

@@ -2,7 +2,6 @@
 
 import json
 import os
-import platform
 import sys
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.screen import number
 from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.comparison import PeerOdometry
+from gavo_jax.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -258,17 +258,8 @@ def machine() -> dict[str, Any]:
     """Date, processor, cores, device and versions."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "device": jax.devices()[0].device_kind,
         "versions": environment(),
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor()

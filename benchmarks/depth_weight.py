@@ -33,7 +33,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.objective import Objective, Problem
 from gavo_jax.odometry import Odometry, Step, TrackerState, track
 from gavo_jax.presets import get_preset
-from gavo_jax.warp import exp
+from gavo_jax.se3 import exp
 
 STEPS = 5
 """Of Gauss-Newton from the common optimum to a channel's own."""

@@ -37,7 +37,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import Objective, Residuals, _lane_sum, l2
 from gavo_jax.pyramid import Pyramid, build_pyramid
-from gavo_jax.warp import exp
+from gavo_jax.se3 import exp
 
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
 NO_BARRIER, TWO_MARKS = "score, no barrier", "score, two marks"

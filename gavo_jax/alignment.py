@@ -40,9 +40,10 @@ from gavo_jax.objective import (
 )
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
+from gavo_jax.se3 import departure_from_rigid, exp, log, rigid, rigid_inverse
 from gavo_jax.solvers.base import Bounds, Candidates, solve, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import ImagePlane, Target, exp, image_planes, log, pack_target, rigid_inverse
+from gavo_jax.warp import ImagePlane, Target, image_planes, pack_target
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -64,6 +65,7 @@ class AlignmentStatus(enum.IntEnum):
     BAD_TIMESTAMP = 13
     GAP = 14
     NO_REFERENCE = 15
+    NOT_RIGID = 16
 
     @property
     def sentence(self) -> str:
@@ -88,6 +90,7 @@ _SENTENCES = {
     AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
     AlignmentStatus.GAP: "Frames are missing before this one.",
     AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
+    AlignmentStatus.NOT_RIGID: "The result is no rigid motion: this machine computes wrong numbers (see gavo doctor).",
 }
 
 
@@ -161,8 +164,9 @@ class Alignment(NamedTuple):
     A batch holds the same fields with a leading axis, and `status` as an integer array.
     """
 
-    target_T_reference: Float[Array, "4 4"]
-    """Maps points of the reference camera into the target camera, metres."""
+    target_T_reference: Float[Array | np.ndarray, "4 4"]
+    """Maps points of the reference camera into the target camera, metres. Once it is on the host it is of float64 and
+    its rotation orthonormal."""
     xi: Float[Array, " 6"]
     """Its logarithm (v, w): metres, radians."""
     error: Float[Array, ""]
@@ -218,6 +222,8 @@ MAX_RIVAL = 1.1
 """Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
 
 
+MAX_DEPARTURE = 1e-4
+"""Largest entry of RᵀR − I; rounding alone leaves a hundredth of it. Beyond, a pair is `NOT_RIGID`."""
 SHARED_ERRORS = 9.0
 """Factor on the covariance for errors that the whole image shares (interpolation, the choice of points, the pyramid's
 rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
@@ -644,7 +650,10 @@ def _conclude(
     model, scatter = problem.examine(residuals)
     ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
     inverse = jnp.linalg.inv(model.hessian + ridge)
-    covariance = SHARED_ERRORS * inverse @ scatter @ inverse.T
+    # the scatter tells nothing of a direction in which the images happen to agree, or say nothing: what independent
+    # residuals would leave of it stays
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(jnp.sum(residuals.inside), 1.0) * inverse
+    covariance = SHARED_ERRORS * inverse @ scatter @ inverse.T + least
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
@@ -675,6 +684,7 @@ def _conclude(
         motion, error, overlap = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (stepped, its_error, its_overlap), (motion, error, overlap)
         )
+    status = jnp.where(departure_from_rigid(motion) > MAX_DEPARTURE, jnp.int32(AlignmentStatus.NOT_RIGID), status)
     return Alignment(motion, log(motion), error, overlap, covariance, status, history)
 
 
@@ -736,10 +746,10 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     )
 
 
-def _align_rows(sides, camera, solver, options, keys, guesses):
-    """`_align_pairs` of B pairs; a single one is padded to two rows, of which one is computed."""
+def align_rows(sides, camera, solver, options, keys, guesses) -> Alignment:
+    """`align_batch` of images that are stacked already, its results on the device."""
     count = len(guesses)
-    if count == 1:
+    if count == 1:  # padded to two rows, of which one is computed
         sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
     result = _align_pairs(
         jnp.int32(count),
@@ -783,7 +793,7 @@ def align(
     sides = [_stacked_images([frame], camera) for frame in (reference, target)]
     keys = (jax.random.key(0) if key is None else key)[None]
     guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
-    result = _align_rows(sides, camera, solver, options, keys, guesses)
+    result = align_rows(sides, camera, solver, options, keys, guesses)
     return on_host(jax.tree.map(lambda leaf: leaf[0], result))
 
 
@@ -809,7 +819,7 @@ def align_batch(
         options: As in `align`.
 
     Returns:
-        An `Alignment` whose fields have a leading axis B; `status` is an integer array.
+        An `Alignment` of NumPy arrays with a leading axis B; `status` is an integer array.
 
     Raises:
         GavoError: The images are not of the camera's size, or the two sides differ in number.
@@ -820,13 +830,16 @@ def align_batch(
         raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
-    return _align_rows(sides, camera, solver, options, keys, guesses)
+    return on_host(align_rows(sides, camera, solver, options, keys, guesses))
 
 
 def on_host(alignment: Alignment) -> Alignment:
-    """The same result as NumPy arrays, with `status` as an `AlignmentStatus`."""
+    """The same result, or batch of results, as NumPy arrays: motions rigid in double precision, and the status of a
+    single result an `AlignmentStatus`.
+    """
     host = jax.device_get(alignment)
-    return host._replace(status=AlignmentStatus(int(host.status)))
+    status = host.status if np.ndim(host.status) else AlignmentStatus(int(host.status))
+    return host._replace(target_T_reference=rigid(host.target_T_reference), status=status)
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:

@@ -13,7 +13,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.plots import Landscape
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, build_pyramid
-from gavo_jax.warp import exp
+from gavo_jax.se3 import exp
 
 REACH, STEPS = 0.1, 81
 """Metres or radians to either side, and the number of motions scored along a direction."""

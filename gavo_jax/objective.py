@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.camera import Camera
 from gavo_jax.pyramid import NO_PIXEL, Pyramid, atlas_layout, make_atlas
+from gavo_jax.se3 import adjoint, exp, log, right_jacobian, rigid_inverse
 from gavo_jax.warp import (
     DepthSample,
     GreySample,
@@ -28,17 +29,12 @@ from gavo_jax.warp import (
     Slopes,
     Target,
     Warped,
-    adjoint,
     delay,
     delayed_slopes,
-    exp,
     image_planes,
     inverse_depth_slopes,
     level_sizes,
-    log,
     look_up,
-    right_jacobian,
-    rigid_inverse,
     row_time,
     sample_depth,
     sample_grey,

@@ -38,8 +38,9 @@ from gavo_jax.objective import Reference, most_points, move_reference, settle_re
 from gavo_jax.presets import OdometryOptions, Preset, get_preset
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
+from gavo_jax.se3 import exp, rigid
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.warp import Points, Target, exp, level_sizes, synchronise_depth, warp
+from gavo_jax.warp import Points, Target, level_sizes, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -197,7 +198,7 @@ class Step:
 def no_alignment(status: AlignmentStatus) -> Alignment:
     """The result of a pair that could not be aligned at all: no motion, nothing known."""
     nothing: dict[str, Any] = {
-        "target_T_reference": np.eye(4, dtype=np.float32),
+        "target_T_reference": np.eye(4),
         "xi": np.zeros(6, np.float32),
         "error": np.float32(np.nan),
         "overlap": np.float32(0.0),
@@ -361,7 +362,7 @@ class Odometry:
             return self._lose(before, fit, frame.timestamp), result, True
         if result.status == AlignmentStatus.OK:
             result = result._replace(status=finding.status)
-        world_T_camera = before.world_T_reference @ inverse(_rigid(result.target_T_reference))
+        world_T_camera = before.world_T_reference @ inverse(result.target_T_reference)
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
         if finding.use is Use.ALL or overdue:
@@ -382,7 +383,7 @@ class Odometry:
         if self.options.on_lost == "predict" and timestamp > before.reference_timestamp:
             assert before.tracker is not None
             elapsed = (timestamp - before.reference_timestamp) / float(before.tracker.seconds)
-            motion = _rigid(np.asarray(exp(before.tracker.motion * elapsed)))
+            motion = rigid(exp(before.tracker.motion * elapsed))
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
 
@@ -460,18 +461,9 @@ AGREEMENT = (0.02, 0.02)
 
 
 def _agree(first: Alignment, second: Alignment) -> bool:
-    between = inverse(_rigid(first.target_T_reference)) @ _rigid(second.target_T_reference)
+    between = inverse(first.target_T_reference) @ second.target_T_reference
     angle = np.arccos(np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
     return bool(np.linalg.norm(between[:3, 3]) < AGREEMENT[0] and angle < AGREEMENT[1])
-
-
-def _rigid(transform: Float[Array | np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """A float32 motion in double precision with its rotation made orthonormal, so that chains stay rigid."""
-    result = np.eye(4)
-    u, _, v = np.linalg.svd(np.asarray(transform[:3, :3], np.float64))
-    result[:3, :3] = u @ v
-    result[:3, 3] = transform[:3, 3]
-    return result
 
 
 def _unwatched(frame: Frame | None, step: Step | None) -> None:

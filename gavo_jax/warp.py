@@ -1,4 +1,4 @@
-"""The warp ω(ξ, p) = P(g(ξ) P⁻¹(p)) and the sampling of the target image, equations (3) to (8).
+"""The warp ω(ξ, p) = P(g(ξ) P⁻¹(p)) and the sampling of the target image, equations (4) to (8).
 
 The reference's points are kept as separate flat arrays of ray coordinates and inverse depth, and the target's 2x2
 neighbourhoods are packed into one 32-bit word a pixel, so that a residual costs one gather: on a CPU this is what
@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Integer, UInt32
 
 from gavo_jax.camera import Camera
 from gavo_jax.pyramid import Atlas, atlas_layout
+from gavo_jax.se3 import rigid_inverse
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
 """1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a hundredth of the sensor's noise."""
@@ -22,72 +22,6 @@ SAME_SURFACE = 0.1
 """Neighbouring readings of inverse depth that differ by less than this share are of one surface."""
 SLOPE_STEP = 1.0 / 4096.0
 """1/m a pixel and unit of the packed inverse-depth slopes (signed 8 bits)."""
-
-
-def exp(xi: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
-    """g(ξ) = exp(ξ̂) of a twist ξ = (v, w), translation (m) first, rotation in radians. Equation (3).
-
-    With θ = |w| the series ends: I + ξ̂ + (1 − cos θ)/θ² ξ̂² + (θ − sin θ)/θ³ ξ̂³ (Murray, Li and Sastry 1994). A frame's
-    program needs it in many places, so it is written in few operations: each is a kernel to compile.
-    """
-    hat = jnp.sum(GENERATORS * xi[..., None, None, :], axis=-1)
-    angle = jnp.sqrt(jnp.maximum(jnp.sum(xi[..., 3:] ** 2, axis=-1), SMALL_ANGLE**2))[..., None, None]
-    second = 2.0 * (jnp.sin(0.5 * angle) / angle) ** 2
-    third = (angle - jnp.sin(angle)) / angle**3
-    return jnp.eye(4) + hat + _product(second * jnp.eye(4) + third * hat, _product(hat, hat))
-
-
-def _product(a: Float[Array, "*batch i j"], b: Float[Array, "*batch j k"]) -> Float[Array, "*batch i k"]:
-    """Product of small matrices; a fused sum is quicker than a batch of matrix products."""
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
-
-
-SMALL_ANGLE = 0.01
-"""Radians: below, the coefficients of `exp` are as good as constant."""
-
-
-def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
-    """ξ of a rigid motion, the inverse of `exp`."""
-    return jaxlie.SE3.from_matrix(transform).log()
-
-
-def rigid_inverse(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
-    """The inverse of a rigid motion, [Rᵀ, −Rᵀt]."""
-    turned = jnp.swapaxes(transform[..., :3, :3], -1, -2)
-    moved = -jnp.einsum("...ij,...j->...i", turned, transform[..., :3, 3])
-    top = jnp.concatenate([turned, moved[..., None]], axis=-1)
-    return jnp.concatenate([top, transform[..., 3:, :]], axis=-2)
-
-
-def _generators() -> np.ndarray:
-    basis = np.zeros((4, 4, 6), np.float32)
-    for i in range(3):
-        basis[i, 3, i] = 1.0
-        j, k = (i + 1) % 3, (i + 2) % 3
-        basis[k, j, 3 + i], basis[j, k, 3 + i] = 1.0, -1.0
-    return basis
-
-
-GENERATORS = _generators()
-"""[4, 4, 6]: ξ̂ = GENERATORS · ξ, and the derivative of `exp` at 0."""
-
-
-def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
-    """J with exp(ξ + δ) ≈ exp(ξ) exp(J δ), to second order in ξ: I − ad/2 + ad²/6."""
-    v, w = _cross(xi[:3]), _cross(xi[3:])
-    ad = jnp.block([[w, v], [jnp.zeros((3, 3)), w]])
-    return jnp.eye(6) - 0.5 * ad + ad @ ad / 6.0
-
-
-def adjoint(transform: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
-    """A with transform · exp(δ) = exp(A δ) · transform."""
-    rotation, translation = transform[:3, :3], transform[:3, 3]
-    return jnp.block([[rotation, _cross(translation) @ rotation], [jnp.zeros((3, 3)), rotation]])
-
-
-def _cross(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Matrix of the cross product with a vector."""
-    return jnp.asarray(GENERATORS[:3, :3, 3:]) @ a
 
 
 class Points(NamedTuple):

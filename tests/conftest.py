@@ -6,9 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-# programs of the tests are kept between runs; JAX reads this when it is imported, so it comes first
-os.environ.setdefault("GAVO_CACHE_DIR", str(Path.home() / ".cache" / "gavo-jax" / "test"))
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "gavo-jax" / "test-jax"))
+# JAX reads this when it is imported, so it comes first
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 # XLA's older way to write out a program takes little more than half the time, and the program runs a quarter slower:
@@ -23,7 +21,14 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from gavo_jax.compiler import processor_digest  # noqa: E402
 from gavo_jax.program_cache import keep_programs_in  # noqa: E402
+
+# programs of the tests, and of the commands that they start, are kept between runs
+KEPT = Path.home() / ".cache" / "gavo-jax"
+os.environ.setdefault("GAVO_CACHE_DIR", str(KEPT / "test"))
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "test-jax" / processor_digest()))
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 
 settings.register_profile("gavo", deadline=None, derandomize=True)
 settings.load_profile("gavo")

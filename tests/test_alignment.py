@@ -28,9 +28,9 @@ from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
 from gavo_jax.presets import METHODS, PRESETS, get_preset
 from gavo_jax.pyramid import LEVELS, build_pyramid
+from gavo_jax.se3 import exp
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import exp
 
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
 Images = tuple[np.ndarray, np.ndarray]

@@ -38,10 +38,11 @@ from gavo_jax.objective import (
     unconditioner,
 )
 from gavo_jax.pyramid import NO_PIXEL, PyramidLevel, make_atlas
+from gavo_jax.se3 import exp
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.particle_swarm import ParticleSwarm
-from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, exp, image_plane, pack_target
+from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, image_plane, pack_target
 
 SMALL = Camera(24.0, 23.0, 11.3, 8.8, 24, 18)
 CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)

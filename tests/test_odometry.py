@@ -33,9 +33,9 @@ from gavo_jax.odometry import (
 )
 from gavo_jax.presets import OdometryOptions
 from gavo_jax.pyramid import build_pyramid
+from gavo_jax.se3 import exp
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.trajectory import Trajectory
-from gavo_jax.warp import exp
 
 CAMERA = DEFAULT_CAMERA.level(1)
 FRAMES = 12

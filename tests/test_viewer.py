@@ -18,8 +18,8 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry import Odometry, track
 from gavo_jax.presets import OdometryOptions
+from gavo_jax.se3 import exp
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.warp import exp
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SOLVER = GeneticAlgorithm(population=(0, 0, 0, 8, 12), iterations=(0, 0, 0, 2, 3))

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as npst
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.pyramid import PyramidLevel, build_pyramid, make_atlas
+from gavo_jax.se3 import GENERATORS, adjoint, exp, log, right_jacobian
 from gavo_jax.warp import (
-    GENERATORS,
     INVERSE_DEPTH_STEP,
     SLOPE_STEP,
     DepthSample,
@@ -24,18 +24,14 @@ from gavo_jax.warp import (
     Target,
     Warped,
     Words,
-    adjoint,
     delay,
     delayed_slopes,
-    exp,
     image_plane,
     image_planes,
     inverse_depth_slopes,
-    log,
     look_up,
     pack_grey,
     pack_target,
-    right_jacobian,
     row_time,
     sample_depth,
     sample_grey,

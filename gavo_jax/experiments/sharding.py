@@ -9,7 +9,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, _stacked_images, align_batch
+from gavo_jax.alignment import Alignment, AlignmentOptions, Images, _stacked_images, align_rows, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
 
@@ -55,13 +55,13 @@ def align_batch_sharded(
     mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:
-        keys = jax.random.wrap_key_data(keys)
-        return align_batch(references, targets, camera.rectified(), solver, keys, guesses, options)
+        own = (Images(*references), Images(*targets))
+        return align_rows(own, camera, solver, options, jax.random.wrap_key_data(keys), guesses)
 
     align_all = jax.jit(jax.shard_map(align_own, mesh=mesh, in_specs=PAIRS, out_specs=PAIRS, check_vma=False))
     rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), guesses)
     found = align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows))
-    return jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found)
+    return on_host(jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found))
 
 
 def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:

@@ -1,0 +1,97 @@
+"""Which JAX is allowed, and that no program of another processor is loaded."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import pytest
+from jax._src import compilation_cache
+
+from gavo_jax import compiler
+from gavo_jax.compiler import processor_digest, unfit_compiler
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Have a package look installed in another version."""
+
+    def pretend(package: str, other: str) -> None:
+        monkeypatch.setattr(compiler, "version", lambda name: other if name == package else version(name))
+
+    return pretend
+
+
+@pytest.mark.parametrize("package", ["jax", "jaxlib"])
+@pytest.mark.parametrize("other", ["0.7.0", "0.8.1", "0.10.2", "0.11.0"])
+def test_a_version_that_computes_wrong_numbers_is_told(installed, package, other):
+    installed(package, other)
+    told = unfit_compiler.__wrapped__()
+    assert told is not None and "\n" not in told
+    assert told.startswith(f"{package} {other} ") and "!=0.10.2" in told
+
+
+@pytest.mark.parametrize("other", ["0.8.2", "0.10.1", "0.11.1", "0.12.0.1", "0.13.0.dev20270101"])
+def test_other_versions_are_allowed(installed, other):
+    installed("jaxlib", other)
+    assert unfit_compiler.__wrapped__() is None
+
+
+def test_this_one_is_allowed():
+    assert unfit_compiler() is None
+
+
+def test_two_processors_have_two_names(monkeypatch):
+    own = processor_digest()
+    assert own == processor_digest.__wrapped__()
+    monkeypatch.setattr(compiler, "_cpuinfo", lambda: {"model name": "Another", "flags": "fpu sse2"})
+    assert processor_digest.__wrapped__() != own
+
+
+PROGRAM = """
+import jax, jax.numpy as jnp
+from gavo_jax.cli.compilation_cache import enable_compilation_cache
+enable_compilation_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+hits = []
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
+print(float(jax.jit(lambda x: jnp.sin(x).sum())(jnp.ones(100))), sum(hits) > 0)
+"""
+
+
+def compile_in_another_process(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Compile something with the command's cache in a folder; prints the result and whether it was loaded."""
+    left_out = ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL")
+    own = {name: value for name, value in os.environ.items() if name not in left_out}
+    command = [sys.executable, "-c", "import gavo_jax\n" + PROGRAM]
+    return subprocess.run(command, capture_output=True, text=True, check=True, env={**own, "GAVO_CACHE_DIR": str(folder)})
+
+
+def test_programs_are_kept_by_processor_and_their_loading_is_silent(tmp_path):
+    first = compile_in_another_process(tmp_path)
+    kept = tmp_path / "jax" / processor_digest()
+    entries = list(kept.glob("*-cache"))
+    assert first.stdout.endswith("False\n") and entries
+    # XLA takes settings of its own for instructions that the machine lacks, and says so whenever it loads a program
+    marked = 0
+    for entry in entries:
+        content = compilation_cache.decompress_executable(entry.read_bytes())
+        if jax.default_backend() == "cpu" and b"+cmov" in content:
+            entry.write_bytes(compilation_cache.compress_executable(content.replace(b"+cmov", b"+cmox")))
+            marked += 1
+    second = compile_in_another_process(tmp_path)
+    assert second.stdout.endswith("True\n") and second.stdout.split()[0] == first.stdout.split()[0]
+    assert "cpu_aot_loader" not in second.stderr and "SIGILL" not in second.stderr
+    if marked:  # the lines are there for who asks for them
+        told = subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "GAVO_CACHE_DIR": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": "0"},
+        )
+        assert "cpu_aot_loader" in told.stderr or told.stdout.endswith("False\n")
+    kept.rename(tmp_path / "jax" / "0123456789abcdef")
+    assert compile_in_another_process(tmp_path).stdout.endswith("False\n")
