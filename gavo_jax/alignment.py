@@ -20,6 +20,8 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import (
     Brightness,
+    ExplainedShare,
+    Linearization,
     Loss,
     Objective,
     PointsPerLevel,
@@ -628,6 +630,19 @@ CLEARED = 1e9
 """Added to the error of a motion whose mode is taken; above any error."""
 
 
+class Evidence(NamedTuple):
+    """What the images say of one motion at the finest level."""
+
+    motion: Float[Array, "4 4"]
+    model: Linearization
+    """E and its derivatives by a step on the reference's side."""
+    scatter: Float[Array, "6 6"]
+    """Covariance of E's gradient."""
+    inside: Float[Array, ""]
+    """Number of points in view."""
+    explained: ExplainedShare
+
+
 def _conclude(
     objective: Objective,
     search: Search,
@@ -636,56 +651,76 @@ def _conclude(
     history: jax.Array,
     centre: Float[Array, "4 4"],
 ) -> Alignment:
-    """Error, covariance and status at the motion that the search, held about a centre, ended with.
-
-    The scales are estimated there once more, so that errors of different solvers can be compared.
-    """
-    target_T_reference = search.islands[0]
-    residuals = objective.residuals(target_T_reference)
-    scales = estimate_scales(residuals, finest.depth_weight)
+    """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
+    found = search.islands[0]
     if options.robust_scale:
-        objective = replace(objective, scales=scales)
+        # once more, at the motion found, so that errors of different solvers can be compared
+        objective = replace(objective, scales=estimate_scales(objective.residuals(found), finest.depth_weight))
     reach = jnp.stack([search.box[0], search.box[3]])
-    problem = Problem(objective, target_T_reference, jnp.eye(6), centre, reach)
-    model, scatter = problem.examine(residuals)
-    ridge = 1e-6 * jnp.diag(jnp.diag(model.hessian)) + 1e-9 * jnp.eye(6)
-    inverse = jnp.linalg.inv(model.hessian + ridge)
+    problem = Problem(objective, found, jnp.eye(6), centre, reach)
+    evidence = _refine(problem, takes_step=options.last_step and not options.symmetric)
+    covariance, status = _judge(evidence, objective, search.rival)
+    motion, model = evidence.motion, evidence.model
+    return Alignment(motion, log(motion), model.error, model.overlap, covariance, status, history)
+
+
+def _refine(problem: Problem, takes_step: bool) -> Evidence:
+    """Evidence at the problem's origin or, with `takes_step`, one Newton step from there, if that is no worse."""
+
+    def look(motion: Float[Array, "4 4"]) -> Evidence:
+        here = replace(problem, origin=motion)
+        residuals = problem.objective.residuals(motion)
+        return Evidence(motion, *here.examine(residuals), jnp.sum(residuals.inside), explained_share(residuals))
+
+    def advance(steps: Integer[Array, ""], best: Evidence) -> Evidence:
+        step = -jnp.linalg.solve(_regular(best.model.hessian), best.model.gradient)
+        new = look(best.motion @ exp(step))
+        better = (new.model.error < best.model.error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
+        better &= ~problem.is_out_of_reach(new.motion)
+        return jax.tree.map(lambda a, b: jnp.where((steps == 0) | better, a, b), new, best)
+
+    # the first turn goes nowhere, as nothing is known yet; a loop, so that what it does is compiled once
+    shapes = jax.eval_shape(look, problem.origin)
+    unknown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)._replace(motion=problem.origin)
+    return jax.lax.fori_loop(0, 1 + int(takes_step), advance, unknown)
+
+
+def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """A Hessian that can be inverted, hardly changed."""
+    return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
+
+
+def _judge(
+    evidence: Evidence, objective: Objective, rival: Float[Array, ""]
+) -> tuple[Float[Array, "6 6"], Integer[Array, ""]]:
+    """Covariance and status of a motion."""
+    motion, model = evidence.motion, evidence.model
+    inverse = jnp.linalg.inv(_regular(model.hessian))
     # the scatter tells nothing of a direction in which the images happen to agree, or say nothing: what independent
     # residuals would leave of it stays
-    least = 2.0 * objective.scales.grey**2 / jnp.maximum(jnp.sum(residuals.inside), 1.0) * inverse
-    covariance = SHARED_ERRORS * inverse @ scatter @ inverse.T + least
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
+    covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
-    depth_share = jnp.mean(has_reading)
-    finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(problem.origin)) & jnp.all(jnp.isfinite(covariance))
+    finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
-    explained = explained_share(residuals)
+    explained = evidence.explained
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     status = jnp.int32(AlignmentStatus.OK)
     for found, value in (
-        (search.rival < MAX_RIVAL, AlignmentStatus.AMBIGUOUS),
+        (rival < MAX_RIVAL, AlignmentStatus.AMBIGUOUS),
         (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
         (unexplained, AlignmentStatus.HIGH_ERROR),
         (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),
         (~finite, AlignmentStatus.NOT_FINITE),
-        (depth_share < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
+        (jnp.mean(has_reading) < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
+        (departure_from_rigid(motion) > MAX_DEPARTURE, AlignmentStatus.NOT_RIGID),
     ):
         status = jnp.where(found, jnp.int32(value), status)
-    motion, error, overlap = problem.origin, model.error, model.overlap
-    if options.last_step and not options.symmetric:
-        step = -inverse @ model.gradient
-        stepped = motion @ exp(step)
-        its_error, its_overlap = objective.error(stepped)
-        better = (its_error < error * (1.0 + LARGEST_RISE)) & ~problem.is_out_of_reach(stepped)
-        better &= jnp.all(jnp.abs(step) < LARGEST_STEP)
-        motion, error, overlap = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (stepped, its_error, its_overlap), (motion, error, overlap)
-        )
-    status = jnp.where(departure_from_rigid(motion) > MAX_DEPARTURE, jnp.int32(AlignmentStatus.NOT_RIGID), status)
-    return Alignment(motion, log(motion), error, overlap, covariance, status, history)
+    return covariance, status
 
 
 LARGEST_STEP = 0.01

@@ -362,7 +362,7 @@ class Odometry:
             return self._lose(before, fit, frame.timestamp), result, True
         if result.status == AlignmentStatus.OK:
             result = result._replace(status=finding.status)
-        world_T_camera = before.world_T_reference @ inverse(result.target_T_reference)
+        world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
         if finding.use is Use.ALL or overdue:
@@ -461,7 +461,7 @@ AGREEMENT = (0.02, 0.02)
 
 
 def _agree(first: Alignment, second: Alignment) -> bool:
-    between = inverse(first.target_T_reference) @ second.target_T_reference
+    between = inverse(np.asarray(first.target_T_reference)) @ second.target_T_reference
     angle = np.arccos(np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
     return bool(np.linalg.norm(between[:3, 3]) < AGREEMENT[0] and angle < AGREEMENT[1])
 

@@ -77,13 +77,13 @@ def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
     one (Kabsch 1976), so that chains of motions stay rigid. What is not finite stays as it is.
     """
     result = np.array(transform, np.float64)
-    finite = np.isfinite(result).all(axis=(-2, -1))
-    u, _, v = np.linalg.svd(np.where(finite[..., None, None], result, np.eye(4))[..., :3, :3])
-    result[..., :3, :3] = np.where(finite[..., None, None], u @ v, result[..., :3, :3])
+    finite = np.isfinite(result).all(axis=(-2, -1), keepdims=True)
+    u, _, v = np.linalg.svd(np.where(finite, result, np.eye(4))[..., :3, :3])
+    result[..., :3, :3] = np.where(finite, u @ v, result[..., :3, :3])
     return result
 
 
-def departure_from_rigid(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch"]:
+def departure_from_rigid(transform: Float[Array, "*batch 4 4"]) -> Float[Array, " *batch"]:
     """Largest entry of RᵀR − I: rounding leaves some 1e-6."""
     rotation = transform[..., :3, :3]
     return jnp.max(jnp.abs(_product(jnp.swapaxes(rotation, -1, -2), rotation) - jnp.eye(3)), axis=(-2, -1))

@@ -138,7 +138,8 @@ def test_the_result_tells_all(sequence: SyntheticSequence, frames: dict[int, Fra
     result = run("ga", frames[0], frames[1], sequence.camera)
     solver = get_preset("ga").solver
     assert result.target_T_reference.shape == (4, 4) and result.covariance.shape == (6, 6)
-    assert all(np.asarray(field).dtype == np.float32 for field in result if field is not result.status)
+    assert result.target_T_reference.dtype == np.float64
+    assert all(np.asarray(field).dtype == np.float32 for field in result[1:] if field is not result.status)
     np.testing.assert_allclose(exp(result.xi), result.target_T_reference, atol=1e-6)
     np.testing.assert_array_equal(result.target_T_reference[3], [0, 0, 0, 1])
     assert result.error > 0

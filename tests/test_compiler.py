@@ -66,7 +66,9 @@ def compile_in_another_process(folder: Path) -> subprocess.CompletedProcess[str]
     left_out = ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL")
     own = {name: value for name, value in os.environ.items() if name not in left_out}
     command = [sys.executable, "-c", "import gavo_jax\n" + PROGRAM]
-    return subprocess.run(command, capture_output=True, text=True, check=True, env={**own, "GAVO_CACHE_DIR": str(folder)})
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**own, "GAVO_CACHE_DIR": str(folder)}
+    )
 
 
 def test_programs_are_kept_by_processor_and_their_loading_is_silent(tmp_path):
