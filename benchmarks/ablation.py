@@ -19,23 +19,25 @@ from typing import Any
 
 import common
 
+from gavo_jax import presets
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
-from gavo_jax.presets import PAPER_OBJECTIVE, Preset, get_preset
+from gavo_jax.presets import PAPER_OBJECTIVE
+from gavo_jax.settings import Settings
 
 FULL = "full"
 
 
-def _alignment(**changes: Any) -> Callable[[Preset], Preset]:
+def _alignment(**changes: Any) -> Callable[[Settings], Settings]:
     return lambda preset: replace(preset, alignment=replace(preset.alignment, **changes))
 
 
-def _odometry(**changes: Any) -> Callable[[Preset], Preset]:
+def _odometry(**changes: Any) -> Callable[[Settings], Settings]:
     return lambda preset: replace(preset, odometry=replace(preset.odometry, **changes))
 
 
-def _without_preconditioner(preset: Preset) -> Preset:
+def _without_preconditioner(preset: Settings) -> Settings:
     """Plain genes: first population, mutation and bounds as in the paper, which are in metres and radians."""
     return replace(
         preset,
@@ -49,7 +51,7 @@ def _without_preconditioner(preset: Preset) -> Preset:
     )
 
 
-VARIANTS: dict[str, tuple[str, Callable[[Preset], Preset]]] = {
+VARIANTS: dict[str, tuple[str, Callable[[Settings], Settings]]] = {
     "precondition": ("plain genes", _without_preconditioner),
     "surrogate": (
         "no offspring from a quadratic fit",
@@ -82,13 +84,13 @@ def contenders(variants: str, preset_name: str = "default") -> list[common.Conte
     Raises:
         GavoError: an unknown variant.
     """
-    preset = get_preset("ga", preset_name)
-    chosen = [common.preset_contender(FULL, preset)]
+    full = presets.preset("ga", preset_name)
+    chosen = [common.preset_contender(FULL, full)]
     for name in common.names(variants):
         if name not in VARIANTS:
             raise GavoError(f"unknown ingredient {name!r}: not one of {', '.join(VARIANTS)}")
         title, switch_off = VARIANTS[name]
-        chosen.append(common.preset_contender(f"{name}: {title}", switch_off(preset)))
+        chosen.append(common.preset_contender(f"{name}: {title}", switch_off(full)))
     return chosen
 
 

@@ -88,11 +88,11 @@ def make_aligner(name: str, camera: Camera) -> Aligner:
             return Attempt(result.target_T_reference, not result.success)
 
         return by_peer
-    preset = common.preset_of(name)
+    settings = common.preset_of(name)
 
     def by_solver(reference: Frame, target: Frame, seed: int) -> Attempt:
         key = jax.random.key(seed)
-        result = align(reference, target, camera, preset.solver, key, options=preset.alignment)
+        result = align(reference, target, camera, settings, key=key)
         return Attempt(np.asarray(result.target_T_reference, np.float64), result.status != AlignmentStatus.OK)
 
     return by_solver

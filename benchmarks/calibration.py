@@ -46,13 +46,13 @@ def normalised_errors(sequence: Sequence, method: str, seed: int) -> tuple[np.nd
     """
     if sequence.ground_truth is None:
         raise GavoError(f"{sequence.name}: no ground truth to compare with")
-    preset = common.preset_of(method)
+    settings = common.preset_of(method)
     world_T_camera, valid = sequence.ground_truth.interpolate(sequence.timestamps)
     errors, distances, reference = [], [], sequence[0]
     for index in range(1, len(sequence)):
         target = sequence[index]
         key = jax.random.fold_in(jax.random.key(seed), index)
-        found = align(reference, target, sequence.camera, preset.solver, key, options=preset.alignment)
+        found = align(reference, target, sequence.camera, settings, key=key)
         truth = inverse(world_T_camera[index]) @ world_T_camera[index - 1]
         error = np.asarray(log(inverse(np.asarray(found.target_T_reference, np.float64)) @ truth), np.float64)
         if found.status == 0 and valid[index] and valid[index - 1]:

@@ -12,21 +12,21 @@ import jax
 import numpy as np
 import tyro
 
-from gavo_jax import plots
+from gavo_jax import plots, presets
 from gavo_jax.camera import Camera
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.screen import number
 from gavo_jax.cli.tracking import track_visibly
-from gavo_jax.comparison import PeerOdometry
+from gavo_jax.comparison import peer_odometry
 from gavo_jax.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry
+from gavo_jax.odometry.driver import Odometry
 from gavo_jax.peers import PEERS
-from gavo_jax.presets import Preset, get_preset
 from gavo_jax.results import environment, prepare_folder, write_json
+from gavo_jax.settings import Settings
 
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
@@ -95,23 +95,23 @@ class Contender(NamedTuple):
     """Whether the seed can change the result; a peer's cannot."""
 
 
-def preset_contender(name: str, preset: Preset) -> Contender:
+def preset_contender(name: str, settings: Settings) -> Contender:
     """One of our own methods with its settings."""
 
     def make(camera: Camera, seed: int) -> Odometry:
-        return Odometry(camera, preset.solver, preset.alignment, preset.odometry, seed)
+        return Odometry(camera, settings, seed=seed)
 
     return Contender(name, make, True)
 
 
-def preset_of(name: str) -> Preset:
-    """The preset of METHOD or METHOD:PRESET.
+def preset_of(name: str) -> Settings:
+    """The settings of METHOD or METHOD:PRESET.
 
     Raises:
         GavoError: unknown method or preset.
     """
     method, _, preset = name.partition(":")
-    return get_preset(method, preset or "default")
+    return presets.preset(method, preset or "default")
 
 
 def parse_methods(text: str) -> list[Contender]:
@@ -121,7 +121,7 @@ def parse_methods(text: str) -> list[Contender]:
         GavoError: unknown method, preset or peer.
     """
     return [
-        Contender(name, lambda camera, _, name=name: PeerOdometry(name, camera), False)
+        Contender(name, lambda camera, _, name=name: peer_odometry(name, camera), False)
         if name in PEERS
         else preset_contender(name, preset_of(name))
         for name in names(text)

@@ -26,14 +26,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import AlignmentOptions, fit_objective, stack_levels
+from gavo_jax import presets
+from gavo_jax.alignment import fit_objective, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective import Objective, Problem
-from gavo_jax.odometry import Odometry, Step, TrackerState, track
-from gavo_jax.presets import get_preset
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.tracking import TrackerState
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions
 
 STEPS = 5
 """Of Gauss-Newton from the common optimum to a channel's own."""
@@ -98,22 +100,22 @@ def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
 
 def measure(clip: str) -> dict[int, dict[str, float]]:
     """Medians over a clip's pairs, level by level."""
-    sequence, preset = common.open_clip(clip), get_preset("gauss-newton")
-    options = replace(preset.odometry, reference="previous", recover=False)
-    odometry = Odometry(sequence.camera, preset.solver, preset.alignment, options)
+    sequence, settings = common.open_clip(clip), presets.preset("gauss-newton")
+    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False))
+    odometry = Odometry(sequence.camera, settings)
     pairs, states = [], []
 
     def compare(_: Frame | None, step: Step | None) -> None:
         states.append(odometry.progress.tracker)
         if step is not None and not step.lost and None not in (states[-2], states[-1]):
-            levels = own_optima(*states[-2:], odometry.camera, preset.solver, preset.alignment)
+            levels = own_optima(*states[-2:], odometry.camera, settings.solver, settings.alignment)
             pairs.append([weigh(channels) for channels in jax.device_get(levels)])
         del states[:-1]
 
     for _ in track(sequence, odometry=odometry, watch=compare):
         pass
     medians = np.median(np.array(pairs), axis=0)
-    levels = preset.solver.levels
+    levels = settings.solver.levels
     return {level: dict(zip(FIGURES, row.tolist(), strict=True)) for level, row in zip(levels, medians, strict=True)}
 
 

@@ -28,7 +28,8 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.tum import read_frame
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error
-from gavo_jax.odometry import Step, track, trajectory_of
+from gavo_jax.odometry.driver import Step, track
+from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.trajectory import Trajectory
 
 PLACES = 5

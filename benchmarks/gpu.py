@@ -32,7 +32,7 @@ from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.evaluation import rotation_angle
-from gavo_jax.odometry import Odometry
+from gavo_jax.odometry.driver import Odometry
 from gavo_jax.trajectory import inverse
 
 BYTES = 7 * 4
@@ -70,8 +70,7 @@ def main(
     frames, camera = [sequence[i] for i in range(len(sequence))], sequence.camera
     results: dict[str, Any] = {"clip": clip, "batches": {}, "latency": {}, "agreement": {}}
     for name in common.names(methods):
-        preset = common.preset_of(name)
-        batch = partial(align_batch, camera=camera, solver=preset.solver, options=preset.alignment)
+        batch = partial(align_batch, camera=camera, settings=common.preset_of(name))
         results["batches"][name] = time_batches(batch, sequence, common.counts(batches), rounds)
         results["latency"][name] = latency(frames, camera, name, rounds)
         results["agreement"][name] = agreement(frames, camera, name)
@@ -100,10 +99,10 @@ def main(
 
 def latency(frames: list[Frame], camera: Camera, name: str, rounds: int) -> dict[str, float]:
     """Median milliseconds of one pair: by `align`, and by the driver that holds the reference on the device."""
-    preset = common.preset_of(name)
-    one = partial(align, frames[0], frames[1], camera, preset.solver, options=preset.alignment)
+    settings = common.preset_of(name)
+    one = partial(align, frames[0], frames[1], camera, settings)
     [milliseconds] = time_in_turn([one], rounds)
-    odometry = Odometry(camera, preset.solver, preset.alignment, preset.odometry)
+    odometry = Odometry(camera, settings)
     odometry.warm_up()
     steps = [odometry.register(frame, frame.timestamp) for frame in frames]
     driver = [step.milliseconds for step in steps if step is not None]
@@ -145,10 +144,10 @@ def agreement(frames: list[Frame], camera: Camera, name: str) -> dict[str, float
 
 def motions(frames: list[Frame], camera: Camera, name: str) -> np.ndarray:
     """[B, 4, 4] target_T_reference of the pairs of neighbours."""
-    preset = common.preset_of(name)
-    settings = (camera, preset.solver, None, None, preset.alignment)
-    found = [align(*pair, *settings).target_T_reference for pair in zip(frames[:-1], frames[1:], strict=True)]
-    return np.stack(found).astype(np.float64)
+    settings = common.preset_of(name)
+    return np.stack(
+        [align(*pair, camera, settings).target_T_reference for pair in zip(frames[:-1], frames[1:], strict=True)]
+    )
 
 
 def _on_cpu() -> None:

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import AlignmentOptions, objectives_of
+from gavo_jax.alignment import objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
@@ -38,6 +38,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.objective import Objective, Residuals, _lane_sum, l2
 from gavo_jax.pyramid import Pyramid, build_pyramid
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions
 
 SCORE, MAPPED, SIDE_BY_SIDE, FULL = "score", "score, in turn", "score, side by side", "score, robust + depth"
 NO_BARRIER, TWO_MARKS = "score, no barrier", "score, two marks"

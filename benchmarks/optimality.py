@@ -21,19 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.alignment import (
-    AlignmentOptions,
-    Images,
-    align_views,
-    objectives_of,
-    prepare_pair,
-)
+from gavo_jax import presets
+from gavo_jax.alignment import Images, align_views, objectives_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.objective import Objective, Problem, preconditioner, reference_curvature
-from gavo_jax.presets import get_preset
 from gavo_jax.pyramid import build_pyramid
+from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
 
@@ -90,7 +85,7 @@ def final_errors(
 
 def pair_errors(sequence: Sequence, preset_name: str, seed: int) -> list[FinalErrors]:
     """E of every consecutive pair."""
-    genetic, descent = get_preset("ga", preset_name), get_preset("gauss-newton", preset_name)
+    genetic, descent = presets.preset("ga", preset_name), presets.preset("gauss-newton", preset_name)
     errors, last = [], None
     for index, frame in enumerate(sequence):
         images = Images(frame.grey, frame.depth)

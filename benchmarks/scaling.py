@@ -23,11 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from kernel import make_objective, pyramid_of, random_motions
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, align_batch
+from gavo_jax.alignment import Alignment, align_batch
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.objective import Objective
+from gavo_jax.settings import AlignmentOptions
 
 LARGE = 1e6
 """Pixels x candidates from which on a call's fixed cost is small."""
@@ -64,8 +65,7 @@ def main(
     print(f"exponent above {LARGE:.0e} pixels x candidates: {number(slope, 3)}\n")
     results = {"scoring": scoring, "exponent": slope, "batches": {}}
     for name in common.names(methods) if batches else ():
-        preset = common.preset_of(name)
-        settings = partial(align_batch, camera=sequence.camera, solver=preset.solver, options=preset.alignment)
+        settings = partial(align_batch, camera=sequence.camera, settings=common.preset_of(name))
         results["batches"][name] = time_batches(settings, sequence, common.counts(batches), rounds)
     rows = []
     for name, measured in results["batches"].items():

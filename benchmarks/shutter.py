@@ -18,21 +18,21 @@ from typing import Any
 import common
 import numpy as np
 
+from gavo_jax import presets
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.tracking import track_visibly
-from gavo_jax.odometry import Odometry
-from gavo_jax.presets import get_preset
+from gavo_jax.odometry.driver import Odometry
 
 
 def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
     """E, relative to the first readout's, and drift of a clip for each readout in milliseconds."""
     sequence = common.open_clip(clip)
-    preset = get_preset("gauss-newton")
-    options = replace(preset.odometry, reference="previous", recover=False)
+    settings = presets.preset("gauss-newton")
+    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False))
     rows, first = [], None
     for milliseconds in readouts:
         camera = replace(sequence.camera, readout=milliseconds / 1000)
-        odometry = Odometry(camera, preset.solver, preset.alignment, options)
+        odometry = Odometry(camera, settings)
         tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry)
         errors = np.array([float(step.alignment.error) for step in tracked.steps])
         first = errors if first is None else first

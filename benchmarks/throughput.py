@@ -28,7 +28,7 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.experiments.together import track_together
-from gavo_jax.odometry import Odometry, track
+from gavo_jax.odometry.driver import Odometry, track
 
 METHODS = "ga,ga:fast,ga:wide,ga:paper,pso,gauss-newton,adam"
 OVER = "opencv-rgb,opencv-rgbd,open3d-color"
@@ -153,9 +153,7 @@ def _now() -> np.ndarray:
 
 def _together(sequence: Sequence, name: str, count: int) -> dict[str, float]:
     """Milliseconds a pair of that many runs on one decoded stream, by the clock and on the processor."""
-    preset = common.preset_of(name)
-    settings = (sequence.camera, preset.solver, preset.alignment, preset.odometry)
-    drivers = [Odometry(*settings, seed) for seed in range(count)]
+    drivers = [Odometry(sequence.camera, common.preset_of(name), seed=seed) for seed in range(count)]
     start = _now()
     track_together(sequence, drivers)
     clock, cores = (_now() - start) / (len(sequence) - 1) / count * 1e3

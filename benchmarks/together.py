@@ -32,8 +32,9 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.experiments.together import track_together
-from gavo_jax.odometry import Odometry, Step, run_odometry, track
-from gavo_jax.presets import Preset
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.settings import Settings
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SMALL = "small"
@@ -63,7 +64,7 @@ def main(
     with tempfile.TemporaryDirectory() as folder:
         sequence = _small(Path(folder), frames) if clip == SMALL else common.open_clip(clip)
         for name in common.names(methods):
-            results[name] = _measure(sequence, _presets(name, runs), repeats)
+            results[name] = _measure(sequence, _settings(name, runs), repeats)
     rows = [_row(name, results[name]) for name in common.names(methods)]
     columns = ("", "programs", "more", "run_odometry, s", "bare, s", "together, s", "ratio", "to bare")
     columns += ("bare, core-ms", "together, core-ms", "equal")
@@ -77,7 +78,7 @@ def _small(folder: Path, frames: int) -> TumSequence:
     return TumSequence(folder, CAMERA)
 
 
-def _presets(name: str, runs: int) -> list[Preset]:
+def _settings(name: str, runs: int) -> list[Settings]:
     """Settings of each run: its own value of a rate, from 0.9 to 1.1 of the preset's."""
     preset, field = common.preset_of(name), RATES[name.partition(":")[0]]
     rate = getattr(preset.solver, field)
@@ -87,12 +88,12 @@ def _presets(name: str, runs: int) -> list[Preset]:
     ]
 
 
-def _measure(sequence: Sequence, presets: list[Preset], repeats: int) -> dict[str, Any]:
+def _measure(sequence: Sequence, settings: list[Settings], repeats: int) -> dict[str, Any]:
     def drivers() -> list[Odometry]:
-        return [Odometry(sequence.camera, p.solver, p.alignment, p.odometry, seed) for seed, p in enumerate(presets)]
+        return [Odometry(sequence.camera, own, seed=seed) for seed, own in enumerate(settings)]
 
     def single() -> list[list[Step]]:
-        return [run_odometry(sequence, p.solver, seed, p.alignment, p.odometry).steps for seed, p in enumerate(presets)]
+        return [run_odometry(sequence, own, seed=seed).steps for seed, own in enumerate(settings)]
 
     def bare() -> list[list[Step]]:
         return [list(track(sequence, odometry=driver)) for driver in drivers()]
@@ -101,11 +102,11 @@ def _measure(sequence: Sequence, presets: list[Preset], repeats: int) -> dict[st
         return track_together(sequence, drivers())
 
     with _compilations() as first:
-        run_odometry(sequence, presets[0].solver, 0, presets[0].alignment, presets[0].odometry)
+        run_odometry(sequence, settings[0])
     with _compilations() as others:
         found = [[_timed(way) for way in (single, bare, together)] for _ in range(repeats)]
     clock, cores = np.median([[times for times, _ in ways] for ways in found], axis=0).T.tolist()
-    pairs = len(presets) * (len(sequence) - 1)
+    pairs = len(settings) * (len(sequence) - 1)
     equal = sum(_same(a, b) for a, b in zip(found[0][0][1], found[0][2][1], strict=True))
     return {
         "programs": len(first),

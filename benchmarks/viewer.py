@@ -20,7 +20,7 @@ import numpy as np
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.odometry import Odometry
+from gavo_jax.odometry.driver import Odometry
 from gavo_jax.results import RECORDING
 from gavo_jax.viewer import ViewerMode, make_viewer
 
@@ -40,11 +40,9 @@ class Cost(NamedTuple):
 
 def watch(sequence: Sequence, name: str, mode: ViewerMode, folder: Path) -> Cost:
     """Track a sequence before a viewer."""
-    preset, recording = common.preset_of(name), folder / RECORDING
+    recording = folder / RECORDING
     viewer = make_viewer(mode, recording)
-    odometry = Odometry(
-        sequence.camera, preset.solver, preset.alignment, preset.odometry, record=viewer.wants_populations
-    )
+    odometry = Odometry(sequence.camera, common.preset_of(name), record=viewer.wants_populations)
     odometry.warm_up()
     viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
     start = time.perf_counter(), time.process_time()

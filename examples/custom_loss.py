@@ -24,8 +24,8 @@ def counted(s: jax.Array) -> jax.Array:
 def main() -> gavo.Alignment:
     """Align two frames by the genetic algorithm under a loss of our own."""
     sequence = gavo.SyntheticSequence(frames=2)
-    options = gavo.AlignmentOptions(loss=counted)
-    pair = gavo.align(sequence[0], sequence[1], sequence.camera, SOLVER, options=options)
+    settings = gavo.Settings(SOLVER, gavo.AlignmentOptions(loss=counted))
+    pair = gavo.align(sequence[0], sequence[1], sequence.camera, settings)
 
     first, second = sequence.ground_truth.world_T_camera
     exact = np.linalg.inv(second) @ first

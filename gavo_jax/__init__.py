@@ -1,11 +1,12 @@
 """Dense RGB-D visual odometry by genetic algorithm, in JAX."""
 
+import warnings
+
 from gavo_jax.compiler import prepare_process
 
 prepare_process()  # before anything imports JAX
 
 from gavo_jax.alignment import Alignment as Alignment
-from gavo_jax.alignment import AlignmentOptions as AlignmentOptions
 from gavo_jax.alignment import AlignmentStatus as AlignmentStatus
 from gavo_jax.alignment import align as align
 from gavo_jax.alignment import align_batch as align_batch
@@ -25,16 +26,27 @@ from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory
 from gavo_jax.evaluation import distance_error as distance_error
 from gavo_jax.evaluation import relative_pose_error as relative_pose_error
 from gavo_jax.objective import LOSSES as LOSSES
-from gavo_jax.odometry import Odometry as Odometry
-from gavo_jax.odometry import OdometryRun as OdometryRun
-from gavo_jax.odometry import Step as Step
-from gavo_jax.odometry import run_odometry as run_odometry
-from gavo_jax.odometry import track as track
-from gavo_jax.presets import OdometryOptions as OdometryOptions
-from gavo_jax.presets import Preset as Preset
-from gavo_jax.presets import get_preset as get_preset
+from gavo_jax.odometry.driver import Odometry as Odometry
+from gavo_jax.odometry.driver import Step as Step
+from gavo_jax.odometry.driver import track as track
+from gavo_jax.odometry.run import OdometryRun as OdometryRun
+from gavo_jax.odometry.run import run_odometry as run_odometry
+from gavo_jax.presets import preset as preset
+from gavo_jax.settings import AlignmentOptions as AlignmentOptions
+from gavo_jax.settings import OdometryOptions as OdometryOptions
+from gavo_jax.settings import Settings as Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton as GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm as GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent as GradientDescent
 from gavo_jax.solvers.particle_swarm import ParticleSwarm as ParticleSwarm
 from gavo_jax.trajectory import Trajectory as Trajectory
+
+_RENAMED = {"get_preset": "preset", "Preset": "Settings"}
+
+
+def __getattr__(name: str) -> object:
+    """Names of version 0.1, for one version more."""
+    if name not in _RENAMED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"gavo_jax.{name} is gavo_jax.{_RENAMED[name]} now", DeprecationWarning, stacklevel=2)
+    return globals()[_RENAMED[name]]

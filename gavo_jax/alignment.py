@@ -6,7 +6,7 @@ starts the next level from its best candidate. Everything from images to `Alignm
 """
 
 import enum
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,9 +22,7 @@ from gavo_jax.objective import (
     Brightness,
     ExplainedShare,
     Linearization,
-    Loss,
     Objective,
-    PointsPerLevel,
     Problem,
     Reference,
     Scales,
@@ -32,7 +30,6 @@ from gavo_jax.objective import (
     estimate_brightness,
     estimate_scales,
     explained_share,
-    geman_mcclure,
     grids_of,
     make_references,
     most_points,
@@ -43,8 +40,8 @@ from gavo_jax.objective import (
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
 from gavo_jax.se3 import departure_from_rigid, exp, log, rigid, rigid_inverse
-from gavo_jax.solvers.base import Bounds, Candidates, solve, static
-from gavo_jax.solvers.genetic import GeneticAlgorithm
+from gavo_jax.settings import AlignmentOptions, Settings, as_settings
+from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
 from gavo_jax.warp import ImagePlane, Target, image_planes, pack_target
 
 
@@ -96,79 +93,15 @@ _SENTENCES = {
 }
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class AlignmentOptions:
-    """What is minimised and where, apart from the solver.
-
-    Attributes:
-        loss: ρ of the squared normalised residual (static); see `objective.LOSSES`, or any callable.
-        depth: Whether the depth residual joins the grey one (static).
-        brightness: Whether a gain and a bias between the frames are estimated (static).
-        centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
-            (static); see `Objective`.
-        symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
-        refine: Whether the motion that wins where islands compete is taken through all levels once more, alone, with
-            the brightness and scales that are known only then (static).
-        robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
-        precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
-        points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
-            None takes every pixel.
-        estimation_points: Largest number of points a view from which brightness, scales and curvature are estimated
-            before a level is searched (static); None takes all.
-        views: Largest number of reference frames that are scored together, an entry a level (static); the first ones
-            are.
-        islands: Independent populations, an entry a level (static); the best ones go on to the next level.
-        depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
-            level.
-        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
-            err by whole surfaces (static); see `objective.depth_trust`.
-        last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
-            curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
-            only evaluated end scattered about the minimum; this centres them. Not where the error is `symmetric`: slope
-            and curvature are known of one direction alone.
-        min_overlap: Share of the reference's points that a candidate must keep in view to count.
-        outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
-            None, and on the levels that refine one motion: (2) as printed.
-        bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
-        bounds_factor: Factor on the half-widths from a level to the next finer one.
-        scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands
-            start from the best distinct ones. 0 starts all islands from the guess.
-        scout_spread: Standard deviations of the scouts, metres and radians.
-    """
-
-    loss: Loss = static(geman_mcclure)
-    depth: bool = static(True)
-    brightness: bool = static(True)
-    centred: bool = static(False)
-    symmetric: bool = static(False)
-    refine: bool = static(False)
-    robust_scale: bool = static(True)
-    precondition: bool = static(True)
-    points: PointsPerLevel = static(4800)
-    estimation_points: int | None = static(1200)
-    views: tuple[int, ...] = static((2, 2, 1, 1, 1))
-    islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
-    depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
-    doubt_depth: bool = static(False)
-    last_step: bool = static(True)
-    min_overlap: float = 0.35
-    outside_cost: float | None = None
-    bounds: tuple[float, float] = (0.5, 0.8)
-    bounds_factor: float = 1.0
-    scouts: int = static(0)
-    scout_spread: tuple[float, float] = (0.15, 0.4)
-
-
 class Alignment(NamedTuple):
     """The motion between two frames, with what is known about it.
 
     A batch holds the same fields with a leading axis, and `status` as an integer array.
     """
 
-    target_T_reference: Float[Array | np.ndarray, "4 4"]
-    """Maps points of the reference camera into the target camera, metres. Once it is on the host it is of float64 and
-    its rotation orthonormal."""
+    target_T_reference: Float[Array, "4 4"]
+    """Maps points of the reference camera into the target camera, metres. On the host it is a NumPy array of float64
+    with an orthonormal rotation."""
     xi: Float[Array, " 6"]
     """Its logarithm (v, w): metres, radians."""
     error: Float[Array, ""]
@@ -463,7 +396,7 @@ def align_views(
     views: tuple[Reference, ...],
     target: Target,
     camera: Camera,
-    solver: Any,
+    solver: Solver,
     options: AlignmentOptions,
     key: PRNGKeyArray,
     guesses: Float[Array, "g 4 4"],
@@ -539,7 +472,7 @@ def align_views(
 
 def _search_island(
     problem: Problem,
-    solver: Any,
+    solver: Solver,
     options: AlignmentOptions,
     box: Float[Array, " 6"],
     record: bool,
@@ -742,7 +675,7 @@ def _align_images(
     reference: Images,
     target: Images,
     camera: Camera,
-    solver: Any,
+    solver: Solver,
     options: AlignmentOptions,
     key: PRNGKeyArray,
     guess: Float[Array, "4 4"],
@@ -781,7 +714,7 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     )
 
 
-def align_rows(sides, camera, solver, options, keys, guesses) -> Alignment:
+def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
     """`align_batch` of images that are stacked already, its results on the device."""
     count = len(guesses)
     if count == 1:  # padded to two rows, of which one is computed
@@ -790,8 +723,8 @@ def align_rows(sides, camera, solver, options, keys, guesses) -> Alignment:
         jnp.int32(count),
         *sides,
         camera.rectified(),
-        GeneticAlgorithm() if solver is None else solver,
-        AlignmentOptions() if options is None else options,
+        settings.solver,
+        settings.alignment,
         keys,
         guesses,
     )
@@ -802,9 +735,11 @@ def align(
     reference: Frame | tuple[Any, Any],
     target: Frame | tuple[Any, Any],
     camera: Camera,
-    solver: Any = None,
+    settings: Settings | Solver | None = None,
+    *,
     key: PRNGKeyArray | None = None,
-    guess: Float[Array, "4 4"] | None = None,
+    guess: Float[Array | np.ndarray, "4 4"] | None = None,
+    solver: Solver | None = None,
     options: AlignmentOptions | None = None,
 ) -> Alignment:
     """Estimate the motion of the camera between two RGB-D frames.
@@ -814,10 +749,11 @@ def align(
             `camera.depth_scale` a metre, 0 = no reading.
         target: Frame t + 1.
         camera: Their camera. Lens distortion, where it has any, is taken out first.
-        solver: `GeneticAlgorithm()` by default; any solver with an entry a level.
+        settings: What searches and what is minimised; a solver stands for the default settings with that solver.
         key: Random key; `jax.random.key(0)` by default. The same key gives the same result, bit for bit.
         guess: A motion target_T_reference to start from; the identity by default.
-        options: What is minimised.
+        solver: Takes the place of the settings' solver.
+        options: Deprecated: `alignment` of the settings.
 
     Returns:
         `Alignment`; the camera's own motion is the inverse of its `target_T_reference`.
@@ -825,10 +761,11 @@ def align(
     Raises:
         GavoError: The images are not of the camera's size, or of a wrong shape.
     """
-    sides = [_stacked_images([frame], camera) for frame in (reference, target)]
+    settings = as_settings(settings, solver, alignment=options)
+    sides = [stacked_images([frame], camera) for frame in (reference, target)]
     keys = (jax.random.key(0) if key is None else key)[None]
     guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
-    result = align_rows(sides, camera, solver, options, keys, guesses)
+    result = align_rows(sides, camera, settings, keys, guesses)
     return on_host(jax.tree.map(lambda leaf: leaf[0], result))
 
 
@@ -836,9 +773,11 @@ def align_batch(
     references: Any,
     targets: Any,
     camera: Camera,
-    solver: Any = None,
+    settings: Settings | Solver | None = None,
+    *,
     keys: PRNGKeyArray | None = None,
-    guesses: Float[Array, "b 4 4"] | None = None,
+    guesses: Float[Array | np.ndarray, "b 4 4"] | None = None,
+    solver: Solver | None = None,
     options: AlignmentOptions | None = None,
 ) -> Alignment:
     """Align B pairs in one compiled call; what it takes of memory beside the images does not grow with a large B.
@@ -848,9 +787,10 @@ def align_batch(
             without distortion.
         targets: The other B frames, alike.
         camera: Their camera.
-        solver: As in `align`.
+        settings: As in `align`.
         keys: [B] random keys; `jax.random.split(jax.random.key(0), B)` by default.
         guesses: [B, 4, 4] motions to start from; the identity by default.
+        solver: As in `align`.
         options: As in `align`.
 
     Returns:
@@ -859,13 +799,14 @@ def align_batch(
     Raises:
         GavoError: The images are not of the camera's size, or the two sides differ in number.
     """
-    sides = [_stacked_images(side, camera) for side in (references, targets)]
+    settings = as_settings(settings, solver, alignment=options)
+    sides = [stacked_images(side, camera) for side in (references, targets)]
     count = len(sides[0].grey)
     if len(sides[1].grey) != count:
         raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
-    return on_host(align_rows(sides, camera, solver, options, keys, guesses))
+    return on_host(align_rows(sides, camera, settings, keys, guesses))
 
 
 def on_host(alignment: Alignment) -> Alignment:
@@ -875,6 +816,19 @@ def on_host(alignment: Alignment) -> Alignment:
     host = jax.device_get(alignment)
     status = host.status if np.ndim(host.status) else AlignmentStatus(int(host.status))
     return host._replace(target_T_reference=rigid(host.target_T_reference), status=status)
+
+
+def no_alignment(status: AlignmentStatus) -> Alignment:
+    """The result of a pair that could not be aligned at all: no motion, nothing known."""
+    nothing: dict[str, Any] = {
+        "target_T_reference": np.eye(4),
+        "xi": np.zeros(6, np.float32),
+        "error": np.float32(np.nan),
+        "overlap": np.float32(0.0),
+        "covariance": np.full((6, 6), np.nan, np.float32),
+        "history": np.zeros(0, np.float32),
+    }
+    return Alignment(**nothing, status=status)
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
@@ -888,10 +842,11 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     return Images(grey, depth)
 
 
-def _stacked_images(side: Any, camera: Camera) -> Images:
+def stacked_images(side: Any, camera: Camera) -> Images:
+    """B frames as `align_batch` takes them, stacked and free of lens distortion."""
     if isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3:
         if camera.is_distorted:
-            return _stacked_images(list(zip(*side, strict=True)), camera)
+            return stacked_images(list(zip(*side, strict=True)), camera)
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
             raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
         return Images(jnp.asarray(side[0]), jnp.asarray(side[1]))

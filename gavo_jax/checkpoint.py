@@ -11,7 +11,8 @@ import numpy as np
 
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
-from gavo_jax.odometry import Progress, TrackerState
+from gavo_jax.odometry.driver import Progress
+from gavo_jax.odometry.tracking import TrackerState
 
 NUMBERS, POSES = "numbers", ("world_T_reference", "world_T_camera")
 

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, objectives_of
+from gavo_jax.alignment import Alignment, objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.plots import Landscape
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions
 
 REACH, STEPS = 0.1, 81
 """Metres or radians to either side, and the number of motions scored along a direction."""

@@ -1,14 +1,10 @@
 """Named settings: what `--method` and `--preset` stand for."""
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-import jax
-
-from gavo_jax.alignment import AlignmentOptions
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
-from gavo_jax.solvers.base import static
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -16,42 +12,6 @@ from gavo_jax.solvers.particle_swarm import ParticleSwarm
 
 METHODS = ("ga", "pso", "gauss-newton", "adam")
 PRESETS = ("default", "paper", "fast", "wide")
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class OdometryOptions:
-    """How the driver uses the alignment; all but `keyframe_overlap` is static.
-
-    Attributes:
-        reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
-            at once, their points scored together.
-        keyframe_overlap: Part of the keyframe's points that is still in view when they are replaced by a newer frame's;
-            the mean over its shares, see `odometry.renew_keyframe`.
-        prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
-        synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
-            sequence tells both stamps.
-        rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
-        recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
-        on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
-    """
-
-    reference: Literal["previous", "keyframe"] = static("keyframe")
-    keyframe_overlap: float = 0.7
-    prior: bool = static(True)
-    synchronise: bool = static(True)
-    rolling_shutter: bool = static(True)
-    recover: bool = static(True)
-    on_lost: Literal["hold", "predict", "stop"] = static("hold")
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A solver, what it minimises, and how the driver uses it."""
-
-    solver: Any
-    alignment: AlignmentOptions
-    odometry: OdometryOptions
 
 
 PAPER_OBJECTIVE = AlignmentOptions(
@@ -150,7 +110,7 @@ the other does not, so both directions count; the winner is refined from the coa
 tracking takes."""
 
 
-def get_preset(method: str = "ga", name: str = "default") -> Preset:
+def preset(method: str = "ga", name: str = "default") -> Settings:
     """The settings that a method and a preset name stand for.
 
     Args:
@@ -165,15 +125,15 @@ def get_preset(method: str = "ga", name: str = "default") -> Preset:
     if method not in METHODS:
         raise GavoError(f"unknown method {method!r}: not one of {', '.join(METHODS)}")
     if name == "paper":
-        return Preset(
+        return Settings(
             _paper_solver(method),
             PAPER_OBJECTIVE,
             OdometryOptions(reference="previous", prior=False, synchronise=False, rolling_shutter=False, recover=False),
         )
     if name == "default":
-        return Preset(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
+        return Settings(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
     if name == "fast":
-        return Preset(_FAST[method], AlignmentOptions(points=_FAST_POINTS), OdometryOptions())
+        return Settings(_FAST[method], AlignmentOptions(points=_FAST_POINTS), OdometryOptions())
     if name == "wide":
-        return Preset(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
+        return Settings(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
     raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")

@@ -20,10 +20,11 @@ import cv2
 import jax
 import numpy as np
 
-from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.alignment import AlignmentStatus, no_alignment
 from gavo_jax.checkpoint import load_checkpoint, save_checkpoint
 from gavo_jax.errors import PARTIAL, GavoError, read_text
-from gavo_jax.odometry import Progress, Step, TrackerState, no_alignment
+from gavo_jax.odometry.driver import Progress, Step
+from gavo_jax.odometry.tracking import TrackerState
 from gavo_jax.plots import CAPTIONS as FIGURES
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
 from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines

@@ -29,7 +29,7 @@ from gavo_jax.alignment import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Step
+from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory, inverse
 
 if TYPE_CHECKING:

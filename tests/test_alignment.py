@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from gavo_jax import alignment as alignment_module
+from gavo_jax import presets
 from gavo_jax.alignment import (
     Alignment,
-    AlignmentOptions,
     AlignmentStatus,
     align,
     align_batch,
@@ -26,9 +26,10 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
-from gavo_jax.presets import METHODS, PRESETS, get_preset
+from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 
@@ -65,8 +66,7 @@ def difference(estimate: Any, truth: np.ndarray) -> tuple[float, float]:
 
 def run(method: str, reference: Frame | Images, target: Frame | Images, camera: Camera, seed: int = 0) -> Alignment:
     """Align by a method's default preset."""
-    preset = get_preset(method)
-    return align(reference, target, camera, solver=preset.solver, key=jax.random.key(seed), options=preset.alignment)
+    return align(reference, target, camera, presets.preset(method), key=jax.random.key(seed))
 
 
 @pytest.mark.parametrize("reference, target", PAIRS)
@@ -89,8 +89,9 @@ def test_the_symmetric_error_does_not_care_which_frame_is_the_reference(
 
     def there_and_back(symmetric: bool) -> tuple[float, float]:
         options = AlignmentOptions(symmetric=symmetric, robust_scale=False, brightness=False, depth=False, loss=l2)
-        there = align(start, far, sequence.camera, QUICK, guess=jnp.asarray(truth), options=options)
-        back = align(far, start, sequence.camera, QUICK, guess=jnp.asarray(np.linalg.inv(truth)), options=options)
+        settings = Settings(QUICK, options)
+        there = align(start, far, sequence.camera, settings, guess=truth)
+        back = align(far, start, sequence.camera, settings, guess=np.linalg.inv(truth))
         return difference(back.target_T_reference, np.linalg.inv(np.asarray(there.target_T_reference, float)))
 
     one_way, both_ways = there_and_back(False), there_and_back(True)
@@ -113,10 +114,8 @@ def test_a_last_step_centres_what_a_short_search_leaves(sequence: SyntheticSeque
     truth = target_T_reference(sequence, 0, 1)
 
     def off(last_step: bool) -> tuple[list[float], list[float]]:
-        options = AlignmentOptions(last_step=last_step)
-        found = [
-            align(frames[0], frames[1], sequence.camera, solver, jax.random.key(k), None, options) for k in range(5)
-        ]
+        settings = Settings(solver, AlignmentOptions(last_step=last_step))
+        found = [align(frames[0], frames[1], sequence.camera, settings, key=jax.random.key(k)) for k in range(5)]
         return [difference(a.target_T_reference, truth)[0] for a in found], [float(a.error) for a in found]
 
     (with_step, error), (without, error_before) = off(True), off(False)
@@ -129,14 +128,14 @@ def test_a_search_that_refines_visits_its_levels_again(sequence: SyntheticSequen
     assert visited_levels((4, 3), options) == (4, 4, 3)
     assert visited_levels((4, 3), replace(options, refine=False)) == (4, 3)
     solver = GeneticAlgorithm(population=16, iterations=(0, 0, 0, 5, 7))
-    result = align(frames[0], frames[1], sequence.camera, solver, options=options)
+    result = align(frames[0], frames[1], sequence.camera, Settings(solver, options))
     assert result.history.shape == (7 + 7 + 5,)
     assert difference(result.target_T_reference, target_T_reference(sequence, 0, 1))[0] < 0.01
 
 
 def test_the_result_tells_all(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     result = run("ga", frames[0], frames[1], sequence.camera)
-    solver = get_preset("ga").solver
+    solver = presets.preset("ga").solver
     assert result.target_T_reference.shape == (4, 4) and result.covariance.shape == (6, 6)
     assert result.target_T_reference.dtype == np.float64
     assert all(np.asarray(field).dtype == np.float32 for field in result[1:] if field is not result.status)
@@ -359,8 +358,8 @@ def test_an_undetermined_direction_is_named(sequence: SyntheticSequence) -> None
 
 
 def wide_search(reference: Frame | Images, target: Frame | Images, camera: Camera, **changes: Any) -> Alignment:
-    preset = get_preset("ga", "wide")
-    return align(reference, target, camera, solver=preset.solver, options=replace(preset.alignment, **changes))
+    wide = presets.preset("ga", "wide")
+    return align(reference, target, camera, replace(wide, alignment=replace(wide.alignment, **changes)))
 
 
 def wallpaper(sequence: SyntheticSequence, shift: float, repeats: bool) -> Images:
@@ -406,19 +405,19 @@ def test_statuses_say_a_sentence() -> None:
 def test_every_preset_has_a_solver_for_all_levels() -> None:
     for method in METHODS:
         for name in PRESETS:
-            preset = get_preset(method, name)
-            assert len(preset.solver.iterations) == len(preset.alignment.islands) == LEVELS
-            assert preset.solver.levels[0] == 4
-    assert get_preset("ga", "paper").solver.levels[-1] == 0
+            settings = presets.preset(method, name)
+            assert len(settings.solver.iterations) == len(settings.alignment.islands) == LEVELS
+            assert settings.solver.levels[0] == 4
+    assert presets.preset("ga", "paper").solver.levels[-1] == 0
     for bad in (("simplex", "default"), ("ga", "best")):
         with pytest.raises(GavoError, match="unknown"):
-            get_preset(*bad)
+            presets.preset(*bad)
 
 
 def test_bounds_are_inputs_of_the_program(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     """Half-widths that shut the true motion out show in the result, without a second compilation."""
     options = AlignmentOptions(bounds=(0.001, 0.001))
-    result = align(frames[0], frames[1], sequence.camera, solver=GaussNewton(), options=options)
+    result = align(frames[0], frames[1], sequence.camera, Settings(GaussNewton(), options))
     metres, degrees = difference(result.target_T_reference, np.eye(4))
     true_metres, true_degrees = difference(target_T_reference(sequence, 0, 1), np.eye(4))
     assert true_degrees > 0.3 and true_metres > 0.005

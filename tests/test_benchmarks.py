@@ -77,7 +77,7 @@ def test_ablation_compares_with_the_full_preset(load, tmp_path: Path) -> None:
 def test_ablation_switches_off_what_it_says(load) -> None:
     ablation: ModuleType = load("ablation")
     for name, (_, switch_off) in ablation.VARIANTS.items():
-        full = ablation.get_preset("ga", "default")
+        full = ablation.presets.preset("ga", "default")
         assert switch_off(full) != full, name
 
 

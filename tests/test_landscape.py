@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from gavo_jax.alignment import AlignmentOptions, align
+from gavo_jax.alignment import align
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.landscape import STEPS, error_landscape
+from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)

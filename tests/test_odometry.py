@@ -15,25 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import AlignmentOptions, AlignmentStatus, prepare_reference
+from gavo_jax.alignment import Alignment, AlignmentStatus, no_alignment, prepare_reference
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import move_reference
-from gavo_jax.odometry import (
-    Odometry,
-    OdometryRun,
-    Step,
-    first_state,
-    no_alignment,
-    renew_keyframe,
-    run_odometry,
-    track,
-)
-from gavo_jax.presets import OdometryOptions
+from gavo_jax.odometry.aligners import Attempt, Recovering, Search
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.run import OdometryRun, run_odometry
+from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
 from gavo_jax.pyramid import build_pyramid
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.trajectory import Trajectory
 
@@ -45,6 +39,7 @@ PLAIN = OdometryOptions(recover=False)
 
 SOLVER = GaussNewton(iterations=(0, 15, 0, 0, 20))
 """Two levels: soon compiled."""
+SEARCH_ALONE = Settings(SOLVER, odometry=PLAIN)
 
 
 class Altered:
@@ -97,7 +92,7 @@ def sequence() -> SyntheticSequence:
 
 
 def run(sequence: Any, options: OdometryOptions = PLAIN, **arguments: Any) -> OdometryRun:
-    return run_odometry(sequence, solver=SOLVER, options=options, **arguments)
+    return run_odometry(sequence, Settings(SOLVER, odometry=options), **arguments)
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +308,7 @@ def test_dropped_frames_are_told_and_bridged(sequence: SyntheticSequence) -> Non
     kept = [0, 1, 2, 3, 4, 5, 9, 10, 11]
     gapped = Altered(sequence, lambda index, frame: frame)
     gapped.timestamps = sequence.timestamps[kept]
-    odometry = Odometry(CAMERA, SOLVER, options=PLAIN)
+    odometry = Odometry(CAMERA, SEARCH_ALONE)
     steps = [odometry.register(sequence[i], float(sequence.timestamps[i])) for i in kept]
     told = {kept[i]: step.alignment.status for i, step in enumerate(steps) if step and step.alignment.status}
     assert told == {9: AlignmentStatus.GAP} and not any(step.lost for step in steps if step)
@@ -404,7 +399,7 @@ def test_memory_does_not_grow_with_the_frames(sequence: SyntheticSequence) -> No
 
 def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> None:
     altered = Altered(sequence, lambda _, frame: frame)
-    steps = track(altered, SOLVER, options=PLAIN)
+    steps = track(altered, SEARCH_ALONE)
     assert altered.read == []
     first = next(steps)
     assert first.index == 1 and max(altered.read) <= 3
@@ -430,7 +425,7 @@ def test_a_rolling_shutter_is_reckoned_with() -> None:
 
 
 def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticSequence) -> None:
-    odometry = Odometry(replace(CAMERA, readout=0.03), SOLVER, options=PLAIN)
+    odometry = Odometry(replace(CAMERA, readout=0.03), SEARCH_ALONE)
     pending = []
     for index in range(2):
         odometry.register(sequence[index], float(sequence.timestamps[index]))
@@ -442,16 +437,16 @@ def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticS
 
 def test_the_program_for_every_frame_makes_the_first_state_too(sequence: SyntheticSequence) -> None:
     frame, camera = sequence[0], replace(CAMERA, readout=0.03)
-    odometry = Odometry(camera, SOLVER, options=PLAIN)
+    odometry = Odometry(camera, SEARCH_ALONE)
     odometry.register(frame, 0.0)
-    expected = first_state(frame.grey, frame.depth, camera, SOLVER, odometry.alignment)
+    expected = first_state(frame.grey, frame.depth, camera, SOLVER, odometry.settings.alignment)
     state = odometry.progress.tracker
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), state, expected)
 
 
 def test_one_program_serves_every_frame(sequence: SyntheticSequence) -> None:
-    odometry = Odometry(replace(CAMERA, readout=0.03), SOLVER, options=PLAIN)
-    blank = odometry.blank_state()
+    odometry = Odometry(replace(CAMERA, readout=0.03), SEARCH_ALONE)
+    blank = blank_state(odometry.camera, SOLVER, odometry.settings.alignment)
     odometry.register(sequence[0], 0.0)
     states = blank, odometry.progress.tracker
     types = [[jax.typeof(leaf) for leaf in jax.tree.leaves(state)] for state in states]
@@ -463,7 +458,7 @@ def test_warming_up_leaves_the_garbage_collector_as_it_was(collects: bool) -> No
     before = gc.isenabled()
     try:
         (gc.enable if collects else gc.disable)()
-        Odometry(CAMERA, SOLVER, options=PLAIN).warm_up()
+        Odometry(CAMERA, SEARCH_ALONE).warm_up()
         assert gc.isenabled() == collects
     finally:
         (gc.enable if before else gc.disable)()
@@ -527,7 +522,7 @@ def test_synchronising_without_delay_changes_nothing(sequence: SyntheticSequence
 def test_warm_up_leaves_no_trace(sequence: SyntheticSequence) -> None:
     steps = []
     for warm in (True, False):
-        odometry = Odometry(CAMERA, SOLVER, options=PLAIN)
+        odometry = Odometry(CAMERA, SEARCH_ALONE)
         if warm:
             assert odometry.warm_up() > 0
         assert odometry.register(sequence[0], 0.0) is None
@@ -548,19 +543,64 @@ def test_real_frames(data_dir: Path) -> None:
 @pytest.mark.slow
 def test_the_wide_search_recovers_what_the_default_loses() -> None:
     jump = SyntheticSequence(frames=60, camera=CAMERA)[::25]
-    lost = run_odometry(jump, GaussNewton(), options=PLAIN).metrics["lost_pairs"]
+    lost = run_odometry(jump, Settings(GaussNewton(), odometry=PLAIN)).metrics["lost_pairs"]
     assert run_odometry(jump, GaussNewton()).metrics["lost_pairs"] < max(lost, 1)
 
 
-def test_a_high_error_is_used_if_the_wide_search_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
-    still = no_alignment(AlignmentStatus.HIGH_ERROR)
-    near, far = (np.eye(4, dtype=np.float32) for _ in range(2))
-    near[0, 3], far[0, 3] = 0.01, 0.1
+class Told:
+    """An aligner that finds what it is told."""
+
+    def __init__(self, result: Alignment) -> None:
+        self.result = result
+
+    def warm_up(self) -> float:
+        return 0.0
+
+    def start(self, frame: Frame) -> Any:
+        return frame.timestamp
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        return Attempt(frame.timestamp, self.result, self.result.status is AlignmentStatus.OK)
+
+    def predict(self, state: Any, elapsed: float) -> np.ndarray:
+        return np.eye(4)
+
+
+def found(status: AlignmentStatus, x: float) -> Alignment:
+    """A motion of so many metres to the right, and what is said of it."""
+    motion = np.eye(4)
+    motion[0, 3] = x
+    return no_alignment(status)._replace(target_T_reference=motion)
+
+
+@pytest.mark.parametrize(
+    "first, second, x",
+    [
+        (found(AlignmentStatus.OK, 0.02), found(AlignmentStatus.OK, 0.1), 0.02),
+        (found(AlignmentStatus.AMBIGUOUS, 0.02), found(AlignmentStatus.OK, 0.1), 0.1),
+        (found(AlignmentStatus.HIGH_ERROR, 0.02), found(AlignmentStatus.HIGH_ERROR, 0.03), 0.02),
+        (found(AlignmentStatus.HIGH_ERROR, 0.02), found(AlignmentStatus.HIGH_ERROR, 0.1), None),
+        (found(AlignmentStatus.LOW_OVERLAP, 0.02), found(AlignmentStatus.LOW_OVERLAP, 0.02), None),
+    ],
+)
+def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
+    first: Alignment, second: Alignment, x: float | None
+) -> None:
     sequence = Rendered(frames=2, camera=CAMERA, noise=NONE)
-    for wide, lost in ((near, False), (far, True)):
-        odometry = Odometry(CAMERA, GaussNewton())
-        odometry.register(sequence[0], 0.0)
-        state, attempts = odometry.progress.tracker, [still, still._replace(target_T_reference=wide)]
-        monkeypatch.setattr(odometry, "_run", lambda *_, s=state, a=attempts: (s, a.pop(0)))
-        step = odometry.register(sequence[1], 1 / 30)
-        assert step is not None and step.lost is lost and step.alignment.status is AlignmentStatus.HIGH_ERROR
+    odometry = Odometry(CAMERA, aligner=Recovering(Told(first), lambda: Told(second)))
+    odometry.register(sequence[0], 0.0)
+    step = odometry.register(sequence[1], 1 / 30)
+    assert step is not None and step.lost is (x is None)
+    assert step.world_T_camera[0, 3] == pytest.approx(-(x or 0.0))
+    assert odometry.progress.tracker == (sequence[0].timestamp if x is None else sequence[1].timestamp)
+
+
+def test_the_wide_search_stands_behind_the_default_one() -> None:
+    aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
+    assert isinstance(aligner, Recovering) and isinstance(aligner.first, Search)
+    wide = aligner.second()
+    assert isinstance(wide, Search) and wide.key == aligner.first.key
+    assert wide.settings.alignment.scouts > 0 and wide.settings.odometry.reference == "previous"
+    assert wide.settings.solver.levels == SOLVER.levels
+    assert wide.settings.alignment.points == aligner.first.settings.alignment.points
+    assert isinstance(Odometry(CAMERA, SEARCH_ALONE).aligner, Search)

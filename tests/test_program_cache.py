@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax import AlignmentOptions, program_cache
+from gavo_jax import AlignmentOptions, presets, program_cache
 from gavo_jax.objective import geman_mcclure, huber
-from gavo_jax.presets import METHODS, PRESETS, get_preset
+from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.program_cache import CachedProgram, Foreign, identify, keep_programs_in
 from gavo_jax.warp import Points
 
@@ -208,9 +208,9 @@ def test_somebody_elses_code_is_never_kept(folder: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_preset_can_be_kept(method: str, preset: str) -> None:
-    settings = get_preset(method, preset)
+    settings = presets.preset(method, preset)
     identified = identify((settings.solver, settings.alignment, settings.odometry))
     assert " at 0x" not in repr(identified)
     assert identified == identify((settings.solver, settings.alignment, settings.odometry))
-    others = [get_preset(method, other) for other in PRESETS if other != preset]
+    others = [presets.preset(method, other) for other in PRESETS if other != preset]
     assert all(identified != identify((other.solver, other.alignment, other.odometry)) for other in others)

@@ -10,7 +10,7 @@ import pytest
 
 from gavo_jax.alignment import Alignment, AlignmentStatus
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Step
+from gavo_jax.odometry.driver import Step
 from gavo_jax.results import FRAME_COLUMNS, RunFolder, describe, frame_row, prepare_folder, write_json
 
 

@@ -19,9 +19,11 @@ from gavo_jax.checkpoint import load_checkpoint, save_checkpoint
 from gavo_jax.cli import main, run
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry, Progress, run_odometry, track
-from gavo_jax.presets import OdometryOptions
+from gavo_jax.odometry.driver import Odometry, Progress, track
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.results import RunFolder
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.trajectory import Trajectory
@@ -191,24 +193,25 @@ def test_damaged_files_are_not_resumed(clip, broken, capsys, name, damage):
 
 
 def test_a_checkpoint_of_another_camera_is_refused(tmp_path):
-    odometry = Odometry(CAMERA, SOLVER, options=PLAIN)
-    odometry.progress = Progress(odometry.blank_state(), 3)
-    save_checkpoint(tmp_path / "checkpoint.npz", odometry.progress, {})
+    own, other = (blank_state(camera, SOLVER, AlignmentOptions()) for camera in (CAMERA, CAMERA.level(1)))
+    save_checkpoint(tmp_path / "checkpoint.npz", Progress(own, 3), {})
     with pytest.raises(GavoError, match="another camera"):
-        load_checkpoint(tmp_path / "checkpoint.npz", Odometry(CAMERA.level(1), SOLVER, options=PLAIN).blank_state())
+        load_checkpoint(tmp_path / "checkpoint.npz", other)
 
 
 @pytest.mark.parametrize(("solver", "at"), [(SOLVER, 1), (SOLVER, 4), (GENETIC, 3)])
 def test_a_driver_goes_on_from_a_saved_progress(tmp_path, solver, at):
-    sequence = SyntheticSequence(frames=7, camera=CAMERA)
-    straight = run_odometry(sequence, solver, options=PLAIN).trajectory.world_T_camera
-    first = Odometry(CAMERA, solver, options=PLAIN)
+    sequence, settings = SyntheticSequence(frames=7, camera=CAMERA), Settings(solver, odometry=PLAIN)
+    straight = run_odometry(sequence, settings).trajectory.world_T_camera
+    first = Odometry(CAMERA, settings)
     for step in track(sequence, odometry=first):
         if step.index == at:
             break
     save_checkpoint(tmp_path / "checkpoint.npz", first.progress, {"frames.csv": 7})
-    second = Odometry(CAMERA, solver, options=PLAIN)
-    second.progress, sizes = load_checkpoint(tmp_path / "checkpoint.npz", second.blank_state())
+    second = Odometry(CAMERA, settings)
+    second.progress, sizes = load_checkpoint(
+        tmp_path / "checkpoint.npz", blank_state(CAMERA, solver, settings.alignment)
+    )
     rest = list(track(sequence, odometry=second))
     assert sizes == {"frames.csv": 7}
     assert [step.index for step in rest] == list(range(at + 1, 7))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from gavo_jax import viewer
-from gavo_jax.alignment import AlignmentOptions, Population
+from gavo_jax.alignment import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry, track
-from gavo_jax.presets import OdometryOptions
+from gavo_jax.odometry.driver import Odometry, track
 from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
@@ -27,6 +27,7 @@ SEARCH_ALONE = AlignmentOptions(last_step=False)
 """So that a pair's result is the best of the candidates that are shown."""
 PLAIN = OdometryOptions(recover=False)
 """So few candidates find little: no second search is the subject here."""
+SETTINGS = Settings(SOLVER, SEARCH_ALONE, PLAIN)
 FRAMES, GENERATIONS, PARTICLES = 4, 2 + 3, (12, 12, 12, 8, 8)
 ENTITIES_OF_A_PAIR = (
     "/curves/rmse",
@@ -66,14 +67,14 @@ def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "run.rrd"
     sequence = SyntheticSequence(frames=FRAMES, camera=CAMERA)
     shown = viewer.make_viewer("save", path)
-    odometry = Odometry(sequence.camera, SOLVER, SEARCH_ALONE, PLAIN, record=shown.wants_populations)
+    odometry = Odometry(sequence.camera, SETTINGS, record=shown.wants_populations)
     with shown:
         shown.open("a run", sequence.camera, sequence.timestamps, sequence.ground_truth)
         steps = list(
             track(
                 sequence,
                 odometry=odometry,
-                watch=lambda frame, step: shown.watch(frame, step, odometry.populations),
+                watch=lambda frame, step: shown.watch(frame, step, odometry.candidates),
             )
         )
     return steps, sequence, path
@@ -129,7 +130,7 @@ def test_a_frame_is_small(run):
 
 def test_recording_changes_nothing(run):
     steps, sequence, _ = run
-    plain = list(track(sequence, odometry=Odometry(sequence.camera, SOLVER, SEARCH_ALONE, PLAIN)))
+    plain = list(track(sequence, odometry=Odometry(sequence.camera, SETTINGS)))
     assert all(np.array_equal(a.world_T_camera, b.world_T_camera) for a, b in zip(steps, plain, strict=True))
 
 

@@ -4,6 +4,7 @@ import json
 
 import jax
 
+from gavo_jax import presets
 from gavo_jax.alignment import align as align_pair
 from gavo_jax.camera import Camera, camera_for_sequence, load_camera
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
@@ -11,7 +12,6 @@ from gavo_jax.cli.options import Align
 from gavo_jax.cli.screen import waiting
 from gavo_jax.cli.selection import check_seed
 from gavo_jax.datasets.tum import read_frame
-from gavo_jax.presets import get_preset
 from gavo_jax.results import describe
 
 
@@ -19,14 +19,12 @@ def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance` and `status` of one pair."""
     check_seed(options.seed)
     camera = _camera(options)
-    preset = get_preset(options.method, options.preset)
+    settings = presets.preset(options.method, options.preset)
     reference = read_frame(options.rgb0, options.depth0, camera)
     target = read_frame(options.rgb1, options.depth1, camera)
     enable_compilation_cache()
     with waiting("compiling and aligning …"):
-        found = align_pair(
-            reference, target, camera.rectified(), preset.solver, jax.random.key(options.seed), options=preset.alignment
-        )
+        found = align_pair(reference, target, camera.rectified(), settings, key=jax.random.key(options.seed))
     answer = {
         "target_T_reference": found.target_T_reference,
         "xi": found.xi,

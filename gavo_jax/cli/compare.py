@@ -6,18 +6,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax import plots
+from gavo_jax import plots, presets
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, save_figure, track_visibly
-from gavo_jax.comparison import PeerOdometry
+from gavo_jax.comparison import peer_odometry
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Odometry
-from gavo_jax.peers import PEERS
-from gavo_jax.presets import METHODS, get_preset
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.peers import PEERS, make_peer
+from gavo_jax.presets import METHODS
 from gavo_jax.report import REPORT, Table, write_report
 from gavo_jax.results import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.trajectory import Trajectory
@@ -59,7 +59,7 @@ def compare(options: Compare) -> int:
         raise GavoError(f"--seeds: must be from 1 to {MAX_SEED}, not {options.seeds}")
     sequence = open_sequence(options)
     enable_compilation_cache()
-    peers = {name: PeerOdometry(name, sequence.camera) for name in methods if name in PEERS}
+    peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     remove_files(folder, COMPARISON, REPORT)
     remove_figures(folder)
@@ -112,17 +112,14 @@ def _parse_methods(text: str) -> list[str]:
     return names
 
 
-def _run_method(
-    sequence: Sequence, method: str, preset_name: str, seed: int | None, peer: PeerOdometry | None
-) -> Entry:
+def _run_method(sequence: Sequence, method: str, preset_name: str, seed: int | None, peer: Odometry | None) -> Entry:
     """Run one method once; a peer has neither preset nor seed.
 
     Raises:
         KeyboardInterrupt: the user stopped it; an unfinished run is not compared.
     """
     if peer is None:
-        preset = get_preset(method, preset_name)
-        odometry = Odometry(sequence.camera, preset.solver, preset.alignment, preset.odometry, seed or 0)
+        odometry = Odometry(sequence.camera, presets.preset(method, preset_name), seed=seed or 0)
     else:
         odometry = peer
     label = method if seed is None else f"{method}, seed {seed}"
@@ -135,7 +132,7 @@ def _run_method(
         "preset": None if peer else preset_name,
         "seed": seed,
         **tracked.metrics,
-        "versions": peer.peer.versions if peer else environment(),
+        "versions": make_peer(method, sequence.camera).versions if peer else environment(),
     }
     return Entry(method, metrics, tracked.trajectory)
 

@@ -9,15 +9,18 @@ from typing import Any
 
 import jax
 
+from gavo_jax import presets
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
-from gavo_jax.presets import Preset, get_preset
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.results import RECORDING, RunFolder, environment
+from gavo_jax.settings import Settings
 from gavo_jax.viewer import Viewer, make_viewer
 
 LOST = 3
@@ -44,23 +47,17 @@ FIGURES_OF_MERIT = (
 def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
     check_seed(options.seed)
-    preset = _effective_preset(options)
+    settings = _effective_settings(options)
     sequence = open_sequence(options)
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
     with RunFolder(path) as folder, viewer:
-        odometry = Odometry(
-            sequence.camera,
-            preset.solver,
-            preset.alignment,
-            preset.odometry,
-            options.seed,
-            record=viewer.wants_populations,
-        )
-        config = _config(options, preset, sequence)
-        progress = folder.resume(config, odometry.blank_state()) if options.resume else None
+        odometry = Odometry(sequence.camera, settings, seed=options.seed, record=viewer.wants_populations)
+        config = _config(options, settings, sequence)
+        blank = blank_state(sequence.camera, settings.solver, settings.alignment)
+        progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             print(f"gavo: {folder.path}: the run came to its end before: nothing to resume", file=sys.stderr)
@@ -116,17 +113,17 @@ def _track(
     return metrics, tracked.interrupted
 
 
-def _effective_preset(options: Run) -> Preset:
-    preset = get_preset(options.method, options.preset)
-    odometry = preset.odometry
+def _effective_settings(options: Run) -> Settings:
+    settings = presets.preset(options.method, options.preset)
+    odometry = settings.odometry
     if options.reference is not None:
         odometry = replace(odometry, reference=options.reference)
     if options.on_lost is not None:
         odometry = replace(odometry, on_lost=options.on_lost)
-    return replace(preset, odometry=odometry)
+    return replace(settings, odometry=odometry)
 
 
-def _config(options: Run, preset: Preset, sequence: Sequence) -> dict[str, Any]:
+def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, Any]:
     """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
     places = {
         name: str(Path(place).resolve())
@@ -142,9 +139,9 @@ def _config(options: Run, preset: Preset, sequence: Sequence) -> dict[str, Any]:
             "last_timestamp": float(sequence.timestamps[-1]),
             "camera": sequence.camera,
         },
-        "solver": preset.solver,
-        "alignment": preset.alignment,
-        "odometry": preset.odometry,
+        "solver": settings.solver,
+        "alignment": settings.alignment,
+        "odometry": settings.odometry,
         "device": jax.devices()[0].device_kind,
         "versions": environment(),
     }

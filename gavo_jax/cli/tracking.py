@@ -15,7 +15,8 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import distance_error
 from gavo_jax.landscape import error_landscape
-from gavo_jax.odometry import Odometry, Step, compute_metrics, track, trajectory_of
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.run import compute_metrics, trajectory_of
 from gavo_jax.report import Picture
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer import NO_VIEWER, Viewer
@@ -54,7 +55,7 @@ def track_visibly(
     interrupted = False
 
     def watch(frame: Frame | None, step: Step | None) -> None:
-        viewer.watch(frame, step, odometry.populations)
+        viewer.watch(frame, step, odometry.candidates)
 
     with pair_progress(label, pairs, done) as bar:
         compile_seconds = odometry.warm_up()
@@ -104,16 +105,17 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
     good = [step for step in steps if not step.lost]
     if not plots.available() or not good:
         return
-    solver = odometry.solver
-    visits = visited_levels(solver.levels, odometry.alignment)
+    settings = odometry.settings
+    solver = settings.solver
+    visits = visited_levels(solver.levels, settings.alignment)
     widths = [solver.iterations[level] for level in visits]
     whole = [step.alignment.history for step in good if len(step.alignment.history) == sum(widths)]
     if whole:
         parts = np.split(np.stack(whole), np.cumsum(widths)[:-1], axis=1)
         histories = dict(zip(visits, parts, strict=True))
         save_figure(plots.plot_convergence(histories), folder, "convergence")
-    if odometry.populations:
-        trimmed = [population.trimmed() for population in odometry.populations]
+    if odometry.candidates:
+        trimmed = [population.trimmed() for population in odometry.candidates]
         errors = {int(population.level): np.asarray(population.error) for population in trimmed}
         save_figure(plots.plot_population(errors), folder, "population")
     landscape = _landscape_of(sequence, odometry, good[len(good) // 2])
@@ -124,12 +126,13 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
 def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> plots.Landscape | None:
     """Return E around the motion of a step at the coarsest and the finest level; None where a frame is unreadable."""
     reference = int(np.searchsorted(sequence.timestamps, step.reference_timestamp))
-    levels = dict.fromkeys((odometry.solver.levels[0], odometry.solver.levels[-1]))
+    settings = odometry.settings
+    levels = dict.fromkeys((settings.solver.levels[0], settings.solver.levels[-1]))
     try:
         frames = sequence[reference], sequence[step.index]
     except FrameError:
         return None
-    return error_landscape(*frames, odometry.camera, step.alignment, odometry.alignment, tuple(levels))
+    return error_landscape(*frames, odometry.camera, step.alignment, settings.alignment, tuple(levels))
 
 
 def save_figure(figure: "Figure", folder: Path, name: str) -> Picture:

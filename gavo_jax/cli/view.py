@@ -9,7 +9,7 @@ from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry import Step
+from gavo_jax.odometry.driver import Step
 from gavo_jax.results import CONFIG, VIEW, RecordedRun, read_run
 from gavo_jax.viewer import make_viewer
 

@@ -13,12 +13,13 @@ from typing import Any, Protocol
 
 import jax
 
-from gavo_jax.comparison import PeerOdometry
+from gavo_jax.comparison import peer_odometry
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
-from gavo_jax.odometry import Odometry, Step, compute_metrics, trajectory_of
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.run import compute_metrics, trajectory_of
 from gavo_jax.peers import make_peer
 from gavo_jax.results import environment
 
@@ -193,9 +194,8 @@ class _Tracker:
 
 def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
     if run.settings is None:
-        return PeerOdometry(run.method, sequence.camera)
-    settings = run.settings
-    return Odometry(sequence.camera, settings.solver, settings.alignment, settings.odometry, run.seed or 0)
+        return peer_odometry(run.method, sequence.camera)
+    return Odometry(sequence.camera, run.settings, seed=run.seed or 0)
 
 
 def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]) -> Row:

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from gavo_jax import presets
 from gavo_jax.camera import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError, read_text, shown
-from gavo_jax.experiments.settings import MAX_REAL, flatten, override, refuse_unknown
 from gavo_jax.experiments.together import program_of
 from gavo_jax.peers import PEERS
-from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
+from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.results import describe
+from gavo_jax.settings import Settings
+from gavo_jax.settings_file import MAX_REAL, flatten, override, refuse_unknown
 
 KEYS = ("name", "output", "seeds", "batch", "sequences", "methods", "ray")
 SEQUENCE_KEYS = ("path", "name", "camera", "start", "frames", "stride", "optional")
@@ -80,7 +82,7 @@ class Run:
     preset: str
     variant: str
     seed: int | None
-    settings: Preset | None
+    settings: Settings | None
 
     @property
     def label(self) -> str:
@@ -303,7 +305,7 @@ class _Variant:
     method: str
     preset: str
     text: str
-    settings: Preset | None
+    settings: Settings | None
     seeds: tuple[int | None, ...]
     printed: Mapping[str, float]
 
@@ -338,10 +340,10 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     if method in PEERS:
         refuse_unknown(f"{place}: {method} has no settings", entry, ("name", "printed", "optional"))
         return [_Variant(method, "", "", None, (None,), printed)]
-    presets = entry.get("presets", ["default"])
-    if not isinstance(presets, list) or not presets:
+    names = entry.get("presets", ["default"])
+    if not isinstance(names, list) or not names:
         raise GavoError(f"{place}: presets: not a list of names")
-    refuse_unknown(f"{place}: presets", map(str, presets), PRESETS)
+    refuse_unknown(f"{place}: presets", map(str, names), PRESETS)
     seeds = seeds_of(f"{place}: seeds", entry["seeds"]) if "seeds" in entry else default_seeds
     rooms = {room: entry[room] for room in ("solver", "alignment", "odometry") if room in entry}
     fixed = flatten(place, rooms)
@@ -350,10 +352,10 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
         if not isinstance(values, list) or not values:
             raise GavoError(f"{place}: sweep.{_line(name)}: not a list of values")
     variants = []
-    for preset in presets:
+    for preset in names:
         for choice in itertools.product(*swept.values()):
             values = fixed | dict(zip(swept, choice, strict=True))
-            settings = override(get_preset(method, preset), values, place)
+            settings = override(presets.preset(method, preset), values, place)
             text = ", ".join(f"{name.partition('.')[2]}={_short(value)}" for name, value in values.items())
             variants.append(_Variant(method, preset, text, settings, seeds, printed))
     return variants

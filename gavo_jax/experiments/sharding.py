@@ -9,9 +9,11 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, Images, _stacked_images, align_rows, on_host
+from gavo_jax.alignment import Alignment, Images, align_rows, on_host, stacked_images
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
+from gavo_jax.settings import Settings, as_settings
+from gavo_jax.solvers.base import Solver
 
 PAIRS = PartitionSpec("pairs")
 
@@ -20,10 +22,10 @@ def align_batch_sharded(
     references: Any,
     targets: Any,
     camera: Camera,
-    solver: Any = None,
+    settings: Settings | Solver | None = None,
+    *,
     keys: PRNGKeyArray | None = None,
     guesses: Float[Any, "b 4 4"] | None = None,
-    options: AlignmentOptions | None = None,
 ) -> Alignment:
     """`align_batch` with its B pairs laid out over all devices, one program for all (`shard_map`).
 
@@ -35,10 +37,9 @@ def align_batch_sharded(
         references: As in `align_batch`.
         targets: As in `align_batch`.
         camera: As in `align_batch`.
-        solver: As in `align_batch`.
+        settings: As in `align_batch`.
         keys: As in `align_batch`.
         guesses: As in `align_batch`.
-        options: As in `align_batch`.
 
     Returns:
         As `align_batch`, in NumPy arrays.
@@ -46,7 +47,8 @@ def align_batch_sharded(
     Raises:
         GavoError: as `align_batch`.
     """
-    sides = [_stacked_images(side, camera) for side in (references, targets)]
+    settings = as_settings(settings)
+    sides = [stacked_images(side, camera) for side in (references, targets)]
     count = len(sides[0].grey)
     if len(sides[1].grey) != count:
         raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
@@ -56,7 +58,7 @@ def align_batch_sharded(
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:
         own = (Images(*references), Images(*targets))
-        return align_rows(own, camera, solver, options, jax.random.wrap_key_data(keys), guesses)
+        return align_rows(own, camera, settings, jax.random.wrap_key_data(keys), guesses)
 
     align_all = jax.jit(jax.shard_map(align_own, mesh=mesh, in_specs=PAIRS, out_specs=PAIRS, check_vma=False))
     rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), guesses)

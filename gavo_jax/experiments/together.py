@@ -9,19 +9,23 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Float64
 
-from gavo_jax.alignment import Alignment, AlignmentOptions, on_host
+from gavo_jax.alignment import Alignment, AlignmentStatus, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.odometry import Clock, Odometry, Progress, Step, TrackerState, _traced, _track, decoded, first_state
-from gavo_jax.presets import OdometryOptions, Preset
+from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recovery
+from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, decoded
+from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
+from gavo_jax.settings import Settings
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
 
@@ -55,7 +59,7 @@ def track_together(
 
 def track_stacked(
     sequence: FrameSequence,
-    presets: Sequence[Preset],
+    settings: Sequence[Settings],
     seeds: Sequence[int],
     on_frame: Callable[[], None] | None = None,
 ) -> list[list[Step]]:
@@ -65,7 +69,7 @@ def track_stacked(
 
     Args:
         sequence: As in `track_together`.
-        presets: Settings of each run, of one structure: what differs are rates (see `program_of`).
+        settings: Of each run, of one structure: what differs are rates (see `program_of`).
         seeds: Seed of each run.
         on_frame: As in `track_together`.
 
@@ -75,13 +79,13 @@ def track_stacked(
     Raises:
         FrameError: the first frame cannot be read.
     """
-    stack = _Stack(sequence.camera, presets, seeds)
+    stack = _Stack(sequence.camera, settings, seeds)
     return _drive(sequence, stack.lanes, stack.register, on_frame)
 
 
-def program_of(preset: Preset) -> Any:
+def program_of(settings: Settings) -> Any:
     """What decides, beside the camera, the compiled program of a run: runs of equal (hashable) answers share one."""
-    return jax.tree.structure(_settings_of(preset))
+    return jax.tree.structure(_of_program(settings))
 
 
 def _drive(
@@ -96,7 +100,7 @@ def _drive(
         for i, step in enumerate(register(frame, float(sequence.timestamps[index]))):
             if step is not None and not stopped[i]:
                 steps[i].append(step)
-                stopped[i] = step.lost and odometries[i].options.on_lost == "stop"
+                stopped[i] = step.lost and odometries[i].settings.odometry.on_lost == "stop"
         if on_frame is not None:
             on_frame()
         if all(stopped):
@@ -104,12 +108,9 @@ def _drive(
     return steps
 
 
-Settings = tuple[Any, AlignmentOptions, OdometryOptions]
-"""A run's solver, what it minimises and how the driver uses it, as the program takes them."""
-
-
-def _settings_of(preset: Preset) -> Settings:
-    return preset.solver, preset.alignment, _traced(preset.odometry)
+def _of_program(settings: Settings) -> Settings:
+    """What the program for a frame takes of a run's settings."""
+    return replace(settings, odometry=traced_part(settings.odometry))
 
 
 @jax.jit
@@ -125,7 +126,8 @@ def _track_stack(
     """One frame of R runs: everything but the images and the camera has a leading axis R."""
 
     def one(state: TrackerState, clock: Clock, key: Any, settings: Settings) -> Any:
-        return _track(state, grey, depth, clock, key, camera, *settings, record=False)[:2]
+        parts = (settings.solver, settings.alignment, settings.odometry)
+        return track_frame(state, grey, depth, clock, key, camera, *parts, record=False)[:2]
 
     return jax.vmap(one)(states, clocks, keys, settings)
 
@@ -134,40 +136,48 @@ NEW_ROW: Any = object()
 """Stands for a lane's state after its first attempt at a frame: a row of the new stack."""
 
 
-class _Lane(Odometry):
-    """One run of a stack: its first attempt at a frame was made with the others', whatever follows is its own."""
+@dataclass
+class _Stacked:
+    """The search of one run of a stack: its first attempt at a frame was made with the others'."""
 
-    first_attempt: Alignment | None = None
+    search: Search
+    made: Alignment | None = None
+    """That attempt's result; None where there is none, and the run is on its own."""
 
-    def _run(
-        self,
-        state: TrackerState,
-        frame: Frame,
-        clock: Clock,
-        solver: Any = None,
-        alignment: AlignmentOptions | None = None,
-        options: OdometryOptions | None = None,
-    ) -> tuple[TrackerState, Alignment]:
-        if solver is None and self.first_attempt is not None:
-            return NEW_ROW, self.first_attempt
-        return super()._run(state, frame, clock, solver, alignment, options)
+    def warm_up(self) -> float:
+        """The stack's program compiles with its first frame."""
+        return 0.0
 
-    def _start(self, frame: Frame) -> TrackerState:
+    def start(self, frame: Frame) -> TrackerState:
         """As of a single run, whose program the stack has no other use for."""
-        return first_state(frame.grey, frame.depth, self.camera, self.solver, self.alignment)
+        settings = self.search.settings
+        return first_state(frame.grey, frame.depth, self.search.camera, settings.solver, settings.alignment)
+
+    def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
+        """The attempt that was made."""
+        if self.made is None:
+            return self.search.align(state, frame, clock)
+        return Attempt(NEW_ROW, self.made, self.made.status == AlignmentStatus.OK)
+
+    def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """As of a single run."""
+        return self.search.predict(state, elapsed)
 
 
 class _Stack:
     """R lanes whose states are rows of one stack on the device."""
 
-    def __init__(self, camera: Camera, presets: Sequence[Preset], seeds: Sequence[int]) -> None:
+    def __init__(self, camera: Camera, settings: Sequence[Settings], seeds: Sequence[int]) -> None:
+        self._searches = [
+            _Stacked(Search(camera, own, jax.random.key(seed))) for own, seed in zip(settings, seeds, strict=True)
+        ]
         self.lanes = [
-            _Lane(camera, preset.solver, preset.alignment, preset.odometry, seed)
-            for preset, seed in zip(presets, seeds, strict=True)
+            Odometry(camera, stacked.search.settings, aligner=with_recovery(stacked, stacked.search))
+            for stacked in self._searches
         ]
         self._camera = camera
-        self._sharding = _over_devices(len(presets))
-        self._settings = self._rows([_settings_of(preset) for preset in presets])
+        self._sharding = _over_devices(len(settings))
+        self._settings = self._rows([_of_program(own) for own in settings])
 
     def register(self, frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
         """Track one more frame by all lanes; each decides by itself what becomes of it."""
@@ -176,23 +186,23 @@ class _Stack:
         if isinstance(frame, Frame) and all(progress.tracker is not None for progress in before):
             after = self._attempt(frame, before)
         steps = [lane.register(frame, timestamp) for lane in self.lanes]
-        for i, lane in enumerate(self.lanes):
+        for i, (lane, stacked) in enumerate(zip(self.lanes, self._searches, strict=True)):
             if lane.progress.tracker is NEW_ROW:
                 lane.progress = lane.progress._replace(tracker=_row(after, i))
-            lane.first_attempt = None
+            stacked.made = None
         return steps
 
     def _attempt(self, frame: Frame, before: Sequence[Progress]) -> TrackerState:
         """Align a frame by all lanes in one call; each lane keeps its own result, the stack of states is returned."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
-        clocks = self._rows([lane.clock(progress, frame) for lane, progress in zip(self.lanes, numbered, strict=True)])
-        keys = jnp.stack([lane.key for lane in self.lanes])
+        clocks = self._rows([clock_of(progress, frame) for progress in numbered])
+        keys = jnp.stack([stacked.search.key for stacked in self._searches])
         states = self._rows([progress.tracker for progress in before])
         images = jnp.asarray(frame.grey), jnp.asarray(frame.depth)
         after, results = _track_stack(states, *images, clocks, keys, self._camera, self._settings)
         host = jax.device_get(results)
-        for i, lane in enumerate(self.lanes):
-            lane.first_attempt = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
+        for i, stacked in enumerate(self._searches):
+            stacked.made = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
         return after
 
     def _rows(self, values: Sequence[Any]) -> Any:

@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
-from gavo_jax.experiments.settings import flatten, override, refuse_unknown
-from gavo_jax.odometry import run_odometry
-from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.settings import Settings
+from gavo_jax.settings_file import flatten, override, refuse_unknown
 
 KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
 RANGE_KEYS = ("low", "high", "step", "log")
@@ -72,7 +74,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     space = flatten(f"{path}: space", table.get("space", {}), lambda value: "low" in value or "high" in value)
     if not space:
         raise GavoError(f"{path}: space: nothing to tune")
-    start = get_preset(method, preset)
+    start = presets.preset(method, preset)
     for key, spec in space.items():
         place = f"{path}: space.{key}"
         for bound in _bounds(place, spec):
@@ -110,7 +112,7 @@ def tune(
         raise GavoError("tuning needs Optuna: pip install 'gavo-jax[tune]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sequences = [part.open() for part in tuning.parts]
-    start = get_preset(tuning.method, tuning.preset)
+    start = presets.preset(tuning.method, tuning.preset)
     try:
         study = optuna.create_study(
             storage=storage, study_name=tuning.name, directions=["minimize", "minimize"], load_if_exists=True
@@ -121,8 +123,8 @@ def tune(
         trial = study.ask()
         try:
             values = {key: _suggest(trial, key, spec) for key, spec in tuning.space.items()}
-            preset = override(start, values, f"trial {trial.number}")
-            drift, milliseconds = measure(sequences, preset, tuning.seeds)
+            settings = override(start, values, f"trial {trial.number}")
+            drift, milliseconds = measure(sequences, settings, tuning.seeds)
         except BaseException:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
             raise
@@ -132,7 +134,7 @@ def tune(
     return sorted(front, key=lambda choice: choice.milliseconds)
 
 
-def measure(sequences: list[FrameSequence], preset: Preset, seeds: tuple[int, ...]) -> tuple[float, float]:
+def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:
     """Geometric means of drift (m/s) and of the median time a pair (ms), run by run: nothing shares the machine.
 
     Raises:
@@ -141,7 +143,7 @@ def measure(sequences: list[FrameSequence], preset: Preset, seeds: tuple[int, ..
     figures = []
     for sequence in sequences:
         for seed in seeds:
-            run = run_odometry(sequence, preset.solver, seed, preset.alignment, preset.odometry)
+            run = run_odometry(sequence, settings, seed=seed)
             if run.metrics[DRIFT] is None:
                 raise GavoError(f"{sequence.name}: no ground truth over a second of it")
             figures.append((run.metrics[DRIFT], run.metrics[TIME]))

@@ -1,7 +1,7 @@
 """The solver protocol and the one loop that runs every solver on a pyramid level."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,7 @@ class Candidates(NamedTuple):
     error: Float[Array, " p"]
 
 
+@runtime_checkable
 class Solver(Protocol):
     """A frozen dataclass pytree of hyperparameters.
 
@@ -48,6 +49,8 @@ class Solver(Protocol):
     every level, so arrays are made for the largest entry and what counts on a level is a number in the program:
     `PerLevel` brings what that needs.
     """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def iterations(self) -> Schedule:

@@ -6,12 +6,13 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from gavo_jax import presets
 from gavo_jax.alignment import Alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
-from gavo_jax.experiments.settings import override
 from gavo_jax.experiments.sharding import align_batch_sharded
-from gavo_jax.presets import Preset, get_preset
+from gavo_jax.settings import Settings
+from gavo_jax.settings_file import override
 
 PAIRS = 11
 """Eight devices do not divide it."""
@@ -20,10 +21,10 @@ GUESS = 0.1
 FIGURES = ("xi", "error", "covariance")
 
 
-def methods() -> dict[str, Preset]:
+def methods() -> dict[str, Settings]:
     """Gauss-Newton, and two generations of the genetic algorithm."""
-    generations = override(get_preset("ga"), {"solver.iterations": [0, 0, 0, 0, 2]})
-    return {"gauss-newton": get_preset("gauss-newton"), "ga": generations}
+    generations = override(presets.preset("ga"), {"solver.iterations": [0, 0, 0, 0, 2]})
+    return {"gauss-newton": presets.preset("gauss-newton"), "ga": generations}
 
 
 def pairs(seed: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Camera, jax.Array]:
@@ -41,8 +42,8 @@ def figures_of(align: Callable[..., Alignment], seed: int = 5) -> dict[str, np.n
     guesses = np.tile(np.eye(4, dtype=np.float32), (PAIRS, 1, 1))
     guesses[:, 0, 3] = GUESS
     figures = {}
-    for name, preset in methods().items():
-        found = align(references, targets, camera, preset.solver, keys, guesses, preset.alignment)
+    for name, settings in methods().items():
+        found = align(references, targets, camera, settings, keys=keys, guesses=guesses)
         figures |= {f"{name}_{figure}": np.asarray(getattr(found, figure)) for figure in FIGURES}
     return figures
 

@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
+from gavo_jax import presets
 from gavo_jax.cli import main
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments import tuning
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state
 from gavo_jax.experiments.plan import read_plan
 from gavo_jax.experiments.runner import estimate_seconds, missing, run_experiment
-from gavo_jax.experiments.settings import override
 from gavo_jax.experiments.table import COLUMNS, Table
 from gavo_jax.experiments.tuning import measure, read_tuning, tune
-from gavo_jax.presets import get_preset
+from gavo_jax.settings_file import override
 
 METHODS = """
 [[methods]]
@@ -165,7 +165,7 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
 
 
 def test_what_a_trial_measures(tuned):
-    preset = override(get_preset("gauss-newton"), {"solver.iterations": [0, 0, 6, 6, 8]})
+    preset = override(presets.preset("gauss-newton"), {"solver.iterations": [0, 0, 6, 6, 8]})
     drift, milliseconds = measure([read_tuning(tuned).parts[0].open()], preset, (0,))
     assert 0 < drift < 0.5 and milliseconds > 0
 

@@ -11,17 +11,19 @@ import jax
 import numpy as np
 import pytest
 
+from gavo_jax import presets
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
 from gavo_jax.experiments.executors import LocalExecutor
 from gavo_jax.experiments.plan import read_plan
 from gavo_jax.experiments.runner import run_experiment
-from gavo_jax.experiments.settings import override
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
-from gavo_jax.odometry import Odometry, Step, run_odometry, track
-from gavo_jax.presets import Preset, get_preset
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.settings import Settings
+from gavo_jax.settings_file import override
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 FRAMES = 5
@@ -43,8 +45,8 @@ class Damaged(SyntheticSequence):
         return frame
 
 
-def drivers(presets: list[Preset]) -> list[Odometry]:
-    return [Odometry(CAMERA, p.solver, p.alignment, p.odometry, seed) for seed, p in enumerate(presets)]
+def drivers(settings: list[Settings]) -> list[Odometry]:
+    return [Odometry(CAMERA, own, seed=seed) for seed, own in enumerate(settings)]
 
 
 def poses(steps: list[Step]) -> np.ndarray:
@@ -72,9 +74,9 @@ SMALL = {"solver.iterations": [0, 0, 6, 6, 8]}
 """The three coarsest levels: 40 x 30 pixels are the finest."""
 
 
-def rates(count: int) -> list[Preset]:
+def rates(count: int) -> list[Settings]:
     """Gauss-Newton with a damping and a depth weight of its own for every run."""
-    preset = override(get_preset("gauss-newton"), SMALL)
+    preset = override(presets.preset("gauss-newton"), SMALL)
     return [
         replace(
             preset,
@@ -86,20 +88,19 @@ def rates(count: int) -> list[Preset]:
 
 
 def test_together_is_one_by_one_bit_for_bit():
-    preset = override(get_preset("ga"), SMALL | {"solver.population": [0, 0, 8, 8, 16]})
-    presets = [preset] * 2
-    presets += [replace(preset, solver=replace(preset.solver, mutation_decay=decay)) for decay in (0.6, 0.9)]
-    found = track_together(frames(), drivers(presets))
-    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
-        alone = list(track(frames(), preset.solver, preset.alignment, preset.odometry, seed=i))
+    one = override(presets.preset("ga"), SMALL | {"solver.population": [0, 0, 8, 8, 16]})
+    settings = [one] * 2 + [replace(one, solver=replace(one.solver, mutation_decay=decay)) for decay in (0.6, 0.9)]
+    found = track_together(frames(), drivers(settings))
+    for i, (own, steps) in enumerate(zip(settings, found, strict=True)):
+        alone = list(track(frames(), own, seed=i))
         assert np.array_equal(poses(steps), poses(alone))
     assert len({steps[-1].alignment.error.tobytes() for steps in found}) == 4
 
 
 def test_lost_frames_together():
-    presets = rates(2)
-    stopping = [replace(p, odometry=replace(p.odometry, on_lost="stop", recover=False)) for p in presets[:1]]
-    staying = [replace(p, odometry=replace(p.odometry, recover=False)) for p in presets[1:]]
+    settings = rates(2)
+    stopping = [replace(p, odometry=replace(p.odometry, on_lost="stop", recover=False)) for p in settings[:1]]
+    staying = [replace(p, odometry=replace(p.odometry, recover=False)) for p in settings[1:]]
     sequence = Damaged(7, camera=CAMERA)
     found = track_together(sequence, drivers(stopping + staying))
     assert [len(steps) for steps in found] == [2, 6]
@@ -107,21 +108,21 @@ def test_lost_frames_together():
 
 
 def test_stacked_runs_agree_with_single_ones():
-    presets = rates(4)
-    found = track_stacked(frames(), presets, range(4))
-    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
-        alone = list(track(frames(), preset.solver, preset.alignment, preset.odometry, seed=i))
+    settings = rates(4)
+    found = track_stacked(frames(), settings, range(4))
+    for i, (own, steps) in enumerate(zip(settings, found, strict=True)):
+        alone = list(track(frames(), own, seed=i))
         np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
         assert [step.index for step in steps] == [1, 2, 3, 4]
     assert not np.array_equal(poses(found[0]), poses(found[3]))
 
 
 def test_stacked_runs_lose_and_find_themselves():
-    presets = [replace(p, odometry=replace(p.odometry, recover=False)) for p in rates(4)]
+    settings = [replace(p, odometry=replace(p.odometry, recover=False)) for p in rates(4)]
     sequence = Damaged(7, camera=CAMERA)
-    found = track_stacked(sequence, presets, range(4))
-    for i, (preset, steps) in enumerate(zip(presets, found, strict=True)):
-        alone = list(track(sequence, preset.solver, preset.alignment, preset.odometry, seed=i))
+    found = track_stacked(sequence, settings, range(4))
+    for i, (own, steps) in enumerate(zip(settings, found, strict=True)):
+        alone = list(track(sequence, own, seed=i))
         assert [step.lost for step in steps] == [step.lost for step in alone]
         np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
 
@@ -155,7 +156,7 @@ def test_64_runs_compile_once_and_are_the_single_runs_in_half_the_time(
     assert len(plan.runs) == 64 and plan.programs == 1
     settings = plan.runs[0].settings
     assert settings is not None
-    run_odometry(frames(), settings.solver, 0, settings.alignment, settings.odometry)
+    run_odometry(frames(), settings)
     with compilations() as events:
         start = time.perf_counter()
         table = Table(plan.folder)
@@ -166,8 +167,7 @@ def test_64_runs_compile_once_and_are_the_single_runs_in_half_the_time(
     start = time.perf_counter()
     for run in plan.runs:
         assert run.settings is not None and run.seed is not None
-        preset = run.settings
-        alone = run_odometry(frames(), preset.solver, run.seed, preset.alignment, preset.odometry).metrics
+        alone = run_odometry(frames(), run.settings, seed=run.seed).metrics
         for name in ("rpe_translation_rmse_m_per_frame", "ate_translation_rmse_m", "distance_error_final_m"):
             assert rows[run.id][name] == alone[name]
     single = time.perf_counter() - start

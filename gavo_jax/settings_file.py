@@ -10,11 +10,11 @@ import optax
 
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.objective import LOSSES
-from gavo_jax.presets import Preset
 from gavo_jax.pyramid import LEVELS
+from gavo_jax.settings import Settings
 
-ROOMS = tuple(field.name for field in dataclasses.fields(Preset))
-"""First part of a dotted name: the parts of a preset."""
+ROOMS = tuple(field.name for field in dataclasses.fields(Settings))
+"""First part of a dotted name: the parts of the settings."""
 OPTIMIZERS = ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 """optax's optimisers that need nothing but a learning rate."""
 MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
@@ -31,11 +31,11 @@ def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> Non
             raise GavoError(f"{place}: unknown key {shown(key)}{hint}")
 
 
-def override(preset: Preset, values: Mapping[str, Any], place: str = "settings") -> Preset:
-    """Return the preset with some hyperparameters replaced.
+def override(settings: Settings, values: Mapping[str, Any], place: str = "settings") -> Settings:
+    """Return the settings with some hyperparameters replaced.
 
     Args:
-        preset: What the others are taken from.
+        settings: What the others are taken from.
         values: Value by dotted name. A list gives a schedule an entry a pyramid level (level 0 first); a single number
             stands for every level of a schedule of rates; `solver.population.4` names the entry of level 4. The word
             `none` switches an optional number off; losses and optax's optimisers go by their names.
@@ -47,7 +47,7 @@ def override(preset: Preset, values: Mapping[str, Any], place: str = "settings")
     for name, value in values.items():
         room, _, rest = name.partition(".")
         refuse_unknown(place, [room], ROOMS)
-        part = getattr(preset, room)
+        part = getattr(settings, room)
         field, _, level = rest.partition(".")
         refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part)])
         current = getattr(part, field)
@@ -56,9 +56,9 @@ def override(preset: Preset, values: Mapping[str, Any], place: str = "settings")
             new: Any = _with_level(where, current, level, value)
         else:
             new = _convert(where, type(part), field, current, value)
-        preset = dataclasses.replace(preset, **{room: dataclasses.replace(part, **{field: new})})
-    _check_schedules(place, preset.solver)
-    return preset
+        settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
+    _check_schedules(place, settings.solver)
+    return settings
 
 
 def flatten(place: str, table: Mapping[str, Any], is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:

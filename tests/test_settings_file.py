@@ -3,10 +3,12 @@
 import optax
 import pytest
 
+from gavo_jax import presets
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.settings import flatten, override
 from gavo_jax.objective import huber
-from gavo_jax.presets import get_preset
+from gavo_jax.settings_file import flatten, override
+from gavo_jax.solvers.genetic import GeneticAlgorithm
+from gavo_jax.solvers.gradient import GradientDescent
 
 
 def test_values_of_every_kind():
@@ -22,7 +24,8 @@ def test_values_of_every_kind():
         "alignment.bounds": [0.1, 0.2],
         "odometry.on_lost": "stop",
     }
-    preset = override(get_preset("ga", "default"), values)
+    preset = override(presets.preset("ga", "default"), values)
+    assert isinstance(preset.solver, GeneticAlgorithm)
     assert preset.solver.mutation_decay == 1.0 and isinstance(preset.solver.mutation_decay, float)
     assert preset.solver.population == (0, 8, 8, 8, 8) and preset.solver.iterations[3:] == (10, 3)
     assert preset.solver.spread == (2.5,) * 5 and preset.solver.mutation_step is None
@@ -31,10 +34,11 @@ def test_values_of_every_kind():
     assert preset.odometry.on_lost == "stop"
     for name in ("default", "fast", "paper"):
         for points in (900, [0, 900, 600, 300, 300]):
-            chosen = override(get_preset("ga", name), {"alignment.points": points}).alignment.points
+            chosen = override(presets.preset("ga", name), {"alignment.points": points}).alignment.points
             assert chosen == (points if isinstance(points, int) else tuple(points))
-        assert override(get_preset("ga", name), {"alignment.points": "none"}).alignment.points is None
-    assert override(get_preset("adam"), {"solver.optimizer": "lion"}).solver.optimizer is optax.lion
+        assert override(presets.preset("ga", name), {"alignment.points": "none"}).alignment.points is None
+    by_lion = override(presets.preset("adam"), {"solver.optimizer": "lion"}).solver
+    assert isinstance(by_lion, GradientDescent) and by_lion.optimizer is optax.lion
 
 
 @pytest.mark.parametrize(
@@ -62,7 +66,7 @@ def test_values_of_every_kind():
 )
 def test_what_is_refused(name, value, words):
     with pytest.raises(GavoError) as refused:
-        override(get_preset("ga", "default"), {name: value}, "file.toml: methods[1]")
+        override(presets.preset("ga", "default"), {name: value}, "file.toml: methods[1]")
     assert all(word in str(refused.value) for word in ("file.toml: methods[1]", *words))
 
 

@@ -1,0 +1,205 @@
+"""Who finds the motion of a new frame: the search, the wide search behind it, or somebody else's odometry.
+
+An aligner is a value that the driver holds: it starts from a frame and then makes an `Attempt` at each new one. What it
+knows of earlier frames is a state that the driver keeps and hands back, so that an attempt that fails leaves no trace.
+"""
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from jaxtyping import Float64, PRNGKeyArray
+
+from gavo_jax import presets
+from gavo_jax.alignment import Alignment, AlignmentStatus, Population, on_host
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
+from gavo_jax.se3 import exp, rigid
+from gavo_jax.settings import OdometryOptions, Settings
+from gavo_jax.trajectory import inverse
+
+
+class Attempt(NamedTuple):
+    """What an aligner made of a frame."""
+
+    state: Any
+    """What it knows then, should the frame become the reference."""
+    result: Alignment
+    """On the host."""
+    usable: bool
+    """Whether the motion can be used."""
+    candidates: tuple[Population, ...] = ()
+    """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
+
+
+class Aligner(Protocol):
+    """Finds the motion of a new frame."""
+
+    def warm_up(self) -> float:
+        """Compile, or load, what is needed; the seconds this took."""
+        ...
+
+    def start(self, frame: Frame) -> Any:
+        """The state with a frame as the only reference."""
+        ...
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        """Align a frame with the references; the state stays as it is."""
+        ...
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """target_T_reference if the camera goes on as before for so many seconds."""
+        ...
+
+
+@dataclass(frozen=True)
+class Search:
+    """Our own: the compiled program of `tracking.track_frame`.
+
+    Attributes:
+        camera: Camera of the frames, without distortion.
+        settings: What searches, and how.
+        key: The run's; every random number follows from it and the frame's index.
+        record: Whether the candidates are kept.
+    """
+
+    camera: Camera
+    settings: Settings
+    key: PRNGKeyArray
+    record: bool = False
+
+    def warm_up(self) -> float:
+        """Compile the program for a frame, or load it from the cache."""
+        start, collects = time.perf_counter(), gc.isenabled()
+        gc.disable()  # tracing makes objects by the hundred thousand that all stay; looking through them takes a fifth
+        try:
+            size = (self.camera.height, self.camera.width)
+            self.start(Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0))
+        finally:
+            if collects:
+                gc.enable()
+        return time.perf_counter() - start
+
+    def blank_state(self) -> TrackerState:
+        """The state before the first frame."""
+        return blank_state(self.camera, self.settings.solver, self.settings.alignment)
+
+    def start(self, frame: Frame) -> TrackerState:
+        """The state after a first frame, by the program that serves every frame: there is nothing to find yet."""
+        return self.align(self.blank_state(), frame, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))).state
+
+    def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
+        """Align with the previous frame and the keyframe; the motion is usable if it is `OK`."""
+        settings = self.settings
+        state, result, populations = track_frame(
+            state,
+            frame.grey,
+            frame.depth,
+            clock,
+            self.key,
+            self.camera,
+            settings.solver,
+            settings.alignment,
+            traced_part(settings.odometry),
+            record=self.record,
+        )
+        result = on_host(result)
+        return Attempt(state, result, result.status == AlignmentStatus.OK, _by_level(populations))
+
+    def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the twist of the last motion."""
+        return rigid(exp(state.motion * (elapsed / float(state.seconds))))
+
+
+def _by_level(populations: Population | None) -> tuple[Population, ...]:
+    """The candidates of each visit to a level, on the host."""
+    if populations is None:
+        return ()
+    host = jax.device_get(populations)
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(len(host.level)))
+
+
+def traced_part(options: OdometryOptions) -> OdometryOptions:
+    """The options that shape the program; the others are reset, so that they cause no second compilation."""
+    return replace(options, recover=True, on_lost="hold")
+
+
+@dataclass(frozen=True)
+class Recovering:
+    """An aligner whose unusable results are tried again by another one, from the same state.
+
+    Attributes:
+        first: What is asked first.
+        second: What is asked where that is unusable; made when it is needed.
+    """
+
+    first: Aligner
+    second: Callable[[], Aligner]
+
+    def warm_up(self) -> float:
+        """That of the first one; the second compiles when it is needed."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> Any:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        """The first attempt if it is usable, else the second one if that is.
+
+        If neither is, the first one's motion can be used all the same where a high error is all that speaks against it
+        and the second ends at the same motion (blur, or something that moves).
+        """
+        attempt = self.first.align(state, frame, clock)
+        if attempt.usable:
+            return attempt
+        again = self.second().align(state, frame, clock)
+        if again.usable:
+            return again
+        confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
+        return attempt._replace(usable=confirmed and _agree(attempt.result, again.result))
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+AGREEMENT = (0.02, 0.02)
+"""Metres and radians within which two searches ended at the same motion."""
+
+
+def _agree(first: Alignment, second: Alignment) -> bool:
+    between = inverse(np.asarray(first.target_T_reference)) @ second.target_T_reference
+    angle = np.arccos(np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    return bool(np.linalg.norm(between[:3, 3]) < AGREEMENT[0] and angle < AGREEMENT[1])
+
+
+def wide_search(search: Search) -> Search:
+    """The wide search on the points that a search's references hold, against the previous frame alone."""
+    settings, wide = search.settings, presets.preset("ga", "wide")
+    genetic: Any = wide.solver
+    iterations = tuple(n if k in settings.solver.levels else 0 for k, n in enumerate(genetic.iterations))
+    wide = Settings(
+        replace(genetic, iterations=iterations),
+        replace(wide.alignment, points=settings.alignment.points),
+        replace(settings.odometry, reference="previous"),
+    )
+    return replace(search, settings=wide)
+
+
+def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: bool = False) -> Aligner:
+    """The aligner that settings describe."""
+    search = Search(camera, settings, key, record)
+    return with_recovery(search, search)
+
+
+def with_recovery(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner with the wide search behind it, where the search's settings ask for that."""
+    if not search.settings.odometry.recover:
+        return aligner
+    return Recovering(aligner, lambda: wide_search(search))

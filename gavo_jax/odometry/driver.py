@@ -1,0 +1,263 @@
+"""The thin driver: frames in, chained poses out.
+
+It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses; a thread decodes
+the next frame meanwhile.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.alignment import Alignment, AlignmentStatus, Population, no_alignment
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.frame_checks import Finding, History, Use, check_frame
+from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.settings import Settings, as_settings
+from gavo_jax.solvers.base import Solver
+from gavo_jax.trajectory import inverse
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the driver says of one new frame."""
+
+    index: int
+    """Of the frame in the sequence; the first frame, 0, makes no step."""
+    reference_timestamp: float
+    """Colour stamp of the reference, the last frame that was not lost, seconds."""
+    timestamp: float
+    alignment: Alignment
+    """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded. Its status may be
+    a warning about the frame (a gap before it, depth in part missing) that had a usable motion all the same."""
+    world_T_camera: Float64[np.ndarray, "4 4"]
+    """Recorded; the world is the first camera."""
+    milliseconds: float
+    """From the decoded images to the result on the host."""
+    lost: bool
+    """Whether there is no usable motion."""
+    policy: Literal["", "hold", "predict", "stop"] = ""
+    """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
+
+
+MAX_HELD = 3
+"""Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
+
+
+class Progress(NamedTuple):
+    """Where a driver stands between two frames: all that decides what it makes of the next ones."""
+
+    tracker: Any = None
+    """The aligner's state; None while no usable frame was seen."""
+    last_index: int = -1
+    """Of the last frame."""
+    reference_timestamp: float = 0.0
+    world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
+    world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
+    """As recorded last."""
+    held: int = 0
+    """Frames since the reference was renewed."""
+    history: History = History()
+
+
+class Odometry:
+    """Frame-by-frame tracking: it holds an aligner, and between two frames all it knows is its `progress`.
+
+    Args:
+        camera: Camera of the frames, without distortion.
+        settings: What searches, what is minimised, how it is used; the `default` preset's if left out.
+        seed: Every random number follows from it and the frames' indices.
+        record: Whether every frame's candidates are kept until the next frame, for people to look at.
+        solver: Takes the place of the settings' solver.
+        aligner: Takes the place of the search that the settings describe.
+
+    Attributes:
+        progress: Where it stands; a driver of the same settings that is given it goes on from there.
+        candidates: Of the last frame's search, an entry a level, coarsest first; empty unless they are recorded.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        settings: Settings | Solver | None = None,
+        *,
+        seed: int = 0,
+        record: bool = False,
+        solver: Solver | None = None,
+        aligner: Aligner | None = None,
+    ):
+        self.camera, self.settings = camera, as_settings(settings, solver)
+        self.aligner = aligner or make_aligner(camera, self.settings, jax.random.key(seed), record)
+        self.progress = Progress()
+        self.candidates: tuple[Population, ...] = ()
+
+    def warm_up(self) -> float:
+        """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
+        return self.aligner.warm_up()
+
+    def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
+        """Track one more frame.
+
+        A frame that is not fit for it (`frame_checks`) is flagged and never becomes a reference.
+
+        Args:
+            frame: The next frame; for one that could not be read the error, or None: it is lost, and the run goes on.
+            timestamp: Its colour stamp, seconds; later than the last one's, or the frame is lost.
+
+        Returns:
+            The step, or None for the first frame, which is the world's origin.
+
+        Raises:
+            FrameError: There is no first frame to start from.
+        """
+        if self.progress.last_index < 0 and not isinstance(frame, Frame):
+            raise frame or FrameError("the first frame could not be read")
+        start = time.perf_counter()
+        finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
+        usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
+        candidates: tuple[Population, ...] = ()
+        if before.tracker is None:
+            fit = usable if finding.use is Use.ALL else None
+            after = before if fit is None else self._restart(before, fit)
+            result, lost = no_alignment(AlignmentStatus.NO_REFERENCE if fit else finding.status), True
+        elif usable is None:
+            after, result, lost = self._lose(before, None, timestamp), no_alignment(finding.status), True
+        else:
+            attempt = self.aligner.align(before.tracker, usable, clock_of(before, usable))
+            after, result, lost = self._advance(before, usable, finding, attempt)
+            candidates = attempt.candidates
+        self.progress, self.candidates = after, candidates
+        if before.last_index == 0:
+            return None
+        milliseconds = (time.perf_counter() - start) * 1e3
+        return Step(
+            before.last_index,
+            before.reference_timestamp,
+            timestamp,
+            result,
+            after.world_T_camera.copy(),
+            milliseconds,
+            lost,
+            self.settings.odometry.on_lost if lost else "",
+        )
+
+    def _restart(self, before: Progress, frame: Frame) -> Progress:
+        """Make a frame the only reference, standing where the camera is recorded to be."""
+        return before._replace(
+            tracker=self.aligner.start(frame),
+            reference_timestamp=frame.timestamp,
+            world_T_reference=before.world_T_camera,
+            held=0,
+        )
+
+    def _advance(
+        self, before: Progress, frame: Frame, finding: Finding, attempt: Attempt
+    ) -> tuple[Progress, Alignment, bool]:
+        """What becomes of an attempt: where its motion is usable and the frame fit for it, that is the new reference.
+
+        Returns:
+            Where the driver stands now, the result, and whether the pair is lost.
+        """
+        result = attempt.result
+        if not attempt.usable:
+            fit = frame if finding.use is Use.ALL else None
+            return self._lose(before, fit, frame.timestamp), result, True
+        if result.status == AlignmentStatus.OK:
+            result = result._replace(status=finding.status)
+        world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
+        after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
+        overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
+        if finding.use is Use.ALL or overdue:
+            after = after._replace(
+                tracker=attempt.state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0
+            )
+        return after, result, False
+
+    def _lose(self, before: Progress, frame: Frame | None, timestamp: float) -> Progress:
+        """Record a lost pair by the policy, and give the old reference up once it is out of reach.
+
+        Args:
+            before: Where the driver stood.
+            frame: The new frame if it is fit to be a reference.
+            timestamp: Its stamp.
+        """
+        after = before._replace(held=before.held + 1)
+        if self.settings.odometry.on_lost == "predict" and timestamp > before.reference_timestamp:
+            motion = self.aligner.predict(before.tracker, timestamp - before.reference_timestamp)
+            after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
+        return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
+
+
+def clock_of(before: Progress, frame: Frame) -> Clock:
+    """When a frame was taken, for a driver that counts it as its last one already."""
+    elapsed = frame.timestamp - before.reference_timestamp
+    delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay), np.uint32(before.last_index))
+
+
+def _unwatched(frame: Frame | None, step: Step | None) -> None:
+    """Nobody looks."""
+
+
+def track(
+    sequence: Sequence,
+    settings: Settings | Solver | None = None,
+    *,
+    seed: int = 0,
+    odometry: Odometry | None = None,
+    watch: Callable[[Frame | None, Step | None], None] = _unwatched,
+) -> Iterator[Step]:
+    """Stream a sequence: a step for every frame after the first, as it is done.
+
+    The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
+
+    Args:
+        sequence: The frames.
+        settings: As of `Odometry`.
+        seed: As of `Odometry`.
+        odometry: A driver to use instead of a new one; if it has seen frames already it goes on with the next one.
+        watch: Is shown every frame (None: it could not be read) with its step (None: it is the first).
+
+    Raises:
+        FrameError: The first frame cannot be read.
+    """
+    if odometry is None:
+        odometry = Odometry(sequence.camera, settings, seed=seed)
+
+    first = odometry.progress.last_index + 1
+    for index, frame in enumerate(decoded(sequence, first), start=first):
+        step = odometry.register(frame, float(sequence.timestamps[index]))
+        watch(frame if isinstance(frame, Frame) else None, step)
+        if step is not None:
+            yield step
+            if step.lost and odometry.settings.odometry.on_lost == "stop":
+                return
+
+
+def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
+    """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
+
+    def read(index: int) -> Frame | FrameError:
+        try:
+            return sequence[index]
+        except FrameError as error:
+            return error
+
+    if first >= len(sequence):
+        return
+    with ThreadPoolExecutor(max_workers=1) as decoder:
+        coming = decoder.submit(read, first)
+        for index in range(first, len(sequence)):
+            frame = coming.result()
+            if index + 1 < len(sequence):
+                coming = decoder.submit(read, index + 1)
+            yield frame

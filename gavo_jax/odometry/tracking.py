@@ -1,0 +1,170 @@
+"""The program for a frame: its pyramid, its motion from the last frame and the keyframe at once, the next reference.
+
+One compiled program does all of it, and what it needs of earlier frames stays on the device.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from gavo_jax.alignment import (
+    Alignment,
+    Exchanged,
+    Population,
+    align_views,
+    prepare_reference,
+    prepare_target,
+)
+from gavo_jax.camera import Camera
+from gavo_jax.objective import Reference, most_points, move_reference, settle_reference
+from gavo_jax.program_cache import CachedProgram
+from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
+from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions, OdometryOptions
+from gavo_jax.solvers.base import Solver
+from gavo_jax.warp import Points, Target, level_sizes, synchronise_depth, warp
+
+
+class TrackerState(NamedTuple):
+    """What stays on the device from frame to frame."""
+
+    previous: Reference
+    keyframe: Reference
+    """Points of earlier frames in the previous frame's camera; see `renew_keyframe`."""
+    previous_image: Target
+    """The previous frame, packed for sampling: what the symmetric error needs of it."""
+    motion: Float[Array, " 6"]
+    """Twist of the last motion, from the frame before the previous one to the previous one."""
+    seconds: Float[Array, ""]
+    """Time that motion took."""
+
+
+class Clock(NamedTuple):
+    """When a new frame was taken, as numbers of the program."""
+
+    elapsed: Any
+    """Since the reference's colour image, seconds."""
+    depth_delay: Any
+    """From the new colour image to the new depth image, seconds."""
+    frame: Any
+    """Index in the sequence; with the run's key it makes the frame's random numbers."""
+
+
+@partial(jax.jit, static_argnames="finest")
+def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], finest: int) -> Pyramid:
+    """The pyramid with depth moved along a twist (colour moment to depth moment), from level `finest` upwards."""
+    levels = list(pyramid)
+    moved = synchronise_depth(pyramid[finest].inverse_depth, camera.level(finest), exp(twist))
+    for level in range(finest, len(levels)):
+        levels[level] = PyramidLevel(levels[level].grey, moved)
+        if level + 1 < len(levels):
+            moved = halve_inverse_depth(moved)
+    return tuple(levels)
+
+
+KEYFRAME_SHARES = 16
+"""Shares of a keyframe's points that are renewed independently,"""
+KEYFRAME_SPREAD = 0.2
+"""each at its own overlap, evenly spread over a range of this width."""
+
+
+def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overlap: Any) -> Reference:
+    """A keyframe with the points that are going out of view replaced by the newest frame's.
+
+    A keyframe that is given up whole makes all that follows hang on which frame happens to be the first below a
+    threshold. Here the points are dealt into shares, each with its own threshold, so that the shares are soon of
+    different frames.
+
+    Args:
+        keyframe: Points of earlier frames in the newest frame's camera, [L, N].
+        newest: The newest frame's points, alike.
+        camera: Of the last, finest level.
+        overlap: Part of a share that is in view when it is given up, on average over the shares.
+    """
+    places = np.arange(keyframe.grey.shape[-1])
+    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each all over the image
+    dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
+    finest = jax.tree.map(lambda leaf: leaf[-1], keyframe.points)
+    inside = warp(finest, jnp.eye(4), camera).inside
+    in_view = (inside @ dealt) / jnp.maximum((finest.q > 0).astype(jnp.float32) @ dealt, 1.0)
+    thresholds = overlap + KEYFRAME_SPREAD * np.linspace(-0.5, 0.5, KEYFRAME_SHARES)
+    renewed = (in_view < thresholds)[share]
+    return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
+
+
+@partial(CachedProgram, static=("record",), returns=(TrackerState, Reference, Points, Target, Alignment, Population))
+def track_frame(
+    state: TrackerState,
+    grey: Array,
+    depth: Array,
+    clock: Clock,
+    key: PRNGKeyArray,
+    camera: Camera,
+    solver: Solver,
+    alignment: AlignmentOptions,
+    options: OdometryOptions,
+    *,
+    record: bool,
+) -> tuple[TrackerState, Alignment, Population | None]:
+    """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's.
+
+    Before the first frame the state holds no reading: that frame becomes both references, and nothing is known of the
+    motion, so that its points are still where their rows' moments left them. The same program serves, as another one
+    would have to be compiled too.
+    """
+    is_first = ~jnp.any(state.previous.points.q > 0)
+    raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
+    predicted = state.motion * (clock.elapsed / state.seconds)
+    finest = min(solver.levels)
+    delay = clock.depth_delay / clock.elapsed
+    target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
+    readout = camera.readout / clock.elapsed if options.rolling_shutter else None
+    views = (state.previous,)
+    if options.reference == "keyframe":
+        views += (state.keyframe,)
+    guesses = jnp.eye(4)[None]
+    if options.prior:
+        guesses = jnp.concatenate([exp(predicted)[None], guesses])
+    packed = prepare_target(target, solver.levels)
+    exchanged = None
+    if alignment.symmetric:
+        exchanged = Exchanged(prepare_reference(target, camera, solver.levels, alignment), state.previous_image)
+    key = jax.random.fold_in(key, clock.frame)
+    result, populations = align_views(
+        views, packed, camera, solver, alignment, key, guesses, record, exchanged, readout
+    )
+    motion = jnp.where(is_first, 0.0, result.xi)
+    if options.synchronise:
+        target = _synchronised(raw, camera, delay * motion, finest)
+    newest, keyframe = prepare_reference(target, camera, solver.levels, alignment), state.keyframe
+    if readout is not None:
+        unsettled = newest.row_time
+        newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
+        newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
+    keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
+    keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
+    return TrackerState(newest, keyframe, packed, motion, clock.elapsed), result, populations
+
+
+@jax.jit
+def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
+    """State after the first frame, by a program of its own."""
+    pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
+    reference = prepare_reference(pyramid, camera, solver.levels, alignment)
+    packed = prepare_target(pyramid, solver.levels)
+    return TrackerState(reference, reference, packed, jnp.zeros(6), jnp.float32(1.0))
+
+
+def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
+    """The state before the first frame: nothing, in the shapes and types of every state."""
+    levels = solver.levels
+    row: Any = np.zeros((len(levels), most_points(camera, levels, alignment.points)), np.float32)
+    layout = atlas_layout(level_sizes(camera, levels))
+    words: Any = np.zeros((layout.height, layout.width), np.uint32)
+    reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
+    still: Any = np.zeros(6, np.float32), np.float32(1.0)
+    return TrackerState(reference, reference, Target(words, words), *still)

@@ -1,0 +1,149 @@
+"""All that decides a result beside the frames, as one value: what searches, what is minimised, how it is used.
+
+A change is `dataclasses.replace`; `presets` has named ones, `settings_file` reads and writes them.
+"""
+
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import jax
+
+from gavo_jax.objective import Loss, PointsPerLevel, geman_mcclure
+from gavo_jax.solvers.base import Solver, static
+from gavo_jax.solvers.genetic import GeneticAlgorithm
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """What is minimised and where, apart from the solver.
+
+    Attributes:
+        loss: ρ of the squared normalised residual (static); see `objective.LOSSES`, or any callable.
+        depth: Whether the depth residual joins the grey one (static).
+        brightness: Whether a gain and a bias between the frames are estimated (static).
+        centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
+            (static); see `Objective`.
+        symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
+        refine: Whether the motion that wins where islands compete is taken through all levels once more, alone, with
+            the brightness and scales that are known only then (static).
+        robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
+        precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
+        points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
+            None takes every pixel.
+        estimation_points: Largest number of points a view from which brightness, scales and curvature are estimated
+            before a level is searched (static); None takes all.
+        views: Largest number of reference frames that are scored together, an entry a level (static); the first ones
+            are.
+        islands: Independent populations, an entry a level (static); the best ones go on to the next level.
+        depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
+            level.
+        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
+            err by whole surfaces (static); see `objective.depth_trust`.
+        last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
+            curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
+            only evaluated end scattered about the minimum; this centres them. Not where the error is `symmetric`: slope
+            and curvature are known of one direction alone.
+        min_overlap: Share of the reference's points that a candidate must keep in view to count.
+        outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
+            None, and on the levels that refine one motion: (2) as printed.
+        bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
+        bounds_factor: Factor on the half-widths from a level to the next finer one.
+        scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands
+            start from the best distinct ones. 0 starts all islands from the guess.
+        scout_spread: Standard deviations of the scouts, metres and radians.
+    """
+
+    loss: Loss = static(geman_mcclure)
+    depth: bool = static(True)
+    brightness: bool = static(True)
+    centred: bool = static(False)
+    symmetric: bool = static(False)
+    refine: bool = static(False)
+    robust_scale: bool = static(True)
+    precondition: bool = static(True)
+    points: PointsPerLevel = static(4800)
+    estimation_points: int | None = static(1200)
+    views: tuple[int, ...] = static((2, 2, 1, 1, 1))
+    islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
+    depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
+    doubt_depth: bool = static(False)
+    last_step: bool = static(True)
+    min_overlap: float = 0.35
+    outside_cost: float | None = None
+    bounds: tuple[float, float] = (0.5, 0.8)
+    bounds_factor: float = 1.0
+    scouts: int = static(0)
+    scout_spread: tuple[float, float] = (0.15, 0.4)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class OdometryOptions:
+    """How the driver uses the alignment; all but `keyframe_overlap` is static.
+
+    Attributes:
+        reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
+            at once, their points scored together.
+        keyframe_overlap: Part of the keyframe's points that is still in view when they are replaced by a newer frame's;
+            the mean over its shares, see `odometry.tracking.renew_keyframe`.
+        prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
+        synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
+            sequence tells both stamps.
+        rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
+        recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
+        on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
+    """
+
+    reference: Literal["previous", "keyframe"] = static("keyframe")
+    keyframe_overlap: float = 0.7
+    prior: bool = static(True)
+    synchronise: bool = static(True)
+    rolling_shutter: bool = static(True)
+    recover: bool = static(True)
+    on_lost: Literal["hold", "predict", "stop"] = static("hold")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Settings:
+    """A solver, what it minimises, and how the driver uses it; the preset `default` where nothing is said.
+
+    Attributes:
+        solver: `GeneticAlgorithm`, `ParticleSwarm`, `GaussNewton`, `GradientDescent`, or one's own.
+        alignment: What is minimised and where.
+        odometry: How a sequence is tracked; a single pair has no use for it.
+    """
+
+    solver: Solver = field(default_factory=GeneticAlgorithm)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+    odometry: OdometryOptions = field(default_factory=OdometryOptions)
+
+
+def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None = None, **parts: Any) -> Settings:
+    """The settings that a caller means.
+
+    Args:
+        value: Settings; a solver stands for the default settings with that solver, None for the default ones.
+        solver: Takes the place of their solver.
+        parts: `alignment` and `odometry`, likewise: what callers of version 0.1 hand over one by one.
+
+    Raises:
+        TypeError: `value` is neither.
+    """
+    if value is None:
+        settings = Settings()
+    elif isinstance(value, Settings):
+        settings = value
+    elif isinstance(value, Solver):
+        settings = Settings(value)
+    else:
+        raise TypeError(f"neither Settings nor a solver: {type(value).__name__}")
+    given = {name: part for name, part in parts.items() if part is not None}
+    if given:
+        words = "options and alignment are parts of the settings now: dataclasses.replace(settings, alignment=…)"
+        warnings.warn(words, DeprecationWarning, stacklevel=3)
+    if solver is not None:
+        given["solver"] = solver
+    return replace(settings, **given)
