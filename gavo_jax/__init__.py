@@ -35,6 +35,8 @@ from gavo_jax.presets import preset as preset
 from gavo_jax.settings import AlignmentOptions as AlignmentOptions
 from gavo_jax.settings import OdometryOptions as OdometryOptions
 from gavo_jax.settings import Settings as Settings
+from gavo_jax.settings_file import load_settings as load_settings
+from gavo_jax.settings_file import save_settings as save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton as GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm as GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent as GradientDescent

@@ -27,6 +27,7 @@ from gavo_jax.odometry.driver import Progress, Step
 from gavo_jax.odometry.tracking import TrackerState
 from gavo_jax.plots import CAPTIONS as FIGURES
 from gavo_jax.plots import FORMATS as FIGURE_FORMATS
+from gavo_jax.settings_file import name_of
 from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, inverse, write_lines
 from gavo_jax.version import __version__
 
@@ -398,7 +399,7 @@ def describe(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int):
         return value
-    return getattr(value, "__name__", str(value))
+    return name_of(value) or getattr(value, "__name__", str(value))
 
 
 def prepare_folder(folder: str | Path) -> Path:

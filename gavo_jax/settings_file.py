@@ -1,24 +1,150 @@
-"""Any hyperparameter by its dotted name: `solver.mutation_rate`, `alignment.loss`, `solver.population.4`."""
+"""Settings in files and by name: `solver.mutation_rate`, `alignment.loss`, `solver.population.4`.
+
+A settings file is TOML: `method` and `preset` at the top say what it starts from, the tables `solver`, `alignment` and
+`odometry` what differs from that. A run's config.json is one too.
+"""
 
 import dataclasses
 import difflib
+import json
+import tomllib
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import optax
+import tomli_w
 
-from gavo_jax.errors import GavoError, shown
+from gavo_jax import presets
+from gavo_jax.errors import GavoError, read_text, shown, write_bytes
 from gavo_jax.objective import LOSSES
 from gavo_jax.pyramid import LEVELS
 from gavo_jax.settings import Settings
+from gavo_jax.solvers.base import Schedule
 
 ROOMS = tuple(field.name for field in dataclasses.fields(Settings))
 """First part of a dotted name: the parts of the settings."""
-OPTIMIZERS = ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
+OPTIMIZERS: dict[str, Callable[..., Any]] = {
+    name: getattr(optax, name)
+    for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
+}
 """optax's optimisers that need nothing but a learning rate."""
 MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
 """What the device's numbers hold."""
+MAX_FILE_BYTES = 2**20
+
+
+class NamedSettings(NamedTuple):
+    """Settings with the names of what they started from."""
+
+    method: str
+    preset: str
+    settings: Settings
+
+
+def load_settings(path: str | Path, method: str = "ga", preset: str = "default") -> NamedSettings:
+    """Read a settings file, or a run's config.json.
+
+    Args:
+        path: The file.
+        method: What it starts from where it says nothing of that itself, and `preset` likewise.
+
+    Raises:
+        GavoError: It cannot be read, or holds an unknown name (with the nearest known one) or a wrong value.
+    """
+    path = Path(path)
+    table = _read_table(path)
+    if path.suffix == ".json":
+        options = table.get("options")
+        names = options if isinstance(options, dict) else {}
+        table = {key: names[key] for key in ("method", "preset") if key in names} | {
+            room: _without_types(table.get(room, {})) for room in ROOMS
+        }
+    refuse_unknown(str(path), table, ("method", "preset", *ROOMS))
+    method, preset = str(table.pop("method", method)), str(table.pop("preset", preset))
+    refuse_unknown(f"{path}: method", [method], presets.METHODS)
+    refuse_unknown(f"{path}: preset", [preset], presets.PRESETS)
+    return NamedSettings(method, preset, override(presets.preset(method, preset), flatten(str(path), table), str(path)))
+
+
+def save_settings(path: str | Path, settings: Settings, method: str | None = None, preset: str = "default") -> None:
+    """Write a settings file that holds every setting, whole or not at all.
+
+    Args:
+        path: The file, TOML.
+        settings: With a solver, a loss and an optimiser of this package: others have no name to be read by.
+        method: What reading starts from; by default what the solver tells.
+        preset: Likewise.
+
+    Raises:
+        GavoError: It cannot be written, or holds somebody else's code.
+    """
+    known = {type(presets.preset(name).solver): name for name in presets.METHODS}
+    if type(settings.solver) not in known:
+        raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
+    table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}
+    for room in ROOMS:
+        if not rest:
+            raise GavoError(f"{place}: {room}: not a table of settings")
+        part = getattr(settings, room)
+        values = {field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.repr}
+        table[room] = {name: _as_toml(f"{path}: {room}.{name}", value) for name, value in values.items()}
+    write_bytes(path, tomli_w.dumps(table).encode())
+
+
+def assignments(texts: Iterable[str], place: str = "--set") -> dict[str, Any]:
+    """Values by dotted name from texts like `alignment.points=2400`; a value is TOML, or a word.
+
+    Raises:
+        GavoError: One is no assignment.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, sign, value = (part.strip() for part in text.partition("="))
+        if not (name and sign and value):
+            raise GavoError(f"{place}: {shown(text)} is not NAME=VALUE")
+        try:
+            values[name] = tomllib.loads(f"value = {value}")["value"]
+        except (tomllib.TOMLDecodeError, RecursionError):
+            values[name] = value
+    return values
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    text = read_text(path, MAX_FILE_BYTES)
+    try:
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GavoError(f"{path}: cannot be read: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(table, dict):
+        raise GavoError(f"{path}: not a table of settings")
+    return table
+
+
+def _without_types(room: Any) -> Any:
+    """A room of config.json as a settings file has it: without the type's name, and with a word for null."""
+    if not isinstance(room, dict):
+        return room
+    return {name: "none" if value is None else value for name, value in room.items() if name != "type"}
+
+
+def _as_toml(place: str, value: Any) -> Any:
+    if value is None:
+        return "none"
+    if isinstance(value, tuple):
+        return list(value)
+    if callable(value):
+        name = name_of(value)
+        if name is None:
+            raise GavoError(f"{place}: cannot hold a function that is not this package's")
+        return name
+    return value
+
+
+def name_of(function: Any) -> str | None:
+    """The name that a loss or an optimiser goes by; None for somebody else's."""
+    return next((name for name, known in (LOSSES | OPTIMIZERS).items() if known is function), None)
 
 
 def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> None:
@@ -112,8 +238,8 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
                 raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {shown(value)}")
             return (_number(where, value, whole),) * len(current)
         return _entries(where, value, len(current), whole)
-    if isinstance(value, list) and current is None:
-        return tuple(_number(where, entry, False) for entry in value)
+    if isinstance(value, list) and (current is None or typing.get_type_hints(owner)[field] is Schedule):
+        return _entries(where, value, LEVELS, isinstance(current, int))
     return _number(where, value, isinstance(current, int))
 
 
@@ -124,7 +250,7 @@ def _entries(where: str, value: list[Any], count: int, whole: bool) -> tuple[Any
 
 
 def _callable(where: str, field: str, value: Any) -> Any:
-    known = LOSSES if field == "loss" else {name: getattr(optax, name) for name in OPTIMIZERS}
+    known = LOSSES if field == "loss" else OPTIMIZERS
     if not isinstance(value, str):
         raise GavoError(f"{where}: must be a name, not {shown(value)}")
     refuse_unknown(where, [value], known)

@@ -1,12 +1,17 @@
 """Hyperparameters by name."""
 
+import json
+from dataclasses import replace
+
 import optax
 import pytest
 
 from gavo_jax import presets
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import huber
-from gavo_jax.settings_file import flatten, override
+from gavo_jax.results import describe
+from gavo_jax.settings_file import assignments, flatten, load_settings, override, save_settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
 
@@ -75,3 +80,66 @@ def test_nested_tables_have_dotted_names():
         "solver.population.4": 8,
         "solver.patience": 3,
     }
+
+
+@pytest.mark.parametrize("method", presets.METHODS)
+@pytest.mark.parametrize("name", presets.PRESETS)
+def test_every_preset_comes_back_from_its_file(method, name, tmp_path):
+    settings = presets.preset(method, name)
+    save_settings(tmp_path / "settings.toml", settings)
+    assert load_settings(tmp_path / "settings.toml").settings == settings
+    described = {room: describe(getattr(settings, room)) for room in ("solver", "alignment", "odometry")}
+    config = {"options": {"method": method, "preset": name, "seed": 3}, "device": "cpu", **described}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert load_settings(tmp_path / "config.json") == (method, name, settings)
+
+
+def test_a_file_says_what_differs(tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text('method = "pso"\npreset = "fast"\n[solver]\npatience = 4\n[alignment]\nloss = "huber"\n')
+    method, name, settings = load_settings(path)
+    fast = presets.preset("pso", "fast")
+    assert (method, name) == ("pso", "fast")
+    assert settings == replace(
+        fast, solver=replace(fast.solver, patience=4), alignment=replace(fast.alignment, loss=huber)
+    )
+    path.write_text("[solver]\ndamping = 0.5\n")
+    assert load_settings(path, "gauss-newton").settings.solver == GaussNewton(damping=0.5)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("solver = 3", ["solver", "not a table"]),
+        ("[solver]\npatiense = 3", ["'patiense'", "'patience'"]),
+        ("[solvr]\npatience = 3", ["'solvr'", "'solver'"]),
+        ('preset = "quick"', ["preset", "'quick'"]),
+        ('method = "gauss"', ["method", "'gauss-newton'"]),
+        ("method = ", ["cannot be read"]),
+    ],
+)
+def test_a_wrong_file_is_one_line(text, words, tmp_path):
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(GavoError) as refused:
+        load_settings(path)
+    assert all(word in str(refused.value) for word in (str(path), *words)) and "\n" not in str(refused.value)
+
+
+def test_somebody_elses_code_is_not_written(tmp_path):
+    own = replace(presets.preset(), alignment=replace(presets.preset().alignment, loss=lambda s: s))
+    with pytest.raises(GavoError, match="loss"):
+        save_settings(tmp_path / "settings.toml", own)
+    assert not (tmp_path / "settings.toml").exists()
+
+
+def test_assignments_are_toml_or_words():
+    assert assignments(["alignment.points=2400", "solver.spread = [1, 2.5]", "alignment.loss=huber", "a=none"]) == {
+        "alignment.points": 2400,
+        "solver.spread": [1, 2.5],
+        "alignment.loss": "huber",
+        "a": "none",
+    }
+    for wrong in ("alignment.points", "=3", "a="):
+        with pytest.raises(GavoError, match="NAME=VALUE"):
+            assignments([wrong])

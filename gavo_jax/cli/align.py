@@ -4,13 +4,12 @@ import json
 
 import jax
 
-from gavo_jax import presets
 from gavo_jax.alignment import align as align_pair
 from gavo_jax.camera import Camera, camera_for_sequence, load_camera
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.screen import waiting
-from gavo_jax.cli.selection import check_seed
+from gavo_jax.cli.selection import check_seed, choose_settings
 from gavo_jax.datasets.tum import read_frame
 from gavo_jax.results import describe
 
@@ -19,7 +18,7 @@ def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance` and `status` of one pair."""
     check_seed(options.seed)
     camera = _camera(options)
-    settings = presets.preset(options.method, options.preset)
+    settings = choose_settings(options).settings
     reference = read_frame(options.rgb0, options.depth0, camera)
     target = read_frame(options.rgb1, options.depth1, camera)
     enable_compilation_cache()

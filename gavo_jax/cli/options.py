@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
 Method = Literal["ga", "pso", "gauss-newton", "adam"]
 PresetName = Literal["default", "paper", "fast", "wide"]
@@ -26,14 +26,24 @@ class Source:
     """Take every S-th frame."""
 
 
-@dataclass(frozen=True)
-class Run(Source):
-    """Estimate the trajectory of a sequence."""
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """How."""
 
     method: Method = "ga"
     """Genetic algorithm, particle swarm, Gauss-Newton (the classic method) or Adam."""
     preset: PresetName = "default"
     """Settings: the project's own, the paper's, for speed, for large motions."""
+    settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
+    """Settings from a TOML file, or from config.json of an earlier run; the method and preset that it names count."""
+    set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
+    """A single setting, as alignment.points=2400 or solver.population.4=32."""
+
+
+@dataclass(frozen=True)
+class Run(Search, Source):
+    """Estimate the trajectory of a sequence."""
+
     seed: Annotated[int, arg(metavar="S")] = 0
     """Of the method's randomness: the same seed gives the same trajectory, bit for bit."""
     reference: Annotated[
@@ -85,7 +95,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Align:
+class Align(Search):
     """Align one pair of RGB-D images and print the motion as JSON."""
 
     rgb0: Annotated[Positional[Path], arg(metavar="RGB0")]
@@ -98,10 +108,6 @@ class Align:
     """Depth image of the target frame."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
     """As in `gavo run`; auto goes by the name of the folder above RGB0's."""
-    method: Method = "ga"
-    """As in `gavo run`."""
-    preset: PresetName = "default"
-    """As in `gavo run`."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """As in `gavo run`."""
 

@@ -9,11 +9,10 @@ from typing import Any
 
 import jax
 
-from gavo_jax import presets
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.screen import number, print_table
-from gavo_jax.cli.selection import check_seed, open_sequence
+from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry, Step
@@ -47,7 +46,8 @@ FIGURES_OF_MERIT = (
 def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
     check_seed(options.seed)
-    settings = _effective_settings(options)
+    method, preset, settings = choose_settings(options)
+    options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
     sequence = open_sequence(options)
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
@@ -113,8 +113,8 @@ def _track(
     return metrics, tracked.interrupted
 
 
-def _effective_settings(options: Run) -> Settings:
-    settings = presets.preset(options.method, options.preset)
+def _with_shortcuts(settings: Settings, options: Run) -> Settings:
+    """The settings with those that have an option of their own."""
     odometry = settings.odometry
     if options.reference is not None:
         odometry = replace(odometry, reference=options.reference)
@@ -127,8 +127,8 @@ def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, A
     """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
     places = {
         name: str(Path(place).resolve())
-        for name, place in (("sequence", options.sequence), ("camera", options.camera))
-        if Path(place).exists()
+        for name, place in (("sequence", options.sequence), ("camera", options.camera), ("settings", options.settings))
+        if place is not None and Path(place).exists()
     }
     return {
         "options": replace(options, **places),

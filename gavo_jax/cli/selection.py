@@ -1,9 +1,11 @@
 """From options to frames: which sequence, which of its frames, by which camera."""
 
-from gavo_jax.cli.options import Source
+from gavo_jax import presets
+from gavo_jax.cli.options import Search, Source
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
+from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
 MAX_SEED = 2**32 - 1
 
@@ -19,6 +21,19 @@ def open_sequence(source: Source) -> Sequence:
     if source.frames is not None:
         _check_at_least("--frames", source.frames, 2)
     return open_part(source.sequence, source.camera, source.start, source.frames, source.stride)
+
+
+def choose_settings(search: Search) -> NamedSettings:
+    """Return the settings that the options say: a preset's or a file's, with single ones replaced.
+
+    Raises:
+        GavoError: what is wrong with the file or with a single setting.
+    """
+    if search.settings is None:
+        named = NamedSettings(search.method, search.preset, presets.preset(search.method, search.preset))
+    else:
+        named = load_settings(search.settings, search.method, search.preset)
+    return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
 
 def check_seed(seed: int) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from gavo_jax import presets
 from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Tune
 from gavo_jax.cli.screen import number, print_table
@@ -9,6 +10,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.tuning import Choice, read_tuning
 from gavo_jax.experiments.tuning import tune as search
 from gavo_jax.results import prepare_folder, write_json
+from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"
 
@@ -32,7 +34,10 @@ def tune(options: Tune) -> int:
     rows = [_row(choice, names) for choice in front]
     print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)
     write_json(folder / FRONT, [choice._asdict() for choice in front])
-    print(f"front in {folder / FRONT}")
+    for choice in front:
+        values = override(presets.preset(tuning.method, tuning.preset), choice.settings)
+        save_settings(folder / f"trial-{choice.trial}.toml", values, tuning.method, tuning.preset)
+    print(f"front in {folder / FRONT}; its settings: gavo run --settings {folder}/trial-{front[0].trial}.toml")
     return 0
 
 
