@@ -269,7 +269,7 @@ def visited_levels(levels: tuple[int, ...], options: AlignmentOptions) -> tuple[
 
 
 def level_objective(level: Level, target: Target, options: AlignmentOptions, brightness: Brightness) -> Objective:
-    """E of one level under a brightness model, its scales still those of (2)."""
+    """E of one level under a brightness model, its scales still those of the paper's error."""
     reference = level.reference._replace(grey=brightness.seen(level.reference.grey))
     charge = 0.0 if options.outside_cost is None else jnp.where(level.islands > 1, options.outside_cost, 0.0)
     return Objective(

@@ -91,10 +91,10 @@ class Camera:
         )
 
     def project(self, points: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array | np.ndarray, "*batch 2"]:
-        """Project points of the camera frame (metres; x right, y down, z forward) to pixels: P of (5), no distortion.
+        """Project points of the camera frame (metres; x right, y down, z forward) to pixels: P. Equation (5).
 
-        Works on NumPy and JAX arrays alike. Points at z = 0 give infinities or NaN; masking them, and those behind the
-        camera, is the caller's part.
+        No distortion is put on. Works on NumPy and JAX arrays alike. Points at z = 0 give infinities or NaN; masking
+        them, and those behind the camera, is the caller's part.
         """
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         return _stack(self.fx * x / z + self.cx, self.fy * y / z + self.cy)
@@ -102,7 +102,7 @@ class Camera:
     def back_project(
         self, pixels: Float[Array | np.ndarray, "*batch 2"], depth: Float[Array | np.ndarray, "*batch"]
     ) -> Float[Array | np.ndarray, "*batch 3"]:
-        """Lift pixels at a depth (metres along z) to points of the camera frame: P⁻¹ of (6), no distortion."""
+        """Lift pixels at a depth (metres along z) to points of the camera frame: P⁻¹, no distortion. Equation (6)."""
         x = (pixels[..., 0] - self.cx) / self.fx * depth
         y = (pixels[..., 1] - self.cy) / self.fy * depth
         return _stack(x, y, depth)

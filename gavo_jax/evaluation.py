@@ -31,7 +31,7 @@ class ErrorSeries:
 
     @property
     def rmse(self) -> float:
-        """Root of the mean square (16)."""
+        """Root of the mean square; of the translational RPE over 1 s it is the drift in m/s. Equation (16)."""
         return float(np.sqrt(np.mean(np.square(self.values))))
 
     @property
@@ -80,17 +80,17 @@ class RelativePoseError:
 def relative_pose_error(
     estimate: Trajectory, truth: Trajectory, delta: float = 1.0, unit: Literal["s", "frames"] = "s"
 ) -> RelativePoseError:
-    """Return how far the estimated motion over `delta` is from the true one (15).
+    """Return how far the estimated motion over `delta` is from the true one. Equation (15).
 
     Unit "s" is what TUM's `evaluate_rpe.py --fixed_delta --delta DELTA --delta_unit s` computes: each pose i is paired
     with the pose j nearest to `delta` seconds later, save pairs that end at the last pose; the truth is taken at its
     stamps nearest to those of i and j, where both lie within twice its median interval; the error is
-    `inv(est_j_T_i) @ true_j_T_i`. At delta = 1 the RMSE of its translation is the drift in m/s (16). TUM's tool draws
+    `inv(est_j_T_i) @ true_j_T_i`. At delta = 1 the RMSE of its translation is the drift in m/s. TUM's tool draws
     10,000 pairs at random where there are more; here all of them count.
 
-    Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is (15)
-    as printed: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations differ by
-    about the rotation error times the distance travelled.
+    Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is as
+    printed in the paper: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations
+    differ by about the rotation error times the distance travelled.
 
     Raises:
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
@@ -129,10 +129,11 @@ def absolute_trajectory_error(
 
 
 def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX_GAP) -> ErrorSeries:
-    """Return ‖p_est − p_true‖ of each pose, both seen from their own first pose: accumulated drift, as the paper plots.
+    """Return ‖p_est − p_true‖ of each pose, both seen from their own first pose: accumulated drift. Equation (17).
 
-    The truth is interpolated (slerp) at the estimate's stamps; poses it does not cover (outside it, or in a gap longer
-    than `max_gap` seconds) are left out, and the first covered one is the common origin.
+    The paper plots it, and cites its equation without printing it. The truth is interpolated (slerp) at the estimate's
+    stamps; poses it does not cover (outside it, or in a gap longer than `max_gap` seconds) are left out, and the first
+    covered one is the common origin.
 
     Raises:
         GavoError: the truth covers no pose of the estimate.

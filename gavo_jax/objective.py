@@ -46,7 +46,7 @@ Loss = Callable[[jax.Array], jax.Array]
 
 
 def l2(s: jax.Array) -> jax.Array:
-    """ρ(s) = s: plain least squares, the paper's (2)."""
+    """ρ(s) = s: plain least squares, as in the paper's error."""
     return s
 
 
@@ -235,7 +235,7 @@ class Scales(NamedTuple):
 
     @classmethod
     def unit(cls) -> "Scales":
-        """Scales that leave residuals as they are, without depth: the paper's (2)."""
+        """Scales that leave residuals as they are, without depth: the paper's error."""
         one = jnp.float32(1.0)
         return cls(one, one, jnp.float32(0.0))
 
@@ -244,7 +244,7 @@ class Residuals(NamedTuple):
     """Residuals of one motion at every reference point, with what a derivative needs."""
 
     grey: Float[Array, "*n"]
-    """Grey levels; equation (1) after the brightness model, about their mean where the objective is `centred`."""
+    """Grey levels; the paper's residual after the brightness model, about its mean where the objective is `centred`."""
     depth: Float[Array, "*n"]
     """Inverse depth, 1/m, along the surface normal; 0 where `depth_valid` is 0."""
     inside: Float[Array, "*n"]
@@ -284,7 +284,7 @@ class Objective:
     min_overlap: Float[Array, ""]
     outside_cost: Float[Array, ""] = field(default_factory=lambda: jnp.float32(0.0))
     """Cost of a reference point that leaves the view, in units of a typical point's. Positive, and a motion cannot win
-    by pushing pixels out of view; 0 averages over the points in view alone, as (2) does."""
+    by pushing pixels out of view; 0 averages over the points in view alone, as the paper's error does."""
     count: Integer[Array, ""] | None = None
     """Points a view that hold something, from the first on; None: all."""
     views: Integer[Array, ""] | None = None
@@ -352,7 +352,10 @@ class Objective:
         reference: Reference | None = None,
         mean: Float[Array, ""] | None = None,
     ) -> Residuals:
-        """r_i(ξ) of one motion, equation (1); at all points or at some of them, about a mean that is known already."""
+        """Residuals r_i(ξ) = I_{t+1}(ω(ξ, p_i)) − I_t(p_i) of one motion. Equation (1).
+
+        They are of all points or of some, and about a mean that may be known already.
+        """
         reference = self.reference if reference is None else reference
         mean = self.mean_residual(target_T_reference) if mean is None else mean
         warped = warp(reference.points, target_T_reference, self.plane)
@@ -412,7 +415,11 @@ class Objective:
         return _lane_sum((self.reference.points.q > 0).astype(jnp.float32))
 
     def error(self, target_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array]:
-        """E of one motion (squared grey levels), equation (2), and the share of reference points inside the target."""
+        """E(ξ) = (1/N) Σ r_i² of one motion (squared grey levels), N points being inside the target. Equation (2).
+
+        A loss, a depth term and a cost of points outside go beyond the paper. The second number is the overlap, the
+        share of reference points inside.
+        """
         found = self._conclude(self._sums(self._cost(self.residuals(target_T_reference))))
         return found if self.backward is None else _mean(found, self.backward.error(rigid_inverse(target_T_reference)))
 

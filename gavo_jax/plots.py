@@ -61,7 +61,7 @@ CAPTIONS = {
 
 
 def plot_distance_error(errors: Mapping[str, ErrorSeries]) -> Figure:
-    """Draw the distance error (17) of each named run over time and frames, as the paper's figures 5 and 9."""
+    """Draw the distance error of each named run over time and frames, as the paper's figures 5 and 9."""
     figure = _figure(7.0, 4.4, "distance_error")
     axes = figure.add_subplot()
     stamps = np.unique(np.concatenate([series.timestamps for series in errors.values()])) - min(

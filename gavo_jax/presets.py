@@ -26,9 +26,9 @@ PAPER_OBJECTIVE = AlignmentOptions(
     bounds=(0.06, 0.06),
     bounds_factor=0.5,
 )
-"""The paper's (2) on every pixel, ξ searched as it is. Left open there and fixed here: the bounds, ±6 cm and ±0.06 rad
-(3.4°) a gene about the guess at level 4, halved from level to level about the last level's best; a candidate must keep
-half of the points in view."""
+"""The paper's error on every pixel, ξ searched as it is. Left open there and fixed here: the bounds, ±6 cm and ±0.06
+rad (3.4°) a gene about the guess at level 4, halved from level to level about the last level's best; a candidate must
+keep half of the points in view."""
 
 
 def _paper_solver(method: str) -> Any:

@@ -28,7 +28,7 @@ class AlignmentOptions:
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
         refine: Whether the motion that wins where islands compete is taken through all levels once more, alone, with
             the brightness and scales that are known only then (static).
-        robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's (2) (static).
+        robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
             None takes every pixel.
@@ -47,7 +47,7 @@ class AlignmentOptions:
             and curvature are known of one direction alone.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
-            None, and on the levels that refine one motion: (2) as printed.
+            None, and on the levels that refine one motion: the paper's error.
         bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
         bounds_factor: Factor on the half-widths from a level to the next finer one.
         scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands

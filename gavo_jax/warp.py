@@ -128,7 +128,7 @@ class Target(NamedTuple):
 
 
 def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera | ImagePlane) -> Warped:
-    """ω(ξ, p) for every reference point, equations (4) to (8), for one motion."""
+    """ω(ξ, p) = P(g(ξ) P⁻¹(p)) of every reference point for one motion. Equations (4), (7) and (8)."""
     r, t = target_T_reference[:3, :3], target_T_reference[:3, 3]
     x, y, q = points
     depth = r[2, 0] * x + r[2, 1] * y + (r[2, 2] + t[2] * q)

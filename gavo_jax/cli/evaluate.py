@@ -8,7 +8,7 @@ from gavo_jax.trajectory import Trajectory
 
 
 def evaluate(options: Evaluate) -> int:
-    """Print relative pose error (15)(16), absolute trajectory error and distance error with their definitions."""
+    """Print relative pose error, absolute trajectory error and distance error with their definitions."""
     estimate, truth = Trajectory.read_tum(options.estimate), Trajectory.read_tum(options.groundtruth)
     try:
         relative = relative_pose_error(estimate, truth, options.delta, options.unit)

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Integer, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
 from gavo_jax.objective import Problem
 
@@ -151,6 +151,29 @@ class Solution(NamedTuple):
     like `history`."""
 
 
+def static_stop(count: Integer[Array, ""], iterations: Integer[Array, ""] | int) -> Bool[Array, ""]:
+    """The paper's static stop criterion: the largest number of iterations is reached."""
+    return count >= iterations
+
+
+def diversity_stop(stale: Integer[Array, ""], patience: int) -> Bool[Array, ""]:
+    """The paper's diversity stop criterion: the best error has stagnated for `patience` iterations."""
+    return stale >= patience
+
+
+def stagnation(
+    stale: Integer[Array, ""],
+    error: Float[Array, ""],
+    best_error: Float[Array, ""],
+    progress: Float[Array, ""] | float,
+) -> Integer[Array, ""]:
+    """Iterations in a row without progress, of which the last one ended with `error`: what `diversity_stop` asks for.
+
+    An iteration makes progress if it lowers the best error so far by more than the share `progress` of it.
+    """
+    return jnp.where(error < best_error * (1.0 - progress), 0, stale + 1)
+
+
 def solve(
     key: PRNGKeyArray,
     solver: Any,
@@ -172,16 +195,17 @@ def solve(
         return best.error, solver.candidates(state) if record else None
 
     def go_on(carry: tuple[Any, ...]) -> jax.Array:
-        return (carry[2] < iterations) & (carry[3] < solver.patience)
+        _, _, count, stale, _ = carry
+        return ~static_stop(count, iterations) & ~diversity_stop(stale, solver.patience)
 
     def iterate(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, best, count, stale, log = carry
         state = solver.step(keys[count], state, problem)
         new = solver.best(state)
-        progress = new.error < best.error * (1.0 - least)
+        stale = stagnation(stale, new.error, best.error, least)
         best = jax.tree.map(lambda a, b: jnp.where(new.error < best.error, a, b), new, best)
         log = jax.tree.map(lambda rows, row: rows.at[count].set(row), log, entry(state, best))
-        return state, best, count + 1, jnp.where(progress, 0, stale + 1), log
+        return state, best, count + 1, stale, log
 
     best = solver.best(state)
     log = jax.tree.map(lambda row: jnp.full((longest, *row.shape), jnp.nan), entry(state, best))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective import Problem
 from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
-from gavo_jax.solvers.genetic import first_candidates
+from gavo_jax.solvers.operators import initial_population
 
 
 class SwarmState(NamedTuple):
@@ -53,7 +53,7 @@ class ParticleSwarm(PerLevel):
         """Particles about the guesses, at rest."""
         del problem
         places, spread = largest(self.population), self.here(self.spread)
-        x = first_candidates(key, places, spread, guess, bounds)
+        x = initial_population(key, places, spread, guess, bounds)
         width = bounds.upper - bounds.lower if spread is None else jnp.full(6, 6.0 * spread)
         unknown = jnp.full(places, jnp.inf)
         return SwarmState(x, jnp.zeros_like(x), x, unknown, bounds, self.velocity_clamp * width)

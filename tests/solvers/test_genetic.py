@@ -1,4 +1,4 @@
-"""The paper's operators (9) to (14), one by one, and the quadratic fit that breeds one offspring."""
+"""The genetic algorithm with the paper's operators, one by one, as it uses them."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from quadratic import Given, Quadratic, bowl, cube
+from quadratic import Given, bowl, cube
 
 from gavo_jax.solvers.base import Bounds
-from gavo_jax.solvers.genetic import GeneticAlgorithm, GeneticState, first_candidates, surrogate_minimum
+from gavo_jax.solvers.genetic import GeneticAlgorithm, GeneticState
 
 WIDE = cube(100.0)
 
@@ -45,25 +45,6 @@ many_first_steps = jax.jit(jax.vmap(first_step, in_axes=(0, None, None, None, No
 def members(count: int) -> jax.Array:
     """Chromosomes (i, 0, …, 0), which `Given` looks its errors up by."""
     return jnp.zeros((count, 6)).at[:, 0].set(jnp.arange(count, dtype=jnp.float32))
-
-
-def test_first_population_is_uniform_within_the_bounds() -> None:
-    bounds = Bounds(jnp.array([-1.0, 0, 2, -5, 0.1, -1]), jnp.array([1.0, 0.5, 3, 5, 0.2, 0]))
-    guess = (bounds.lower + bounds.upper)[None] / 2
-    x = np.asarray(first_candidates(jax.random.key(0), 4000, None, guess, bounds))
-    np.testing.assert_array_equal(x[0], guess[0])
-    for gene in range(6):
-        low, high = float(bounds.lower[gene]), float(bounds.upper[gene])
-        assert scipy.stats.kstest(x[1:, gene], "uniform", (low, high - low)).pvalue > 1e-3
-
-
-def test_first_population_with_a_spread_is_a_cloud_about_the_guesses() -> None:
-    guesses = jnp.stack([jnp.zeros(6), jnp.full(6, 50.0)])
-    x = np.asarray(first_candidates(jax.random.key(0), 4000, 2.0, guesses, WIDE))
-    np.testing.assert_array_equal(x[:2], guesses)
-    for offset in (x[2::2] - 0.0, x[3::2] - 50.0):
-        assert np.std(offset) == pytest.approx(2.0, rel=0.05)
-        np.testing.assert_allclose(offset.mean(axis=0), 0, atol=0.3)
 
 
 def test_roulette_draws_in_proportion_to_the_fitness() -> None:
@@ -149,56 +130,3 @@ def test_offspring_stay_within_the_bounds() -> None:
     bounds = cube(0.5)
     state = first_step(jax.random.key(0), replace(paper(200), mutation_rate=3.0), bowl(), jnp.zeros((1, 6)), bounds)
     assert np.abs(state.offspring).max() == 0.5
-
-
-jit_surrogate = jax.jit(surrogate_minimum)
-
-
-def evaluated(problem: Quadratic, count: int, seed: int, spread: float = 1.0) -> tuple[jax.Array, jax.Array]:
-    """A population about the origin in the order of its errors."""
-    x = jnp.asarray(np.random.default_rng(seed).normal(0, spread, (count, 6)), jnp.float32)
-    error, _ = problem.score(x)
-    order = jnp.argsort(error)
-    return x[order], error[order]
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_fit_finds_the_minimum_of_a_round_bowl_from_few(seed: int, scale: float) -> None:
-    problem = replace(bowl(seed, spread=1.0, reach=scale), floor=scale**2)
-    x, error = evaluated(problem, 12, seed, spread=scale)
-    found = jit_surrogate(x, error)
-    nearest = np.linalg.norm(x - problem.centre, axis=1).min()
-    assert np.linalg.norm(found - problem.centre) < 0.02 * nearest
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_fit_gets_close_to_the_minimum_of_an_elongated_bowl(seed: int) -> None:
-    problem = bowl(seed, spread=4.0, reach=1.0)
-    x, error = evaluated(problem, 64, seed)
-    found = jit_surrogate(x, error)
-    excess = float(problem.score(found[None])[0][0]) - problem.floor
-    assert excess < 0.1 * (float(error[0]) - problem.floor)
-
-
-def test_fit_survives_worthless_candidates() -> None:
-    problem = bowl(1, spread=1.0)
-    x, error = evaluated(problem, 24, 1)
-    found = jit_surrogate(x, error.at[16:].set(jnp.inf))
-    nearest = np.linalg.norm(x - problem.centre, axis=1).min()
-    assert np.linalg.norm(found - problem.centre) < 0.1 * nearest
-    one = jit_surrogate(x, jnp.full(24, jnp.inf).at[0].set(1.0))
-    np.testing.assert_allclose(one, x[0], atol=1e-3)
-    assert np.all(np.isfinite(jit_surrogate(x, jnp.full(24, jnp.inf))))
-
-
-def test_fit_to_one_and_the_same_candidate_stays_there() -> None:
-    x = jnp.ones((24, 6))
-    np.testing.assert_allclose(jit_surrogate(x, jnp.full(24, 3.0)), x[0], atol=1e-3)
-
-
-def test_fit_never_leaps_away() -> None:
-    # a saddle has no minimum: the step stays within the population's reach
-    problem = Quadratic(jnp.zeros(6), jnp.diag(jnp.array([1.0, 1, 1, -1, -1, -1])))
-    x, error = evaluated(problem, 64, 3)
-    assert np.linalg.norm(jit_surrogate(x, error) - x[0]) < 10.0

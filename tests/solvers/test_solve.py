@@ -10,7 +10,7 @@ import optax
 import pytest
 from quadratic import Quadratic, bowl, cube, search
 
-from gavo_jax.solvers.base import Bounds, Solution
+from gavo_jax.solvers.base import Bounds, Solution, diversity_stop, stagnation, static_stop
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -174,6 +174,18 @@ def test_a_sweep_over_a_rate_is_one_vmap(name: str) -> None:
     assert float(swept[2]) == pytest.approx(float(run(name, problem).error), rel=1e-2)
     if name != "gauss-newton":  # which solves a quadratic exactly at any small damping
         assert len(set(np.asarray(swept).tolist())) > 1
+
+
+def test_stop_criteria() -> None:
+    count = jnp.arange(5)
+    np.testing.assert_array_equal(static_stop(count, 3), [False, False, False, True, True])
+    np.testing.assert_array_equal(diversity_stop(count, 2), [False, False, True, True, True])
+
+
+def test_stagnation_counts_iterations_that_gain_too_little() -> None:
+    errors = jnp.array([9.8, 9.95, 10.0, 11.0, jnp.inf])
+    np.testing.assert_array_equal(stagnation(jnp.int32(4), errors, jnp.float32(10.0), 0.01), [0, 5, 5, 5, 5])
+    assert stagnation(jnp.int32(4), jnp.float32(1.0), jnp.float32(jnp.inf), 0.01) == 0
 
 
 def test_stagnation_stops_the_loop() -> None:
