@@ -85,8 +85,6 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
     table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}
     for room in ROOMS:
-        if not rest:
-            raise GavoError(f"{place}: {room}: not a table of settings")
         part = getattr(settings, room)
         values = {field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.repr}
         table[room] = {name: _as_toml(f"{path}: {room}.{name}", value) for name, value in values.items()}
@@ -173,6 +171,8 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
     for name, value in values.items():
         room, _, rest = name.partition(".")
         refuse_unknown(place, [room], ROOMS)
+        if not rest:
+            raise GavoError(f"{place}: {room}: not a table of settings")
         part = getattr(settings, room)
         field, _, level = rest.partition(".")
         refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part)])
