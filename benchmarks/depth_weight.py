@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment import fit_objective, stack_levels
+from gavo_jax.alignment import fit_objective, levels_of, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
@@ -52,7 +52,8 @@ def own_optima(
     the Hessian of the mean cost there, residuals in units of their scale, and the covariance of its gradient.
     """
     motion = exp(after.motion)
-    levels = stack_levels((before.previous,), camera, solver.levels, options, None, camera.readout / after.seconds)
+    geometry = levels_of(camera, solver, options)
+    levels = stack_levels((before.previous,), camera, geometry, options, None, camera.readout / after.seconds)
     found = []
     for place in range(len(solver.levels)):
         level = jax.tree.map(lambda leaf, place=place: leaf[place], levels)

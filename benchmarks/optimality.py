@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment import Images, align_views, objectives_of, prepare_pair
+from gavo_jax.alignment import Images, align_views, levels_of, objectives_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
@@ -67,10 +67,11 @@ def final_errors(
 ) -> FinalErrors:
     """E of one pair, everything by the same objective (see the module)."""
     before, after = (build_pyramid(frame.grey, frame.depth, camera.depth_scale) for frame in (reference, target))
-    view, packed, exchanged = prepare_pair(before, after, camera, genetic.levels, options)
+    levels = levels_of(camera, genetic, options)
+    view, packed, exchanged = prepare_pair(before, after, camera, levels, options)
     guesses = jnp.eye(4)[None]
     results = [
-        align_views((view,), packed, camera, solver, options, key, guesses, exchanged=exchanged)[0]
+        align_views((view,), packed, camera, levels, solver, options, key, guesses, exchanged=exchanged)[0]
         for solver in (genetic, gauss_newton)
     ]
     found, descended = (result.target_T_reference for result in results)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gavo_jax as gavo
-from gavo_jax.alignment import align_views, prepare_pair
+from gavo_jax.alignment import align_views, levels_of, prepare_pair
 from gavo_jax.objective import Reference
 from gavo_jax.pyramid import build_pyramid
 from gavo_jax.warp import Target
@@ -27,11 +27,12 @@ def main(seeds: int = 8, decays: tuple[float, ...] = (0.6, 0.8, 1.0)) -> np.ndar
     camera, still = sequence.camera, jnp.eye(4)
     options = gavo.AlignmentOptions()
     before, after = (build_pyramid(jnp.asarray(f.grey), jnp.asarray(f.depth), camera.depth_scale) for f in sequence)
-    view, target, _ = prepare_pair(before, after, camera, SOLVER.levels, options)
+    levels = levels_of(camera, SOLVER, options)
+    view, target, _ = prepare_pair(before, after, camera, levels, options)
 
     def final_error(key: jax.Array, decay: jax.Array, view: Reference, target: Target) -> jax.Array:
         solver = replace(SOLVER, mutation_decay=decay)
-        return align_views((view,), target, camera, solver, options, key, still[None])[0].error
+        return align_views((view,), target, camera, levels, solver, options, key, still[None])[0].error
 
     over_seeds = jax.vmap(final_error, in_axes=(0, None, None, None))
     over_both = jax.jit(jax.vmap(over_seeds, in_axes=(None, 0, None, None)))

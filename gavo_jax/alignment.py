@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
+from gavo_jax.levels import ImagePlane, Levels
 from gavo_jax.objective import (
     Brightness,
     ExplainedShare,
@@ -30,9 +31,7 @@ from gavo_jax.objective import (
     estimate_brightness,
     estimate_scales,
     explained_share,
-    grids_of,
     make_references,
-    most_points,
     preconditioner,
     reference_curvature,
     unconditioner,
@@ -42,7 +41,7 @@ from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
 from gavo_jax.se3 import departure_from_rigid, exp, log, rigid, rigid_inverse
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
-from gavo_jax.warp import ImagePlane, Target, image_planes, pack_target
+from gavo_jax.warp import Target, pack_target
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -173,26 +172,29 @@ class Exchanged(NamedTuple):
     """The anchor's frame, as of `prepare_target`."""
 
 
-def prepare_reference(
-    pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
-) -> Reference:
+def levels_of(camera: Camera, solver: Solver, options: AlignmentOptions) -> Levels:
+    """The levels that a solver searches, with as many points as the options say."""
+    return Levels.of(camera, solver.levels, options.points)
+
+
+def prepare_reference(pyramid: Pyramid, camera: Camera, levels: Levels) -> Reference:
     """What a search needs of a reference frame: points of a solver's levels, [L, N], coarsest first."""
-    return make_references(pyramid, camera, levels, options.points)
+    return make_references(pyramid, camera, levels)
 
 
-def prepare_target(pyramid: Pyramid, levels: tuple[int, ...]) -> Target:
+def prepare_target(pyramid: Pyramid, levels: Levels) -> Target:
     """What a search needs of a target frame: a solver's levels packed for sampling, coarsest first."""
-    return pack_target(make_atlas([pyramid[level] for level in levels]))
+    return pack_target(make_atlas([pyramid[number] for number in levels.numbers]))
 
 
 def prepare_pair(
-    reference: Pyramid, target: Pyramid, camera: Camera, levels: tuple[int, ...], options: AlignmentOptions
+    reference: Pyramid, target: Pyramid, camera: Camera, levels: Levels, options: AlignmentOptions
 ) -> tuple[Reference, Target, Exchanged | None]:
     """What a search needs of two frames."""
-    view = prepare_reference(reference, camera, levels, options)
+    view = prepare_reference(reference, camera, levels)
     exchanged = None
     if options.symmetric:
-        exchanged = Exchanged(prepare_reference(target, camera, levels, options), prepare_target(reference, levels))
+        exchanged = Exchanged(prepare_reference(target, camera, levels), prepare_target(reference, levels))
     return view, prepare_target(target, levels), exchanged
 
 
@@ -229,35 +231,36 @@ class Level(NamedTuple):
 def stack_levels(
     views: tuple[Reference, ...],
     camera: Camera,
-    levels: tuple[int, ...],
+    levels: Levels,
     options: AlignmentOptions,
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
 ) -> Level:
     """The visits of a search to the levels, [L], coarsest first."""
-    rows, columns = np.array(grids_of(camera, levels, options.points)).T
-    counted = jnp.array([min(options.views[level], len(views)) for level in levels])
+    numbers, count = levels.numbers, len(levels.numbers)
+    rows, columns = np.array(levels.grids).T
+    counted = jnp.array([min(options.views[number], len(views)) for number in numbers])
     reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *views)
     left_out = jnp.arange(len(views))[:, None] >= counted[:, None, None]
     points = reference.points._replace(q=jnp.where(left_out, 0.0, reference.points.q))
     once = Level(
-        jnp.array(levels),
-        jnp.arange(len(levels)) == 0,
-        image_planes(camera, levels),
-        reference._replace(points=points),
-        jnp.array(rows * columns),
-        jnp.array(columns),
-        counted,
-        jnp.array([options.islands[level] for level in levels]),
-        jnp.stack([jnp.float32(options.depth_weight[level]) for level in levels]),
-        None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
-        None if readout is None else jnp.full(len(levels), readout),
+        number=jnp.array(numbers),
+        is_first=jnp.arange(count) == 0,
+        plane=levels.planes(camera),
+        reference=reference._replace(points=points),
+        points=jnp.array(rows * columns),
+        columns=jnp.array(columns),
+        views=counted,
+        islands=jnp.array([options.islands[number] for number in numbers]),
+        depth_weight=jnp.stack([jnp.float32(options.depth_weight[number]) for number in numbers]),
+        exchanged=None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
+        readout=None if readout is None else jnp.full(count, readout),
     )
     if not options.refine:
         return once
-    visits = visited_levels(levels, options)
-    first_round = jnp.arange(len(visits)) < len(visits) - len(levels)
-    order = jnp.array([levels.index(level) for level in visits])
+    visits = visited_levels(numbers, options)
+    first_round = jnp.arange(len(visits)) < len(visits) - count
+    order = jnp.array([numbers.index(number) for number in visits])
     rounds = jax.tree.map(lambda leaf: leaf[order], once)
     islands = jnp.where(first_round, rounds.islands, 1)
     return rounds._replace(is_first=rounds.is_first & first_round, islands=islands)
@@ -273,17 +276,17 @@ def level_objective(level: Level, target: Target, options: AlignmentOptions, bri
     reference = level.reference._replace(grey=brightness.seen(level.reference.grey))
     charge = 0.0 if options.outside_cost is None else jnp.where(level.islands > 1, options.outside_cost, 0.0)
     return Objective(
-        reference,
-        target,
-        level.plane,
-        Scales.unit(),
-        jnp.float32(options.min_overlap),
-        jnp.float32(charge),
-        level.points,
-        level.views,
-        level.columns,
-        level.is_undecided if options.centred else None,
-        level.readout,
+        reference=reference,
+        target=target,
+        plane=level.plane,
+        scales=Scales.unit(),
+        min_overlap=jnp.float32(options.min_overlap),
+        outside_cost=jnp.float32(charge),
+        count=level.points,
+        views=level.views,
+        columns=level.columns,
+        centred=level.is_undecided if options.centred else None,
+        readout=level.readout,
         loss=options.loss,
         use_depth=options.depth,
     )
@@ -332,15 +335,16 @@ def objectives_of(
     reference: Pyramid,
     target: Pyramid,
     camera: Camera,
-    levels: tuple[int, ...],
+    numbers: tuple[int, ...],
     options: AlignmentOptions,
     target_T_reference: Float[Array, "4 4"],
 ) -> list[Objective]:
     """E of some levels of a pair, each as a search that starts its level at one motion would minimise it."""
+    levels = Levels.of(camera, numbers, options.points)
     view, packed, exchanged = prepare_pair(reference, target, camera, levels, options)
     options = replace(options, refine=False)
     stacked = stack_levels((view,), camera, levels, options, exchanged)
-    rows = [jax.tree.map(lambda leaf, place=place: leaf[place], stacked) for place in range(len(levels))]
+    rows = [jax.tree.map(lambda leaf, place=place: leaf[place], stacked) for place in range(len(numbers))]
     return [fit_objective(level, packed, options, target_T_reference, exchanged)[0] for level in rows]
 
 
@@ -396,6 +400,7 @@ def align_views(
     views: tuple[Reference, ...],
     target: Target,
     camera: Camera,
+    levels: Levels,
     solver: Solver,
     options: AlignmentOptions,
     key: PRNGKeyArray,
@@ -412,6 +417,7 @@ def align_views(
         views: Of `prepare_reference`; the first one's frame is the anchor, in whose camera the others' points are too.
         target: Of `prepare_target`, for the same solver.
         camera: Camera of level 0.
+        levels: Of `levels_of`.
         solver: Any `solvers.base.Solver` with an entry a level.
         options: What is minimised.
         key: Random key.
@@ -425,10 +431,10 @@ def align_views(
         The alignment and, where they were recorded, the candidates of each visit to a level, in the order of
         `visited_levels`.
     """
-    levels = stack_levels(views, camera, solver.levels, options, exchanged, readout)
-    first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], levels) for at in (0, -1))
-    places, visits = max(options.islands), len(visited_levels(solver.levels, options))
-    keys = jax.random.split(key, (visits + 1, places))
+    visits = stack_levels(views, camera, levels, options, exchanged, readout)
+    first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
+    places, order_of_levels = max(options.islands), visited_levels(levels.numbers, options)
+    keys = jax.random.split(key, (len(order_of_levels) + 1, places))
     origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
     start = Search(
         origins,
@@ -445,7 +451,7 @@ def align_views(
         basis = jnp.eye(6)
         if options.precondition:
             basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
-        problem = Problem(objective, search.islands[0], basis, origins[0])
+        problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=origins[0])
         island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
         if places == 1:
@@ -463,8 +469,8 @@ def align_views(
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
         return search, (history[order[0]], population)
 
-    search, (histories, populations) = jax.lax.scan(search_level, start, (levels, keys[:-1]))
-    iterations = [solver.iterations[level] for level in visited_levels(solver.levels, options)]
+    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys[:-1]))
+    iterations = [solver.iterations[number] for number in order_of_levels]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
     return _conclude(objective, search, finest, options, history, origins[0]), populations
@@ -590,7 +596,7 @@ def _conclude(
         # once more, at the motion found, so that errors of different solvers can be compared
         objective = replace(objective, scales=estimate_scales(objective.residuals(found), finest.depth_weight))
     reach = jnp.stack([search.box[0], search.box[3]])
-    problem = Problem(objective, found, jnp.eye(6), centre, reach)
+    problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
     evidence = _refine(problem, takes_step=options.last_step and not options.symmetric)
     covariance, status = _judge(evidence, objective, search.rival)
     motion, model = evidence.motion, evidence.model
@@ -683,8 +689,9 @@ def _align_images(
     before, after = (
         build_pyramid(frame.grey, frame.depth, camera.depth_scale, LEVELS) for frame in (reference, target)
     )
-    view, packed, exchanged = prepare_pair(before, after, camera, solver.levels, options)
-    return align_views((view,), packed, camera, solver, options, key, guess[None], exchanged=exchanged)[0]
+    levels = levels_of(camera, solver, options)
+    view, packed, exchanged = prepare_pair(before, after, camera, levels, options)
+    return align_views((view,), packed, camera, levels, solver, options, key, guess[None], exchanged=exchanged)[0]
 
 
 POINTS_SIDE_BY_SIDE = 2**20
@@ -706,8 +713,8 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
         return _align_images(reference, target, camera, solver, options, key, guess)
 
     if jax.default_backend() != "cpu":
-        most = most_points(camera, solver.levels, options.points)
-        return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=max(1, POINTS_SIDE_BY_SIDE // most))
+        at_once = max(1, POINTS_SIDE_BY_SIDE // levels_of(camera, solver, options).most_points)
+        return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=at_once)
     empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
     return jax.lax.fori_loop(
         0, count, lambda i, results: jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i)), empty

@@ -79,15 +79,16 @@ class Camera:
         A pixel of level k averages 2^k × 2^k pixels, so centres map as c' = (c + 1/2) / 2^k - 1/2.
         Distortion is kept as it is: it acts on normalised coordinates.
         """
-        scale = 0.5**k
-        return replace(
-            self,
-            fx=self.fx * scale,
-            fy=self.fy * scale,
-            cx=(self.cx + 0.5) * scale - 0.5,
-            cy=(self.cy + 0.5) * scale - 0.5,
-            width=self.width >> k,
-            height=self.height >> k,
+        fx, fy, cx, cy = self.scaled(0.5**k)
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=self.width >> k, height=self.height >> k)
+
+    def scaled(self, scale: Any) -> tuple[Any, Any, Any, Any]:
+        """fx, fy, cx, cy of an image `scale` times as large, or of several; see `level`."""
+        return (
+            self.fx * scale,
+            self.fy * scale,
+            (self.cx + 0.5) * scale - 0.5,
+            (self.cy + 0.5) * scale - 0.5,
         )
 
     def project(self, points: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array | np.ndarray, "*batch 2"]:

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.camera import Camera
-from gavo_jax.pyramid import NO_PIXEL, Pyramid, atlas_layout, make_atlas
+from gavo_jax.levels import ImagePlane, Levels
+from gavo_jax.pyramid import NO_PIXEL, Pyramid, make_atlas
 from gavo_jax.se3 import adjoint, exp, log, right_jacobian, rigid_inverse
 from gavo_jax.warp import (
     DepthSample,
     GreySample,
-    ImagePlane,
     Points,
     Shutter,
     Slopes,
@@ -31,9 +31,7 @@ from gavo_jax.warp import (
     Warped,
     delay,
     delayed_slopes,
-    image_planes,
     inverse_depth_slopes,
-    level_sizes,
     look_up,
     row_time,
     sample_depth,
@@ -118,36 +116,7 @@ def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"]
     return along(grey[1:-1, :-2], grey[1:-1, 2:]), along(grey[:-2, 1:-1], grey[2:, 1:-1])
 
 
-PointsPerLevel = int | None | tuple[int, ...]
-"""Largest number of points: of every level alike, None for every pixel, or an entry a level of the pyramid."""
-
-
-def cell_of(camera: Camera, points: int | None) -> int:
-    """Side of the blocks that give one point each, so that an image gives at most `points`; None takes every pixel."""
-    cell = 1
-    while points is not None and (camera.width // cell) * (camera.height // cell) > points:
-        cell += 1
-    return cell
-
-
-def cells_of(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> list[int]:
-    """`cell_of` some levels of a camera."""
-    most = [points[level] if isinstance(points, tuple) else points for level in levels]
-    return [cell_of(camera.level(level), count) for level, count in zip(levels, most, strict=True)]
-
-
-def grids_of(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> list[tuple[int, int]]:
-    """Rows and columns of the points of some levels."""
-    cells = cells_of(camera, levels, points)
-    return [(h // cell, w // cell) for (h, w), cell in zip(level_sizes(camera, levels), cells, strict=True)]
-
-
-def most_points(camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> int:
-    """Points of the level that has the most, N of `make_references`."""
-    return max(rows * columns for rows, columns in grids_of(camera, levels, points))
-
-
-def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], points: PointsPerLevel) -> Reference:
+def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Reference:
     """Points of some levels, [L, N]: one a square block of pixels, that of the steepest grey with a reading.
 
     The choice is stratified, so its cost in accuracy is small, and N is static. Shorter levels are filled up with
@@ -157,26 +126,21 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: tuple[int, ...], p
         pyramid: Of the reference frame.
         camera: Of level 0.
         levels: Which ones, in the order of the result.
-        points: Largest number of points a level.
     """
-    sizes = level_sizes(camera, levels)
-    layout = atlas_layout(sizes)
-    grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[level] for level in levels]))
+    layout = levels.layout
+    grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[number] for number in levels.numbers]))
     gradient, slopes = central_gradient(grey), inverse_depth_slopes(inverse_depth)
     grey, inverse_depth = grey[1:-1, 1:-1], inverse_depth[1:-1, 1:-1]
     steepness = jnp.where(inverse_depth > 0, gradient[0] ** 2 + gradient[1] ** 2, -1.0)
     chosen = []
-    for (height, width), (row, column), cell in zip(
-        sizes, layout.corners, cells_of(camera, levels, points), strict=True
-    ):
+    for (height, width), (row, column), cell in zip(levels.sizes, layout.corners, levels.cells, strict=True):
         u, v = _steepest_of_blocks(steepness[row : row + height, column : column + width], cell)
         chosen.append(((v + row) * layout.width + u + column).reshape(-1))
-    longest = max(places.shape[0] for places in chosen)
-    place = jnp.stack([jnp.pad(p, (0, longest - p.shape[0]), constant_values=layout.gap) for p in chosen])
+    place = jnp.stack([jnp.pad(p, (0, levels.most_points - p.shape[0]), constant_values=layout.gap) for p in chosen])
     q, grey, grey_u, grey_v, slope_u, slope_v = (
         image.reshape(-1).at[place].get(mode="promise_in_bounds") for image in (inverse_depth, grey, *gradient, *slopes)
     )
-    plane = jax.tree.map(lambda leaf: leaf[:, None], image_planes(camera, levels))
+    plane = jax.tree.map(lambda leaf: leaf[:, None], levels.planes(camera))
     row, column = np.array(layout.corners).T[..., None]
     u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
     near = jnp.maximum(q, 1e-3)

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
+from gavo_jax.levels import atlas_layout
+
 LEVELS = 5
 
 # Two surfaces whose inverse depths differ by more than this share are not averaged: a 2x2 block across an edge keeps
@@ -89,29 +91,6 @@ def build_pyramid(
     return tuple(pyramid)
 
 
-class AtlasLayout(NamedTuple):
-    """Where levels lie in an atlas: the largest on top, the others from left to right below, a pixel between them."""
-
-    height: int
-    width: int
-    corners: tuple[tuple[int, int], ...]
-    """Row and column of each level's first pixel."""
-    gap: int
-    """Place, in the flat image, of a pixel that belongs to no level."""
-
-
-def atlas_layout(sizes: Sequence[tuple[int, int]]) -> AtlasLayout:
-    """The layout of levels of some sizes (height, width), whose order `corners` keeps."""
-    top = max(sizes)
-    corners, column, below = [], 0, 0
-    for size in sizes:
-        corners.append((0, 0) if size == top else (top[0] + 1, column))
-        if size != top:
-            column, below = column + size[1] + 1, max(below, size[0])
-    width = max(top[1], column)
-    return AtlasLayout(top[0] + 1 + below, width, tuple(corners), top[0] * width)
-
-
 class Atlas(NamedTuple):
     """Levels of a frame in one image, so that a step of the work on them is one operation and not one a level.
 
@@ -130,7 +109,7 @@ NO_PIXEL = -1.0
 
 
 def make_atlas(levels: Sequence[PyramidLevel]) -> Atlas:
-    """The atlas of some levels, laid out as `atlas_layout` says."""
+    """The atlas of some levels, laid out as `levels.atlas_layout` says."""
     layout = atlas_layout([(level.grey.shape[0], level.grey.shape[1]) for level in levels])
     size = (layout.height + 3, layout.width + 3)
     grey, inverse_depth = jnp.full(size, NO_PIXEL), jnp.zeros(size)

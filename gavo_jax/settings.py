@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import jax
 
-from gavo_jax.objective import Loss, PointsPerLevel, geman_mcclure
+from gavo_jax.levels import PointsPerLevel
+from gavo_jax.objective import Loss, geman_mcclure
 from gavo_jax.solvers.base import Solver, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 

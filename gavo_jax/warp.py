@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Integer, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from gavo_jax.camera import Camera
-from gavo_jax.pyramid import Atlas, atlas_layout
+from gavo_jax.levels import ImagePlane
+from gavo_jax.pyramid import Atlas
 from gavo_jax.se3 import rigid_inverse
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
@@ -31,45 +32,6 @@ class Points(NamedTuple):
     y: Float[Array, " n"]
     q: Float[Array, " n"]
     """Inverse depth, 1/m; 0 marks a point without a reading."""
-
-
-class ImagePlane(NamedTuple):
-    """Intrinsics and place of a pyramid level as numbers that a program takes as input, so that one compiled program
-    serves every level.
-    """
-
-    fx: Float[Array, "*l"]
-    fy: Float[Array, "*l"]
-    cx: Float[Array, "*l"]
-    cy: Float[Array, "*l"]
-    width: Integer[Array, "*l"]
-    height: Integer[Array, "*l"]
-    offset: Integer[Array, "*l"]
-    """Of the level's first pixel in the packed target."""
-    stride: Integer[Array, "*l"]
-    """From a pixel in the packed target to the one below it."""
-
-
-def image_planes(camera: Camera, levels: tuple[int, ...]) -> ImagePlane:
-    """Planes of some levels, [L], packed together."""
-    scale = np.float32(0.5) ** np.array(levels, np.float32)
-    sizes = level_sizes(camera, levels)
-    layout, (height, width) = atlas_layout(sizes), np.array(sizes).T
-    offset = [row * layout.width + column for row, column in layout.corners]
-    focal = [f * scale for f in (camera.fx, camera.fy)]
-    centre = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
-    columns = (*focal, *centre, width, height, offset, [layout.width] * len(levels))
-    return ImagePlane(*(jnp.asarray(column) for column in columns))
-
-
-def level_sizes(camera: Camera, levels: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Height and width of some levels."""
-    return [(camera.height >> level, camera.width >> level) for level in levels]
-
-
-def image_plane(camera: Camera) -> ImagePlane:
-    """The plane of one image that is packed alone."""
-    return jax.tree.map(lambda leaf: leaf[0], image_planes(camera, (0,)))
 
 
 class Warped(NamedTuple):

@@ -25,6 +25,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.levels import Levels
 from gavo_jax.objective import l2
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.pyramid import LEVELS, build_pyramid
@@ -102,8 +103,9 @@ def test_the_symmetric_error_does_not_care_which_frame_is_the_reference(
 def test_coarse_levels_see_the_first_view_alone(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     camera, options = sequence.camera, AlignmentOptions(views=(2, 2, 1, 1, 1))
     pyramid = build_pyramid(jnp.asarray(frames[0].grey), jnp.asarray(frames[0].depth), camera.depth_scale)
-    view, *_ = prepare_pair(pyramid, pyramid, camera, (2, 1), options)
-    levels = stack_levels((view, view), camera, (2, 1), options)
+    searched = Levels.of(camera, (2, 1), options.points)
+    view, *_ = prepare_pair(pyramid, pyramid, camera, searched, options)
+    levels = stack_levels((view, view), camera, searched, options)
     assert levels.views.tolist() == [1, 2]
     has_reading = np.asarray(levels.reference.points.q > 0).any(axis=-1)
     assert has_reading.tolist() == [[True, False], [True, True]]

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from gavo_jax import objective as objective_module
 from gavo_jax.camera import Camera
+from gavo_jax.levels import Levels, image_plane
 from gavo_jax.objective import (
     LOSSES,
     Brightness,
@@ -42,7 +43,7 @@ from gavo_jax.se3 import exp
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.particle_swarm import ParticleSwarm
-from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, image_plane, pack_target
+from gavo_jax.warp import INVERSE_DEPTH_STEP, Target, pack_target
 
 SMALL = Camera(24.0, 23.0, 11.3, 8.8, 24, 18)
 CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)
@@ -51,7 +52,7 @@ CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)
 def make_reference(level: PyramidLevel, camera: Camera, cell: int = 1) -> Reference:
     """The points of one level, one a cell x cell block."""
     points = (camera.width // cell) * (camera.height // cell)
-    return jax.tree.map(lambda leaf: leaf[0], make_references((level,), camera, (0,), points))
+    return jax.tree.map(lambda leaf: leaf[0], make_references((level,), camera, Levels.of(camera, (0,), points)))
 
 
 @cache
@@ -311,7 +312,7 @@ def test_several_levels_give_the_points_of_each_alone() -> None:
     for size in ((9, 12), (4, 6)):
         levels.append(PyramidLevel(*(jnp.asarray(rng.uniform(0.1, 200.0, size), jnp.float32) for _ in range(2))))
     points = (48, 30, 48)
-    together = make_references(tuple(levels), SMALL, (2, 1, 0), points)
+    together = make_references(tuple(levels), SMALL, Levels.of(SMALL, (2, 1, 0), points))
     for row, level, cell in ((0, 2, 1), (1, 1, 2), (2, 0, 3)):
         alone = make_reference(levels[level], SMALL.level(level), cell)
         count = alone.grey.shape[0]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import Alignment, AlignmentStatus, no_alignment, prepare_reference
+from gavo_jax.alignment import Alignment, AlignmentStatus, levels_of, no_alignment, prepare_reference
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -468,7 +468,7 @@ def test_warming_up_leaves_the_garbage_collector_as_it_was(collects: bool) -> No
 def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSequence) -> None:
     frame, camera = sequence[0], CAMERA.level(1)
     pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
-    first = prepare_reference(pyramid, CAMERA, SOLVER.levels, AlignmentOptions())
+    first = prepare_reference(pyramid, CAMERA, levels_of(CAMERA, SOLVER, AlignmentOptions()))
     keyframe = move_reference(first, exp(jnp.array([0.0, 0, 0, 0, turn, 0])))
     renewed = renew_keyframe(keyframe, first._replace(grey=first.grey + 1000.0), camera, 0.7).grey > 500.0
 

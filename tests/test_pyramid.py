@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from gavo_jax.camera import Camera
+from gavo_jax.levels import atlas_layout
 from gavo_jax.pyramid import (
     LEVELS,
     NO_PIXEL,
     PyramidLevel,
-    atlas_layout,
     build_pyramid,
     halve_grey,
     halve_inverse_depth,

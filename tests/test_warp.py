@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.levels import Levels, image_plane
 from gavo_jax.pyramid import PyramidLevel, build_pyramid, make_atlas
 from gavo_jax.se3 import GENERATORS, adjoint, exp, log, right_jacobian
 from gavo_jax.warp import (
@@ -26,8 +27,6 @@ from gavo_jax.warp import (
     Words,
     delay,
     delayed_slopes,
-    image_plane,
-    image_planes,
     inverse_depth_slopes,
     look_up,
     pack_grey,
@@ -362,7 +361,10 @@ def test_levels_are_sampled_out_of_one_atlas() -> None:
     camera, rng = Camera(40.0, 41.0, 23.1, 17.2, 45, 35), np.random.default_rng(5)
     grey, depth = rng.uniform(0, 255, (35, 45)), rng.choice([0.0, 1.0, 1.02, 1.7], (35, 45))
     pyramid, levels = build_pyramid(jnp.asarray(grey), jnp.asarray(depth), 1.0, 4), (3, 2, 0)
-    target, planes = pack_target(make_atlas([pyramid[level] for level in levels])), image_planes(camera, levels)
+    target, planes = (
+        pack_target(make_atlas([pyramid[level] for level in levels])),
+        Levels.of(camera, levels).planes(camera),
+    )
     for i, level in enumerate(levels):
         plane = jax.tree.map(lambda leaf, i=i: leaf[i], planes)
         alone, view = packed(*pyramid[level]), camera.level(level)

@@ -16,17 +16,18 @@ from gavo_jax.alignment import (
     Exchanged,
     Population,
     align_views,
+    levels_of,
     prepare_reference,
     prepare_target,
 )
 from gavo_jax.camera import Camera
-from gavo_jax.objective import Reference, most_points, move_reference, settle_reference
+from gavo_jax.objective import Reference, move_reference, settle_reference
 from gavo_jax.program_cache import CachedProgram
-from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, atlas_layout, build_pyramid, halve_inverse_depth
+from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
-from gavo_jax.warp import Points, Target, level_sizes, synchronise_depth, warp
+from gavo_jax.warp import Points, Target, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -119,7 +120,8 @@ def track_frame(
     is_first = ~jnp.any(state.previous.points.q > 0)
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     predicted = state.motion * (clock.elapsed / state.seconds)
-    finest = min(solver.levels)
+    levels = levels_of(camera, solver, alignment)
+    finest = levels.numbers[-1]
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
     readout = camera.readout / clock.elapsed if options.rolling_shutter else None
@@ -129,18 +131,18 @@ def track_frame(
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
-    packed = prepare_target(target, solver.levels)
+    packed = prepare_target(target, levels)
     exchanged = None
     if alignment.symmetric:
-        exchanged = Exchanged(prepare_reference(target, camera, solver.levels, alignment), state.previous_image)
+        exchanged = Exchanged(prepare_reference(target, camera, levels), state.previous_image)
     key = jax.random.fold_in(key, clock.frame)
     result, populations = align_views(
-        views, packed, camera, solver, alignment, key, guesses, record, exchanged, readout
+        views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout
     )
     motion = jnp.where(is_first, 0.0, result.xi)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * motion, finest)
-    newest, keyframe = prepare_reference(target, camera, solver.levels, alignment), state.keyframe
+    newest, keyframe = prepare_reference(target, camera, levels), state.keyframe
     if readout is not None:
         unsettled = newest.row_time
         newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
@@ -154,17 +156,16 @@ def track_frame(
 def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
     """State after the first frame, by a program of its own."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
-    reference = prepare_reference(pyramid, camera, solver.levels, alignment)
-    packed = prepare_target(pyramid, solver.levels)
+    levels = levels_of(camera, solver, alignment)
+    reference, packed = prepare_reference(pyramid, camera, levels), prepare_target(pyramid, levels)
     return TrackerState(reference, reference, packed, jnp.zeros(6), jnp.float32(1.0))
 
 
 def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
     """The state before the first frame: nothing, in the shapes and types of every state."""
-    levels = solver.levels
-    row: Any = np.zeros((len(levels), most_points(camera, levels, alignment.points)), np.float32)
-    layout = atlas_layout(level_sizes(camera, levels))
-    words: Any = np.zeros((layout.height, layout.width), np.uint32)
+    levels = levels_of(camera, solver, alignment)
+    row: Any = np.zeros((len(levels.numbers), levels.most_points), np.float32)
+    words: Any = np.zeros((levels.layout.height, levels.layout.width), np.uint32)
     reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
     still: Any = np.zeros(6, np.float32), np.float32(1.0)
     return TrackerState(reference, reference, Target(words, words), *still)
