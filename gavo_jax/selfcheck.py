@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax import alignment, reference, warp
+from gavo_jax import alignment, reference, se3, warp
 from gavo_jax.camera import Camera
 from gavo_jax.objective import TILES, Objective, Problem, Reference, Scales, geman_mcclure, most_points
-from gavo_jax.presets import METHODS, PRESETS, Preset, get_preset
+from gavo_jax.presets import METHODS, PRESETS, preset
 from gavo_jax.pyramid import PyramidLevel, make_atlas
+from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Bounds, largest
 from gavo_jax.solvers.genetic import SMALLEST_CHANCE, GeneticAlgorithm, GeneticState
 
@@ -69,8 +70,8 @@ def largest_deviation(found: Any, expected: Any, unit: float = 1.0) -> float:
     return float(np.max(np.where(np.isnan(difference), np.inf, difference), initial=0.0)) / unit
 
 
-def _all_presets() -> list[Preset]:
-    return [get_preset(method, name) for method in METHODS for name in PRESETS]
+def _all_presets() -> list[Settings]:
+    return [preset(method, name) for method in METHODS for name in PRESETS]
 
 
 FULL_IMAGE = Camera.preset("fr1")
@@ -80,20 +81,20 @@ FULL_IMAGE = Camera.preset("fr1")
 def preset_points(merged: bool = False) -> tuple[int, ...]:
     """Points of a view that presets take of a level, or of all its views together."""
     counts = set()
-    for preset in _all_presets():
-        views = max(preset.alignment.views) if merged and preset.odometry.reference == "keyframe" else 1
-        counts.add(views * most_points(FULL_IMAGE, preset.solver.levels, preset.alignment.points))
+    for settings in _all_presets():
+        views = max(settings.alignment.views) if merged and settings.odometry.reference == "keyframe" else 1
+        counts.add(views * most_points(FULL_IMAGE, settings.solver.levels, settings.alignment.points))
     return tuple(sorted(counts))
 
 
-def _populations(preset: Preset) -> tuple[int, int]:
+def _populations(settings: Settings) -> tuple[int, int]:
     """Islands, and candidates of each."""
-    return max(preset.alignment.islands), largest(getattr(preset.solver, "population", 1))
+    return max(settings.alignment.islands), largest(getattr(settings.solver, "population", 1))
 
 
 def preset_candidates() -> tuple[int, ...]:
     """Motions that presets score at once: populations, those of all islands, scouts."""
-    counts = {preset.alignment.scouts for preset in _all_presets()}
+    counts = {settings.alignment.scouts for settings in _all_presets()}
     counts |= {islands * population for islands, population in map(_populations, _all_presets())}
     return tuple(sorted(counts - {0, 1}))
 
@@ -105,10 +106,10 @@ def preset_islands() -> tuple[int, ...]:
 
 def preset_scouts() -> tuple[int, ...]:
     """Motions of which presets choose the best distinct ones."""
-    return tuple(sorted({preset.alignment.scouts for preset in _all_presets()} - {0}))
+    return tuple(sorted({settings.alignment.scouts for settings in _all_presets()} - {0}))
 
 
-WIDE = get_preset("ga", "wide")
+WIDE = preset("ga", "wide")
 """The preset with the most motions."""
 
 
@@ -121,7 +122,7 @@ def _random_twists(rows: int, reach: float) -> np.ndarray:
     return np.random.default_rng(rows).uniform(-reach, reach, (rows, 6)).astype(np.float32)
 
 
-exp, log, rigid_inverse = jax.jit(warp.exp), jax.jit(warp.log), jax.jit(warp.rigid_inverse)
+exp, log, rigid_inverse = jax.jit(se3.exp), jax.jit(se3.log), jax.jit(se3.rigid_inverse)
 transform = jax.jit(lambda problem, x: problem.transform(x))
 warp_points = jax.jit(warp.warp)
 score = jax.jit(lambda objective, motions: objective.score(motions))
@@ -137,19 +138,19 @@ def examine(problem: Problem) -> Any:
 
 
 def exp_deviation(rows: int) -> float:
-    """Of `warp.exp`: metres, and entries of a rotation."""
+    """Of `se3.exp`: metres, and entries of a rotation."""
     twists = _random_twists(rows, 1.5)
     return largest_deviation(exp(twists), reference.exp(twists))
 
 
 def log_deviation(rows: int) -> float:
-    """Of `warp.log` of motions that are `reference.exp` of twists: metres, radians."""
+    """Of `se3.log` of motions that are `reference.exp` of twists: metres, radians."""
     twists = _random_twists(rows, 1.5)
     return largest_deviation(log(reference.exp(twists).astype(np.float32)), twists)
 
 
 def inverse_deviation(rows: int) -> float:
-    """Of `warp.rigid_inverse`: metres, and entries of a rotation."""
+    """Of `se3.rigid_inverse`: metres, and entries of a rotation."""
     motions = reference.exp(_random_twists(rows, 1.5)).astype(np.float32)
     return largest_deviation(rigid_inverse(motions), np.linalg.inv(motions.astype(np.float64)))
 
@@ -356,13 +357,13 @@ def generation_deviation(islands: int, population: int) -> float:
     rng = np.random.default_rng(islands)
     x = rng.normal(size=(islands, 2 * population, 6)).astype(np.float32)
     errors = _distinct(1.0 + np.einsum("ipk,kl,ipl->ip", x, np.eye(6) + 0.2, x - 0.3) / 8 + 1.0)
-    solver = replace(WIDE.solver, population=population)
+    solver = GeneticAlgorithm(population=population)
     width = np.full((islands, 6), np.float32(HALF_WIDTH))
     step = np.full((islands, 6), np.float32(1.5))
     first, second = np.split(x, 2, axis=1)
-    parents, newcomers = np.split(errors, 2, axis=1)
-    population_now, error, offspring, step = _given([first, parents, second, step])
-    state = GeneticState(population_now, error, offspring, step, Bounds(*_given([-width, width])))
+    first_errors, newcomers = np.split(errors, 2, axis=1)
+    parents, parent_errors, offspring, step = _given([first, first_errors, second, step])
+    state = GeneticState(parents, parent_errors, offspring, step, Bounds(*_given([-width, width])))
     found, chance = jax.device_get(breed(solver, islands, state, newcomers))
     mutants = round(solver.mutants * population)
     settings = reference.Breeding(solver.pressure, mutants, solver.crossover_range, 1.5, HALF_WIDTH)
