@@ -6,7 +6,6 @@ two. So each check compiles a kernel as the presets call it, for as many rows, a
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -439,13 +438,8 @@ CONTAINED = ("log",)
 
 
 def full_size() -> Iterator[Outcome]:
-    """Every check that no other one contains, at the largest size of any preset.
-
-    Some at a time: while one program is compiled, another one is traced.
-    """
-    chosen = [check for name, check in CHECKS.items() if name not in CONTAINED]
-    with ThreadPoolExecutor(WORKERS) as pool:
-        yield from pool.map(_at_full_size, chosen)
+    """Every check that no other one contains, at the largest size of any preset."""
+    return (_at_full_size(check) for name, check in CHECKS.items() if name not in CONTAINED)
 
 
 def _at_full_size(check: Check) -> Outcome:
@@ -457,8 +451,6 @@ def _at_full_size(check: Check) -> Outcome:
         return Outcome(f"{check.words.format(size)} ({' '.join(str(error).split())[:200]})", np.inf, check.tolerance)
 
 
-WORKERS = 2
-"""Checks at a time; XLA compiles one on more than one core."""
 REPETITIONS = 5
 """Measurements of the speed, of which the median counts."""
 RECORDED_NANOSECONDS = {"AMD EPYC": 2.3, "Intel Xeon": 5.3}
