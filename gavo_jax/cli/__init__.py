@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import tyro
 
-from gavo_jax.cli.options import Align, Command, Compare, Download, Evaluate, Experiment, Run, Tune, View
+from gavo_jax import compiler
+from gavo_jax.cli.options import Align, Command, Compare, Doctor, Download, Evaluate, Experiment, Run, Tune, View
 from gavo_jax.errors import GavoError
 from gavo_jax.version import __version__
 
@@ -56,7 +57,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _execute(command: Command) -> int:
-    """Import the subcommand only now, so that help and usage errors do not wait for JAX."""
+    """Import the subcommand only now, so that help and usage errors do not wait for JAX.
+
+    Raises:
+        GavoError: this JAX is ruled out, and the subcommand is not the one that says what is wrong.
+    """
+    fault = compiler.unfit_compiler()
+    if fault and not isinstance(command, Doctor):
+        raise GavoError(fault)
     match command:
         case Run():
             from gavo_jax.cli.run import run
@@ -90,6 +98,10 @@ def _execute(command: Command) -> int:
             from gavo_jax.cli.tune import tune
 
             return tune(command)
+        case Doctor():
+            from gavo_jax.cli.doctor import doctor
+
+            return doctor(command)
 
 
 def _parse(arguments: list[str]) -> Command | None:
@@ -122,7 +134,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune")
+    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor")
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 

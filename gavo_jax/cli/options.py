@@ -172,6 +172,11 @@ class Tune:
     """Folder for the study and the front."""
 
 
+@dataclass(frozen=True)
+class Doctor:
+    """Versions, machine and settings for an issue report; whether this JAX computes right numbers, and how fast."""
+
+
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
@@ -181,4 +186,5 @@ Command = (
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[Download, subcommand("download")]
     | Annotated[Tune, subcommand("tune")]
+    | Annotated[Doctor, subcommand("doctor")]
 )

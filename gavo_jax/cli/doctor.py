@@ -1,0 +1,122 @@
+"""`gavo doctor`: what somebody who is asked for help wants to know first, and whether JAX computes right numbers."""
+
+import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from pathlib import Path
+
+import jax
+from packaging.requirements import Requirement
+
+from gavo_jax import compiler, selfcheck
+from gavo_jax.cli.compilation_cache import cache_folder, enable_compilation_cache
+from gavo_jax.cli.options import Doctor
+from gavo_jax.version import __version__
+
+OFF = 1
+"""Exit status where something is not as it should be."""
+NOT_INSTALLED = "not installed"
+PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
+
+
+def doctor(command: Doctor) -> int:
+    """Print versions, machine, cache, extras, checks and speed; 0 if all is well."""
+    del command
+    enable_compilation_cache()
+    faults = []
+    print(f"gavo-jax: {__version__}")
+    for name in PACKAGES:
+        print(f"{name}: {_version(name) or NOT_INSTALLED}")
+    print(f"python: {platform.python_version()} ({platform.python_implementation()})")
+    print(f"system: {platform.platform()}")
+    print(f"processor: {compiler.processor()}, {os.cpu_count()} cores, {_usable_cores()} of them for this process")
+    print(f"devices: {', '.join(f'{device.platform} {device.device_kind}' for device in jax.devices())}")
+    fault = compiler.unfit_compiler()
+    if fault:
+        print(f"compiler: WRONG: {fault}")
+        faults.append("the version of JAX")
+    described, is_writable = _cache()
+    print(f"cache: {described}")
+    if not is_writable:
+        faults.append("the cache folder")
+    for line in _extras():
+        print(f"extra {line}")
+    faults += _print_checks()
+    print("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
+    return OFF if faults else 0
+
+
+def _print_checks() -> list[str]:
+    """Run and print checks and speed; the names of those that are wrong."""
+    wrong = []
+    for outcome in selfcheck.full_size():
+        verdict = "ok" if outcome.is_right else "WRONG"
+        print(
+            f"check {verdict}: {outcome.name}: off by {outcome.deviation:.1e}, at most {outcome.tolerance:.0e}",
+            flush=True,
+        )
+        if not outcome.is_right:
+            wrong.append(outcome.name)
+    recorded = ", ".join(f"{time} on an {name}" for name, time in selfcheck.RECORDED_NANOSECONDS.items())
+    print(f"speed: {selfcheck.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
+    return wrong
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _usable_cores() -> int | None:
+    """Cores that the system lets this process run on; all where it does not say."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def _cache() -> tuple[str, bool]:
+    """What there is to say about the cache folder, and whether programs can be kept there."""
+    folder = cache_folder()
+    if folder is None:
+        return "none: there is no home folder, and GAVO_CACHE_DIR is not set", False
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-atime")]
+    megabytes = sum(path.stat().st_size for path in files) / 2**20
+    words = f"{_without_home(folder)}, {len(files)} programs, {megabytes:.1f} MiB"
+    if elsewhere := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        words += f", compiled ones in {_without_home(Path(elsewhere))}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder):
+            return f"{words}, writable", True
+    except OSError as error:
+        return f"{words}, NOT writable: {error.strerror}", False
+
+
+def _without_home(path: Path) -> str:
+    """A path that does not tell whose it is."""
+    try:
+        return f"~/{path.absolute().relative_to(Path.home())}"
+    except (RuntimeError, ValueError):
+        return str(path)
+
+
+def _extras() -> Iterator[str]:
+    """A line for each optional extra: its packages with versions."""
+    try:
+        extras = metadata("gavo-jax").get_all("Provides-Extra") or []
+        requirements = [Requirement(line) for line in requires("gavo-jax") or []]
+    except PackageNotFoundError:
+        return
+    for extra in extras:
+        if extra == "test":
+            continue
+        needed = [r for r in requirements if r.marker and r.marker.evaluate({"extra": extra})]
+        names = [name for requirement in needed for name in _packages(requirement)]
+        yield f"{extra}: {', '.join(f'{name} {_version(name) or NOT_INSTALLED}' for name in names)}"
+
+
+def _packages(requirement: Requirement) -> list[str]:
+    """A requirement's package; of jax[cuda12], which is JAX itself, the plugin that makes the difference."""
+    return [f"{requirement.name}-{extra}-plugin" for extra in requirement.extras] or [requirement.name]
