@@ -23,7 +23,7 @@ def cross_matrix(a: np.ndarray) -> np.ndarray:
 
 
 def exp(twists: Rows) -> Rows:
-    """g(ξ) of twists [n, 6], equation (3), by Rodrigues' formula: [n, 4, 4]."""
+    """`se3.exp` of twists [n, 6], by Rodrigues' formula: [n, 4, 4]."""
     twists = np.asarray(twists, np.float64)
     angle = np.linalg.norm(twists[:, 3:], axis=1)[:, None, None]
     small = angle < 1e-4
@@ -101,14 +101,14 @@ BORDER = 1e-4
 
 
 def points_of(scene: Scene) -> np.ndarray:
-    """P⁻¹(p) of the points with a reading, equation (5), metres: [n, 3]; 1 m off where there is none."""
+    """P⁻¹(p) of the points with a reading, as `Camera.back_project`, metres: [n, 3]; 1 m off where there is none."""
     x, y, q = (np.asarray(array, np.float64) for array in (scene.x, scene.y, scene.q))
     depth = 1.0 / np.where(q > 0, q, 1.0)
     return np.stack([x * depth, y * depth, depth], axis=-1)
 
 
 def warp(scene: Scene, target_T_reference: np.ndarray) -> Warped:
-    """ω(ξ, p) of all points for one motion [4, 4], equations (4) to (8)."""
+    """ω(ξ, p) of all points for one motion [4, 4], as `warp.warp`."""
     camera = scene.camera
     moved = points_of(scene) @ target_T_reference[:3, :3].T + target_T_reference[:3, 3]
     seen = (scene.q > 0) & (moved[:, 2] * scene.q > 1e-3)
@@ -130,7 +130,7 @@ class Weighing(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Equation (1) at the points inside, [m] each, and where they are."""
+    """`Objective.residuals` of the points inside, [m] each, and where they are."""
 
     grey: np.ndarray
     """Grey levels."""
@@ -167,7 +167,7 @@ def geman_mcclure(s: np.ndarray | float) -> np.ndarray | float:
 
 
 def error(scene: Scene, r: Residuals, by: Weighing) -> tuple[float, float]:
-    """E, equation (2) with the robust loss and the depth term, and the overlap."""
+    """`Objective.error` with the robust loss and the depth term, and the overlap."""
     cost = geman_mcclure((r.grey / by.grey) ** 2) + by.depth_weight * geman_mcclure((r.depth / by.depth) ** 2)
     readings, inside = np.count_nonzero(scene.q > 0), len(r.grey)
     typical = geman_mcclure(1.0) * (1.0 + by.depth_weight)
@@ -250,7 +250,7 @@ EDGE, TAIL = 1e-5, 1e-3
 
 
 def generation(x: np.ndarray, errors: np.ndarray, chance: np.ndarray, by: Breeding) -> Generation:
-    """Equations (10) to (14) and the offspring that the quadratic fit breeds.
+    """`GeneticAlgorithm.step`: the operators and the offspring that the quadratic fit breeds.
 
     Args:
         x: [I, 2P, 6] parents and newcomers.

@@ -16,12 +16,14 @@ import numpy as np
 
 from gavo_jax import alignment, reference, se3, warp
 from gavo_jax.camera import Camera
-from gavo_jax.objective import TILES, Objective, Problem, Reference, Scales, geman_mcclure, most_points
+from gavo_jax.levels import Levels, image_plane
+from gavo_jax.objective import TILES, Objective, Problem, Reference, Scales, geman_mcclure
 from gavo_jax.presets import METHODS, PRESETS, preset
 from gavo_jax.pyramid import PyramidLevel, make_atlas
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Bounds, largest
-from gavo_jax.solvers.genetic import SMALLEST_CHANCE, GeneticAlgorithm, GeneticState
+from gavo_jax.solvers.genetic import GeneticAlgorithm, GeneticState
+from gavo_jax.solvers.operators import SMALLEST_CHANCE
 
 BORDERS = tuple(2**k + offset for k in range(11, 15) for offset in (-1, 0, 1))
 """Rows about powers of two, where compilers change from one way of writing a loop to another."""
@@ -82,7 +84,7 @@ def preset_points(merged: bool = False) -> tuple[int, ...]:
     counts = set()
     for settings in _all_presets():
         views = max(settings.alignment.views) if merged and settings.odometry.reference == "keyframe" else 1
-        counts.add(views * most_points(FULL_IMAGE, settings.solver.levels, settings.alignment.points))
+        counts.add(views * Levels.of(FULL_IMAGE, settings.solver.levels, settings.alignment.points).most_points)
     return tuple(sorted(counts))
 
 
@@ -212,7 +214,7 @@ def _objective(scene: reference.Scene) -> Objective:
     return Objective(
         view,
         _target(),
-        warp.image_plane(LEVEL),
+        image_plane(LEVEL),
         Scales(grey, depth, depth_weight),
         min_overlap,
         outside_cost,
@@ -279,7 +281,7 @@ def _scored_motions(count: int) -> np.ndarray:
     return reference.exp(twists).astype(np.float32)
 
 
-LEAST_POINTS = min(most_points(FULL_IMAGE, (level,), None) for level in WIDE.solver.levels)
+LEAST_POINTS = min(Levels.of(FULL_IMAGE, (level,)).most_points for level in WIDE.solver.levels)
 """Points of the coarsest level, on which scouts are scored."""
 POPULATION = max(population for _, population in map(_populations, _all_presets()))
 """Candidates of the largest population."""

@@ -361,10 +361,8 @@ def test_levels_are_sampled_out_of_one_atlas() -> None:
     camera, rng = Camera(40.0, 41.0, 23.1, 17.2, 45, 35), np.random.default_rng(5)
     grey, depth = rng.uniform(0, 255, (35, 45)), rng.choice([0.0, 1.0, 1.02, 1.7], (35, 45))
     pyramid, levels = build_pyramid(jnp.asarray(grey), jnp.asarray(depth), 1.0, 4), (3, 2, 0)
-    target, planes = (
-        pack_target(make_atlas([pyramid[level] for level in levels])),
-        Levels.of(camera, levels).planes(camera),
-    )
+    target = pack_target(make_atlas([pyramid[level] for level in levels]))
+    planes = Levels.of(camera, levels).planes(camera)
     for i, level in enumerate(levels):
         plane = jax.tree.map(lambda leaf, i=i: leaf[i], planes)
         alone, view = packed(*pyramid[level]), camera.level(level)
