@@ -14,10 +14,10 @@ import tyro
 
 from gavo_jax import plots, presets
 from gavo_jax.camera import Camera
-from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.screen import number
 from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.comparison import peer_odometry
+from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.synthetic import SyntheticSequence

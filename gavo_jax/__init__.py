@@ -12,6 +12,7 @@ from gavo_jax.alignment import align as align
 from gavo_jax.alignment import align_batch as align_batch
 from gavo_jax.camera import Camera as Camera
 from gavo_jax.camera import load_camera as load_camera
+from gavo_jax.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from gavo_jax.compiler import CompilerWarning as CompilerWarning
 from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax import plots, presets
-from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, save_figure, track_visibly
 from gavo_jax.comparison import peer_odometry
+from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry

@@ -11,8 +11,8 @@ import jax
 from packaging.requirements import Requirement
 
 from gavo_jax import compiler, selfcheck
-from gavo_jax.cli.compilation_cache import cache_folder, enable_compilation_cache
 from gavo_jax.cli.options import Doctor
+from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache
 from gavo_jax.version import __version__
 
 OFF = 1

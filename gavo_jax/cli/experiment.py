@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from gavo_jax import plots
-from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Experiment
 from gavo_jax.cli.screen import markdown_table, number, pair_progress, print_table
 from gavo_jax.cli.tracking import save_figure
+from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, programs, read_plan

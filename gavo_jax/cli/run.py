@@ -9,11 +9,11 @@ from typing import Any
 
 import jax
 
-from gavo_jax.cli.compilation_cache import enable_compilation_cache
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
+from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import compute_metrics, trajectory_of
