@@ -6,6 +6,7 @@ from gavo_jax.compiler import prepare_process
 
 prepare_process()  # before anything imports JAX
 
+from gavo_jax import solvers as solvers
 from gavo_jax.alignment import Alignment as Alignment
 from gavo_jax.alignment import AlignmentStatus as AlignmentStatus
 from gavo_jax.alignment import align as align
@@ -33,6 +34,7 @@ from gavo_jax.odometry.driver import track as track
 from gavo_jax.odometry.run import OdometryRun as OdometryRun
 from gavo_jax.odometry.run import run_odometry as run_odometry
 from gavo_jax.presets import preset as preset
+from gavo_jax.presets import register as register
 from gavo_jax.settings import AlignmentOptions as AlignmentOptions
 from gavo_jax.settings import OdometryOptions as OdometryOptions
 from gavo_jax.settings import Settings as Settings

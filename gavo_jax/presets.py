@@ -1,10 +1,14 @@
-"""Named settings: what `--method` and `--preset` stand for."""
+"""Named settings: what `--method` and `--preset` stand for, and how a method of one's own gets a name."""
 
+import re
+from functools import cache
+from importlib.metadata import entry_points
 from typing import Any
 
 from gavo_jax.errors import GavoError
 from gavo_jax.objective import l2
-from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
+from gavo_jax.solvers.base import Solver
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
@@ -12,6 +16,8 @@ from gavo_jax.solvers.particle_swarm import ParticleSwarm
 
 METHODS = ("ga", "pso", "gauss-newton", "adam")
 PRESETS = ("default", "paper", "fast", "wide")
+PLUGINS = "gavo_jax.solvers"
+"""Group of entry points: a package's settings or solvers by the names of their methods."""
 
 
 PAPER_OBJECTIVE = AlignmentOptions(
@@ -110,20 +116,62 @@ the other does not, so both directions count; the winner is refined from the coa
 tracking takes."""
 
 
+_registered: dict[str, Settings] = {}
+
+
+def register(method: str, settings: Settings | Solver) -> None:
+    """Give a method of one's own a name: for `preset`, in experiment files and on the command line.
+
+    A package that is installed can do without a call: an entry point of the group `gavo_jax.solvers` has the method's
+    name and leads to its settings or solver.
+
+    Args:
+        method: Small letters, digits and hyphens. A name that is registered again gets the new settings.
+        settings: Those of its preset `default`, the only one that it has; a solver stands for the default settings with
+            that solver.
+
+    Raises:
+        GavoError: The name is another's, or none.
+    """
+    if method in METHODS or not re.fullmatch("[a-z][a-z0-9-]*", method):
+        raise GavoError(f"{method!r} cannot be the name of a method of one's own")
+    _registered[method] = as_settings(settings)
+
+
+def methods() -> tuple[str, ...]:
+    """All methods that go by a name: `METHODS`, then those that were registered."""
+    _register_plugins()
+    return (*METHODS, *_registered)
+
+
+@cache
+def _register_plugins() -> None:
+    for entry in entry_points(group=PLUGINS):
+        try:
+            register(entry.name, entry.load())
+        except Exception as error:  # somebody else's code may fail in any way
+            raise GavoError(f"method {entry.name!r} of {entry.value}: {' '.join(str(error).split())[:200]}") from error
+
+
 def preset(method: str = "ga", name: str = "default") -> Settings:
     """The settings that a method and a preset name stand for.
 
     Args:
-        method: One of `METHODS`.
-        name: One of `PRESETS`. `default`: preconditioned coordinates, robust grey and depth error, levels 4 to 1.
+        method: One of `methods()`.
+        name: One of `PRESETS`; a method that was registered has `default` alone.
+            `default`: preconditioned coordinates, robust grey and depth error, levels 4 to 1.
             `paper`: as printed, levels 4 to 0, frame to frame. `fast`: fewer pixels and candidates. `wide`: many
             independent populations at the coarsest level, for motions of tens of degrees.
 
     Raises:
         GavoError: An unknown method or preset.
     """
-    if method not in METHODS:
-        raise GavoError(f"unknown method {method!r}: not one of {', '.join(METHODS)}")
+    if method not in methods():
+        raise GavoError(f"unknown method {method!r}: not one of {', '.join(methods())}")
+    if method in _registered:
+        if name != "default":
+            raise GavoError(f"method {method!r} has no preset {name!r}: default alone")
+        return _registered[method]
     if name == "paper":
         return Settings(
             _paper_solver(method),

@@ -63,7 +63,7 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
         }
     refuse_unknown(str(path), table, ("method", "preset", *ROOMS))
     method, preset = str(table.pop("method", method)), str(table.pop("preset", preset))
-    refuse_unknown(f"{path}: method", [method], presets.METHODS)
+    refuse_unknown(f"{path}: method", [method], presets.methods())
     refuse_unknown(f"{path}: preset", [preset], presets.PRESETS)
     return NamedSettings(method, preset, override(presets.preset(method, preset), flatten(str(path), table), str(path)))
 
@@ -80,7 +80,7 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     Raises:
         GavoError: It cannot be written, or holds somebody else's code.
     """
-    known = {type(presets.preset(name).solver): name for name in presets.METHODS}
+    known = {type(presets.preset(name).solver): name for name in presets.methods()}
     if type(settings.solver) not in known:
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
     table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}
@@ -272,6 +272,7 @@ def _check_schedules(place: str, solver: Any) -> None:
     iterations = solver.iterations
     if not any(iterations):
         raise GavoError(f"{place}: solver.iterations: every level has 0")
-    for level, size in enumerate(getattr(solver, "population", ())):
+    population = getattr(solver, "population", ())
+    for level, size in enumerate(population if isinstance(population, tuple) else ()):
         if iterations[level] and size < 4:
             raise GavoError(f"{place}: solver.population: level {level} is searched and needs at least 4, not {size}")

@@ -7,7 +7,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+import gavo_jax as gavo
+from gavo_jax import presets
 from gavo_jax.alignment import AlignmentStatus
+from gavo_jax.cli import main
+from gavo_jax.cli.options import Run
+from gavo_jax.cli.selection import choose_settings
 from gavo_jax.datasets.synthetic import SyntheticSequence
 
 FOLDER = Path(__file__).parent.parent / "examples"
@@ -52,3 +57,18 @@ def test_custom_loss() -> None:
     world_T_camera = SyntheticSequence(frames=2).ground_truth.world_T_camera
     exact = np.linalg.inv(world_T_camera[1]) @ world_T_camera[0]
     assert np.linalg.norm(pair.target_T_reference[:3, 3] - exact[:3, 3]) < 0.005
+
+
+def test_own_solver(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(presets, "_registered", {})
+    pair = load("own_solver").main()
+    assert pair.status is AlignmentStatus.OK
+    world_T_camera = SyntheticSequence(frames=2).ground_truth.world_T_camera
+    exact = np.linalg.inv(world_T_camera[1]) @ world_T_camera[0]
+    assert np.linalg.norm(pair.target_T_reference[:3, 3] - exact[:3, 3]) < 0.001
+    chosen = choose_settings(Run(method="differential-evolution", set=("solver.weight=0.5",)))
+    assert chosen.method == "differential-evolution" and chosen.settings.solver != gavo.preset(chosen.method).solver
+    assert chosen.settings.solver.weight == 0.5  # pyright: ignore[reportAttributeAccessIssue]
+    capsys.readouterr()
+    assert main(["run", "synthetic", "--method", chosen.method, "--preset", "fast"]) == 2
+    assert "has no preset 'fast'" in capsys.readouterr().err

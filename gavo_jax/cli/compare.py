@@ -17,7 +17,6 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.peers import PEERS, make_peer
-from gavo_jax.presets import METHODS
 from gavo_jax.report import REPORT, Table, write_report
 from gavo_jax.results import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.trajectory import Trajectory
@@ -67,7 +66,7 @@ def compare(options: Compare) -> int:
     status = 0
     try:
         for method in methods:
-            for seed in range(options.seeds) if method in METHODS else (None,):
+            for seed in range(options.seeds) if method not in PEERS else (None,):
                 entry = _run_method(sequence, method, options.preset, seed, peers.get(method))
                 suffix = "" if seed is None or options.seeds == 1 else f"-seed{seed}"
                 entry.trajectory.write_tum(folder / f"{method}{suffix}.txt")
@@ -80,7 +79,7 @@ def compare(options: Compare) -> int:
     pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
     drifts = _drifts(entries)
     if plots.available() and drifts:
-        figure = plots.plot_drift({sequence.name: drifts}, METHODS)
+        figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
         pictures.append(save_figure(figure, folder, "drift"))
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
     title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
@@ -103,7 +102,7 @@ def compare(options: Compare) -> int:
 def _parse_methods(text: str) -> list[str]:
     """Return the names between the commas; raise GavoError for an unknown or repeated one."""
     names = [name.strip() for name in text.split(",")]
-    known = (*METHODS, *PEERS)
+    known = (*presets.methods(), *PEERS)
     for name in names:
         if name not in known:
             raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax import plots
+from gavo_jax import plots, presets
 from gavo_jax.cli.options import Experiment
 from gavo_jax.cli.screen import markdown_table, number, pair_progress, print_table
 from gavo_jax.cli.tracking import save_figure
@@ -19,7 +19,6 @@ from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
-from gavo_jax.presets import METHODS
 from gavo_jax.report import REPORT as PAGE
 from gavo_jax.report import Picture, write_report
 from gavo_jax.report import Table as ReportTable
@@ -190,5 +189,5 @@ def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
     if not clips or not plots.available():
         return []
     drifts = {clip: {name: np.array(runs) for name, runs in methods.items()} for clip, methods in clips.items()}
-    ours = list({row["label"] for row in rows if row["method"] in METHODS})
+    ours = list({row["label"] for row in rows if row["method"] in presets.methods()})
     return [save_figure(plots.plot_drift(drifts, ours), folder, FIGURE)]

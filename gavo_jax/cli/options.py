@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
-Method = Literal["ga", "pso", "gauss-newton", "adam"]
+Method = Annotated[str, arg(metavar="{ga,pso,gauss-newton,adam,…}")]
+"""A name that presets.methods() knows: other packages may bring some."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
 
@@ -31,7 +32,7 @@ class Search:
     """How."""
 
     method: Method = "ga"
-    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method) or Adam."""
+    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam, or what other packages bring."""
     preset: PresetName = "default"
     """Settings: the project's own, the paper's, for speed, for large motions."""
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None

@@ -20,7 +20,7 @@ from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError, read_text, shown
 from gavo_jax.experiments.together import program_of
 from gavo_jax.peers import PEERS
-from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.presets import PRESETS
 from gavo_jax.results import describe
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import MAX_REAL, flatten, override, refuse_unknown
@@ -67,7 +67,7 @@ class Run:
         part: Which frames.
         pairs: How many pairs these make.
         pixels: Of one image.
-        method: One of `METHODS`, or a peer.
+        method: One of `presets.methods()`, or a peer.
         preset: Name of the preset; empty for a peer.
         variant: The settings that differ from the preset's, in words; mostly empty.
         seed: None for a peer, which has none.
@@ -332,7 +332,7 @@ def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
 def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
     refuse_unknown(place, entry, METHOD_KEYS)
     method = str(entry.get("name"))
-    refuse_unknown(f"{place}: name", [method], (*METHODS, *PEERS))
+    refuse_unknown(f"{place}: name", [method], (*presets.methods(), *PEERS))
     printed = {
         text_of(place, name): _real(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()

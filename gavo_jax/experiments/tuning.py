@@ -12,7 +12,7 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
 from gavo_jax.odometry.run import run_odometry
-from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import flatten, override, refuse_unknown
 
@@ -31,7 +31,7 @@ class Tuning:
         folder: Where the default storage and the front go.
         parts: Frames that are tracked by every trial.
         seeds: Each trial tracks them once a seed.
-        method: One of `METHODS`.
+        method: One of `presets.methods()`.
         preset: What all other settings are taken from.
         trials: Trials that the study is to hold.
         space: By dotted name of a hyperparameter, a list of choices or a table of `low`, `high`, `step`, `log`.
@@ -69,7 +69,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, _ = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
-    refuse_unknown(f"{path}: method", [str(method)], METHODS)
+    refuse_unknown(f"{path}: method", [str(method)], presets.methods())
     refuse_unknown(f"{path}: preset", [str(preset)], PRESETS)
     space = flatten(f"{path}: space", table.get("space", {}), lambda value: "low" in value or "high" in value)
     if not space:

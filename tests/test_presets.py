@@ -1,0 +1,55 @@
+"""Names of methods: ours, and those of others."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from gavo_jax import presets
+from gavo_jax.errors import GavoError
+from gavo_jax.settings import Settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
+
+QUICK = GaussNewton(iterations=(0, 0, 0, 0, 5))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_registered(monkeypatch):
+    monkeypatch.setattr(presets, "_registered", {})
+    presets._register_plugins.cache_clear()
+    yield
+    presets._register_plugins.cache_clear()
+
+
+def test_a_registered_method_has_a_name_and_one_preset():
+    presets.register("quick", QUICK)
+    assert presets.methods() == (*presets.METHODS, "quick")
+    assert presets.preset("quick") == Settings(QUICK)
+    with pytest.raises(GavoError, match="no preset 'fast'"):
+        presets.preset("quick", "fast")
+
+
+@pytest.mark.parametrize("name", ["ga", "", "Quick", "a b", "--help"])
+def test_names_that_cannot_be(name):
+    with pytest.raises(GavoError, match="cannot be the name"):
+        presets.register(name, QUICK)
+
+
+def test_an_installed_package_brings_a_method(monkeypatch):
+    entry = EntryPoint("quick", "tests_of_presets:QUICK", presets.PLUGINS)
+    monkeypatch.setattr(presets, "entry_points", lambda group: [entry] if group == presets.PLUGINS else [])
+    monkeypatch.setattr(EntryPoint, "load", lambda self: QUICK)
+    assert presets.preset("quick").solver == QUICK
+
+
+def test_a_broken_package_is_one_line(monkeypatch):
+    entry = EntryPoint("broken", "no_such_package:SOLVER", presets.PLUGINS)
+    monkeypatch.setattr(presets, "entry_points", lambda group: [entry])
+    with pytest.raises(GavoError, match="'broken' of no_such_package:SOLVER: No module named"):
+        presets.methods()
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(GavoError, match="not one of ga, pso, gauss-newton, adam"):
+        presets.preset("genetic")
+    with pytest.raises(GavoError, match="not one of default"):
+        presets.preset("ga", "quick")
