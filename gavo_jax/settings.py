@@ -137,7 +137,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         settings = Settings()
     elif isinstance(value, Settings):
         settings = value
-    elif isinstance(value, Solver):
+    elif isinstance(value, Solver) and not isinstance(value, type):
         settings = Settings(value)
     else:
         raise TypeError(f"neither Settings nor a solver: {type(value).__name__}")
