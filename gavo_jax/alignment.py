@@ -41,6 +41,7 @@ from gavo_jax.pyramid import LEVELS, Pyramid, build_pyramid, make_atlas
 from gavo_jax.se3 import departure_from_rigid, exp, log, rigid, rigid_inverse
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
+from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.warp import Target, pack_target
 
 
@@ -243,7 +244,7 @@ def stack_levels(
     reference: Reference = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *views)
     left_out = jnp.arange(len(views))[:, None] >= counted[:, None, None]
     points = reference.points._replace(q=jnp.where(left_out, 0.0, reference.points.q))
-    once = Level(
+    return Level(
         number=jnp.array(numbers),
         is_first=jnp.arange(count) == 0,
         plane=levels.planes(camera),
@@ -256,19 +257,12 @@ def stack_levels(
         exchanged=None if exchanged is None else jax.tree.map(lambda leaf: leaf[:, None], exchanged.references),
         readout=None if readout is None else jnp.full(count, readout),
     )
-    if not options.refine:
-        return once
-    visits = visited_levels(numbers, options)
-    first_round = jnp.arange(len(visits)) < len(visits) - count
-    order = jnp.array([numbers.index(number) for number in visits])
-    rounds = jax.tree.map(lambda leaf: leaf[order], once)
-    islands = jnp.where(first_round, rounds.islands, 1)
-    return rounds._replace(is_first=rounds.is_first & first_round, islands=islands)
 
 
-def visited_levels(levels: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
-    """The levels of a search in the order in which it visits them; with `refine` some twice."""
-    return tuple(level for level in levels if options.refine and options.islands[level] > 1) + levels
+def visited_levels(numbers: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
+    """The levels that a solver searches, coarsest first; with `refine` those on which islands compete."""
+    competing = tuple(number for number in numbers if options.islands[number] > 1)
+    return competing if options.refine and competing else numbers
 
 
 def level_objective(level: Level, target: Target, options: AlignmentOptions, brightness: Brightness) -> Objective:
@@ -342,7 +336,6 @@ def objectives_of(
     """E of some levels of a pair, each as a search that starts its level at one motion would minimise it."""
     levels = Levels.of(camera, numbers, options.points)
     view, packed, exchanged = prepare_pair(reference, target, camera, levels, options)
-    options = replace(options, refine=False)
     stacked = stack_levels((view,), camera, levels, options, exchanged)
     rows = [jax.tree.map(lambda leaf, place=place: leaf[place], stacked) for place in range(len(numbers))]
     return [fit_objective(level, packed, options, target_T_reference, exchanged)[0] for level in rows]
@@ -428,20 +421,54 @@ def align_views(
             None where all rows are exposed at once.
 
     Returns:
-        The alignment and, where they were recorded, the candidates of each visit to a level, in the order of
-        `visited_levels`.
+        The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
     """
     visits = stack_levels(views, camera, levels, options, exchanged, readout)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
-    places, order_of_levels = max(options.islands), visited_levels(levels.numbers, options)
-    keys = jax.random.split(key, (len(order_of_levels) + 1, places))
+    searched = visited_levels(levels.numbers, options)
+    keys = jax.random.split(key, (len(searched) + 1, max(options.islands)))
     origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
     start = Search(
-        origins,
-        jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
-        unchanged_brightness(first),
-        jnp.float32(jnp.inf),
+        islands=origins,
+        box=jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
+        brightness=unchanged_brightness(first),
+        rival=jnp.float32(jnp.inf),
     )
+    of_levels = partial(_search_levels, target=target, options=options, exchanged=exchanged, centre=origins[0])
+    places = np.array([levels.numbers.index(number) for number in searched])
+    rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
+    search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
+    if options.refine:
+        # nothing competes any more, and the brightness can be told from the first level on
+        visits = visits._replace(is_first=jnp.zeros_like(visits.is_first), islands=jnp.ones_like(visits.islands))
+        finest = jax.tree.map(lambda leaf: leaf[-1], visits)
+        winner = search._replace(islands=search.islands[:1], box=start.box)
+        search, *_ = of_levels(REFINER, winner, visits, jax.random.split(key, (len(levels.numbers), 1)), record=False)
+    iterations = [solver.iterations[number] for number in searched]
+    history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
+    objective = level_objective(finest, target, options, search.brightness).merged()
+    return _conclude(objective, search, finest, options, history, origins[0]), populations
+
+
+REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
+"""What refines the winner of many islands. These are small and widely spread, which finds the basin, not its middle: on
+pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+
+
+def _search_levels(
+    solver: Solver,
+    start: Search,
+    visits: Level,
+    keys: PRNGKeyArray,
+    *,
+    target: Target,
+    options: AlignmentOptions,
+    exchanged: Exchanged | None,
+    centre: Float[Array, "4 4"],
+    record: bool,
+) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
+    """Search some levels, one after the other, each from the islands of the last; held about a centre."""
+    places = start.islands.shape[0]
 
     def search_level(
         search: Search, visit: tuple[Level, PRNGKeyArray]
@@ -451,7 +478,7 @@ def align_views(
         basis = jnp.eye(6)
         if options.precondition:
             basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
-        problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=origins[0])
+        problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=centre)
         island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
         inhabited = jnp.arange(places) < level.islands
         if places == 1:
@@ -461,19 +488,16 @@ def align_views(
         found, errors, history, trail = results
         population = None
         if trail is not None:
-            centre = origins[0] if options.precondition else search.islands[0]
+            about = centre if options.precondition else search.islands[0]
             motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
-            population = Population(level.number, log(motions), error, log(centre), search.box)
+            population = Population(level.number, log(motions), error, log(about), search.box)
         order = _best_distinct(found, errors, places)
         rival = search.rival if places == 1 else jnp.where(level.islands > 1, _rival(found, errors), search.rival)
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
         return search, (history[order[0]], population)
 
-    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys[:-1]))
-    iterations = [solver.iterations[number] for number in order_of_levels]
-    history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
-    objective = level_objective(finest, target, options, search.brightness).merged()
-    return _conclude(objective, search, finest, options, history, origins[0]), populations
+    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys))
+    return search, histories, populations
 
 
 def _search_island(

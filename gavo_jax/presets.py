@@ -112,8 +112,8 @@ WIDE_OBJECTIVE = AlignmentOptions(
 so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
 their mean, and while a few modes compete that grey tells apart badly, depth counts as much as grey does; at the finest
 levels, which decide how far the result is off, less. Over a wide baseline one frame may be blurred and each sees what
-the other does not, so both directions count; the winner is refined from the coarsest level again, on more points than
-tracking takes."""
+the other does not, so both directions count; the winner is refined by Gauss-Newton from the coarsest level again, on
+more points than tracking takes."""
 
 
 _registered: dict[str, Settings] = {}

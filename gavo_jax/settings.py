@@ -27,8 +27,8 @@ class AlignmentOptions:
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
             (static); see `Objective`.
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
-        refine: Whether the motion that wins where islands compete is taken through all levels once more, alone, with
-            the brightness and scales that are known only then (static).
+        refine: Whether the solver stops where islands no longer compete, and the motion that won is taken through all
+            levels once more by Gauss-Newton, with the brightness and scales that are known only then (static).
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);

@@ -125,13 +125,13 @@ def test_a_last_step_centres_what_a_short_search_leaves(sequence: SyntheticSeque
     assert np.all(np.array(error) <= 1.003 * np.array(error_before))
 
 
-def test_a_search_that_refines_visits_its_levels_again(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+def test_what_won_is_refined_on_all_levels(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     options = AlignmentOptions(islands=(1, 1, 1, 1, 3), scouts=32, refine=True)
-    assert visited_levels((4, 3), options) == (4, 4, 3)
+    assert visited_levels((4, 3), options) == (4,)
     assert visited_levels((4, 3), replace(options, refine=False)) == (4, 3)
     solver = GeneticAlgorithm(population=16, iterations=(0, 0, 0, 5, 7))
     result = align(frames[0], frames[1], sequence.camera, Settings(solver, options))
-    assert result.history.shape == (7 + 7 + 5,)
+    assert result.history.shape == (7,)
     assert difference(result.target_T_reference, target_T_reference(sequence, 0, 1))[0] < 0.01
 
 

@@ -198,7 +198,7 @@ def test_gpu_reports_on_a_cpu_too(
     gpu.main(clip=CLIP, methods="gauss-newton", batches="2", populations="8", rounds=1, json=tmp_path / "gpu.json")
     record = read(tmp_path / "gpu.json")
     assert capsys.readouterr().out.startswith("no GPU here")
-    assert set(record["agreement"]["gauss-newton"].values()) == {0.0}
+    assert max(record["agreement"]["gauss-newton"].values()) < 1e-9  # poses are made rigid in double precision
     assert min(record["latency"]["gauss-newton"].values()) > 0
     [row] = record["memory"]["scoring"]
     limit = 28 * 640 * 480 * 8 / (record["memory"]["gigabytes_per_second"] * 1e9)

@@ -39,6 +39,8 @@ def doctor(command: Doctor) -> int:
         faults.append("the version of JAX")
     described, is_writable = _cache()
     print(f"cache: {described}")
+    if elsewhere := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        print(f"cache of compiled programs: {_without_home(Path(elsewhere))}")
     if not is_writable:
         faults.append("the cache folder")
     for line in _extras():
@@ -84,8 +86,6 @@ def _cache() -> tuple[str, bool]:
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-atime")]
     megabytes = sum(path.stat().st_size for path in files) / 2**20
     words = f"{_without_home(folder)}, {len(files)} programs, {megabytes:.1f} MiB"
-    if elsewhere := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        words += f", compiled ones in {_without_home(Path(elsewhere))}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder):
