@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,6 +16,8 @@ from gavo_jax import presets
 from gavo_jax.alignment import (
     Alignment,
     AlignmentStatus,
+    Evidence,
+    _judge,
     align,
     align_batch,
     prepare_pair,
@@ -26,7 +29,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.levels import Levels
-from gavo_jax.objective import l2
+from gavo_jax.objective import ExplainedShare, Linearization, Scales, l2
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.se3 import exp
@@ -161,6 +164,18 @@ def test_the_inverse_is_the_cameras_motion(sequence: SyntheticSequence, frames: 
     assert (moved[:3, 3] - world_T_camera[8, :3, 3]) @ step > 0.9 * step @ step
 
 
+@pytest.mark.parametrize(("scale", "status"), [(1.0, AlignmentStatus.OK), (1.001, AlignmentStatus.NOT_RIGID)])
+def test_a_motion_that_is_not_rigid_is_told(scale: float, status: AlignmentStatus) -> None:
+    motion = jnp.eye(4).at[:3, :3].multiply(scale)
+    model = Linearization(jnp.float32(20.0), jnp.float32(0.9), jnp.zeros(6), 1e4 * jnp.eye(6))
+    evidence = Evidence(motion, model, jnp.eye(6), jnp.float32(1e3), ExplainedShare(jnp.float32(1), jnp.float32(1)))
+    points = SimpleNamespace(q=jnp.ones(100))
+    reference = SimpleNamespace(points=points, grey=jnp.arange(100.0))
+    objective: Any = SimpleNamespace(scales=Scales.unit(), reference=reference)
+    _, found = _judge(evidence, objective, jnp.float32(np.inf))
+    assert AlignmentStatus(int(found)) is status
+
+
 def test_covariance_is_one(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
     for method in ("ga", "gauss-newton"):
         covariance = np.asarray(run(method, frames[0], frames[1], sequence.camera).covariance, float)
@@ -194,6 +209,12 @@ def batch(sequence: SyntheticSequence, frames: dict[int, Frame]) -> Alignment:
     """Two pairs by the default genetic algorithm."""
     references, targets = ([frames[i] for i in side] for side in ((0, 8), (1, 9)))
     return align_batch(references, targets, sequence.camera, keys=jax.random.split(jax.random.key(5), 2))
+
+
+def test_a_batch_is_on_the_host_and_rigid(batch: Alignment) -> None:
+    rotation = batch.target_T_reference[:, :3, :3]
+    assert isinstance(rotation, np.ndarray) and rotation.dtype == np.float64
+    np.testing.assert_allclose(rotation.swapaxes(1, 2) @ rotation, np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-14)
 
 
 def test_a_batch_is_its_pairs(batch: Alignment, sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
