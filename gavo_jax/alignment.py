@@ -21,11 +21,11 @@ from gavo_jax.errors import GavoError
 from gavo_jax.levels import ImagePlane, Levels
 from gavo_jax.objective import (
     Brightness,
-    ExplainedShare,
     Linearization,
     Objective,
     Problem,
     Reference,
+    Residuals,
     Scales,
     depth_trust,
     estimate_brightness,
@@ -593,19 +593,6 @@ CLEARED = 1e9
 """Added to the error of a motion whose mode is taken; above any error."""
 
 
-class Evidence(NamedTuple):
-    """What the images say of one motion at the finest level."""
-
-    motion: Float[Array, "4 4"]
-    model: Linearization
-    """E and its derivatives by a step on the reference's side."""
-    scatter: Float[Array, "6 6"]
-    """Covariance of E's gradient."""
-    inside: Float[Array, ""]
-    """Number of points in view."""
-    explained: ExplainedShare
-
-
 def _conclude(
     objective: Objective,
     search: Search,
@@ -616,36 +603,42 @@ def _conclude(
 ) -> Alignment:
     """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
     found = search.islands[0]
+    residuals = objective.residuals(found)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
-        objective = replace(objective, scales=estimate_scales(objective.residuals(found), finest.depth_weight))
+        objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     reach = jnp.stack([search.box[0], search.box[3]])
     problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
-    evidence = _refine(problem, takes_step=options.last_step and not options.symmetric)
-    covariance, status = _judge(evidence, objective, search.rival)
-    motion, model = evidence.motion, evidence.model
+    if options.last_step and not options.symmetric:
+        problem = replace(problem, origin=_refine(problem, residuals))
+        residuals = objective.residuals(problem.origin)
+    model, scatter = problem.examine(residuals)
+    motion = problem.origin
+    covariance, status = _judge(Evidence(motion, residuals, model, scatter), objective, search.rival)
     return Alignment(motion, log(motion), model.error, model.overlap, covariance, status, history)
 
 
-def _refine(problem: Problem, takes_step: bool) -> Evidence:
-    """Evidence at the problem's origin or, with `takes_step`, one Newton step from there, if that is no worse."""
+def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
+    """The motion one Newton step from the problem's origin, of which these are the residuals, if that is no worse."""
+    model = problem.linearize_residuals(residuals)
+    step = -jnp.linalg.solve(_regular(model.hessian), model.gradient)
+    stepped = problem.origin @ exp(step)
+    error, _ = problem.objective.error(stepped)
+    better = (error < model.error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
+    better &= ~problem.is_out_of_reach(stepped)
+    # held back, or XLA would carry both motions through all that follows
+    return jax.lax.optimization_barrier(jnp.where(better, stepped, problem.origin))
 
-    def look(motion: Float[Array, "4 4"]) -> Evidence:
-        here = replace(problem, origin=motion)
-        residuals = problem.objective.residuals(motion)
-        return Evidence(motion, *here.examine(residuals), jnp.sum(residuals.inside), explained_share(residuals))
 
-    def advance(steps: Integer[Array, ""], best: Evidence) -> Evidence:
-        step = -jnp.linalg.solve(_regular(best.model.hessian), best.model.gradient)
-        new = look(best.motion @ exp(step))
-        better = (new.model.error < best.model.error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
-        better &= ~problem.is_out_of_reach(new.motion)
-        return jax.tree.map(lambda a, b: jnp.where((steps == 0) | better, a, b), new, best)
+class Evidence(NamedTuple):
+    """What the images say of one motion at the finest level."""
 
-    # the first turn goes nowhere, as nothing is known yet; a loop, so that what it does is compiled once
-    shapes = jax.eval_shape(look, problem.origin)
-    unknown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)._replace(motion=problem.origin)
-    return jax.lax.fori_loop(0, 1 + int(takes_step), advance, unknown)
+    motion: Float[Array, "4 4"]
+    residuals: Residuals
+    model: Linearization
+    """E and its derivatives by a step on the reference's side."""
+    scatter: Float[Array, "6 6"]
+    """Covariance of E's gradient."""
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
@@ -661,14 +654,14 @@ def _judge(
     inverse = jnp.linalg.inv(_regular(model.hessian))
     # the scatter tells nothing of a direction in which the images happen to agree, or say nothing: what independent
     # residuals would leave of it stays
-    least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(jnp.sum(evidence.residuals.inside), 1.0) * inverse
     covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
     covariance = 0.5 * (covariance + covariance.T)
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
-    explained = evidence.explained
+    explained = explained_share(evidence.residuals)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
     contrast = jnp.std(objective.reference.grey, where=has_reading)

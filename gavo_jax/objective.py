@@ -384,8 +384,12 @@ class Objective:
         A loss, a depth term and a cost of points outside go beyond the paper. The second number is the overlap, the
         share of reference points inside.
         """
-        found = self._conclude(self._sums(self._cost(self.residuals(target_T_reference))))
+        found = self.error_of(self.residuals(target_T_reference))
         return found if self.backward is None else _mean(found, self.backward.error(rigid_inverse(target_T_reference)))
+
+    def error_of(self, r: Residuals) -> tuple[jax.Array, jax.Array]:
+        """E and overlap of the motion of which these are the residuals, in this direction alone."""
+        return self._conclude(self._sums(self._cost(r)))
 
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
@@ -554,6 +558,15 @@ class Problem:
         other = _linearize(backward, inverse, -adjoint(inverse) @ tangent)
         error, overlap = _mean(model[:2], other[:2])
         return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
+
+    def linearize_residuals(self, r: Residuals) -> Linearization:
+        """E and its derivatives at x = 0, of which these are the residuals; from the reference to the target alone."""
+        objective = self.objective
+        sums = objective._sums(objective._cost(r))
+        tangent = adjoint(self.origin) @ self.basis
+        return _linearization(
+            objective, tangent, sums, *_normal_equations(_weighted_terms(objective, objective.reference, r))
+        )
 
     def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
         """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient; from the

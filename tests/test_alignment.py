@@ -29,7 +29,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.levels import Levels
-from gavo_jax.objective import ExplainedShare, Linearization, Scales, l2
+from gavo_jax.objective import Linearization, Scales, l2
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.pyramid import LEVELS, build_pyramid
 from gavo_jax.se3 import exp
@@ -168,8 +168,9 @@ def test_the_inverse_is_the_cameras_motion(sequence: SyntheticSequence, frames: 
 def test_a_motion_that_is_not_rigid_is_told(scale: float, status: AlignmentStatus) -> None:
     motion = jnp.eye(4).at[:3, :3].multiply(scale)
     model = Linearization(jnp.float32(20.0), jnp.float32(0.9), jnp.zeros(6), 1e4 * jnp.eye(6))
-    evidence = Evidence(motion, model, jnp.eye(6), jnp.float32(1e3), ExplainedShare(jnp.float32(1), jnp.float32(1)))
-    points = SimpleNamespace(q=jnp.ones(100))
+    points, ones, none = SimpleNamespace(q=jnp.ones(100)), jnp.ones(100), jnp.zeros(100)
+    residuals: Any = SimpleNamespace(grey=none, depth=none, inside=ones, depth_valid=ones)
+    evidence = Evidence(motion, residuals, model, jnp.eye(6))
     reference = SimpleNamespace(points=points, grey=jnp.arange(100.0))
     objective: Any = SimpleNamespace(scales=Scales.unit(), reference=reference)
     _, found = _judge(evidence, objective, jnp.float32(np.inf))
