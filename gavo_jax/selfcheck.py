@@ -435,8 +435,9 @@ def _checks() -> dict[str, Check]:
 
 CHECKS = _checks()
 """By name, cheap ones first."""
-CONTAINED = ("log",)
-"""Checks whose kernel another one's contains: `distinct` compares places that are logarithms."""
+CONTAINED = ("log", "derivatives")
+"""Checks whose kernel another one's contains: `distinct` compares places that are logarithms, and the covariance is
+made of the derivatives' terms."""
 
 
 def full_size() -> Iterator[Outcome]:
@@ -453,7 +454,7 @@ def _at_full_size(check: Check) -> Outcome:
         return Outcome(f"{check.words.format(size)} ({' '.join(str(error).split())[:200]})", np.inf, check.tolerance)
 
 
-REPETITIONS = 5
+REPETITIONS = 3
 """Measurements of the speed, of which the median counts."""
 RECORDED_NANOSECONDS = {"AMD EPYC": 2.3, "Intel Xeon": 5.3}
 """Per pixel and candidate of the same on 2 cores: `benchmarks/kernel.py`, "score, robust + depth" of 640x480."""
