@@ -20,9 +20,9 @@ from typing import Any
 import common
 
 from gavo_jax import presets
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import l2
+from gavo_jax.objective.losses import l2
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.presets import PAPER_OBJECTIVE
 from gavo_jax.settings import Settings
 

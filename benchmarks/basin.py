@@ -22,14 +22,15 @@ import common
 import jax
 import numpy as np
 
-from gavo_jax import plots
-from gavo_jax.alignment import AlignmentStatus, align
+from gavo_jax.alignment.pairs import align
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.output import plots
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.peers import PEERS, make_peer
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.installed_peers()

@@ -20,11 +20,11 @@ import jax
 import numpy as np
 from scipy.stats import chi2
 
-from gavo_jax.alignment import align
-from gavo_jax.cli.screen import number, print_table
+from gavo_jax.alignment.pairs import align
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.se3 import log
 from gavo_jax.trajectory import inverse
 

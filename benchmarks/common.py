@@ -12,10 +12,8 @@ import jax
 import numpy as np
 import tyro
 
-from gavo_jax import plots, presets
+from gavo_jax import presets
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number
-from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.compiler import processor
@@ -24,8 +22,11 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.output import plots
+from gavo_jax.output.files import environment, prepare_folder, write_json
+from gavo_jax.output.screen import number
+from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
-from gavo_jax.results import environment, prepare_folder, write_json
 from gavo_jax.settings import Settings
 
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"

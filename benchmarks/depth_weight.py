@@ -27,13 +27,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment import fit_objective, levels_of, stack_levels
+from gavo_jax.alignment.visits import fit_objective, levels_of, stack_levels
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
-from gavo_jax.objective import Objective, Problem
+from gavo_jax.objective.error import Objective
+from gavo_jax.objective.problem import Problem
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.tracking import TrackerState
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 

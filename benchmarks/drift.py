@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import common
 import numpy as np
 
-from gavo_jax import plots
-from gavo_jax.cli.screen import number, print_table
+from gavo_jax.output import plots
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.peers import PEERS
 
 METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers()

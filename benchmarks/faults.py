@@ -22,7 +22,6 @@ import common
 import cv2
 import numpy as np
 
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.tum import read_frame
@@ -30,6 +29,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.odometry.driver import Step, track
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.trajectory import Trajectory
 
 PLACES = 5

@@ -23,9 +23,9 @@ from typing import Any
 import common
 import numpy as np
 
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.synthetic import write_tum
 from gavo_jax.errors import GavoError
+from gavo_jax.output.screen import number, print_table
 
 RATE = 30.0
 """Frames a second of what is played."""

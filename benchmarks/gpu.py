@@ -26,13 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 from scaling import time_batches, time_in_turn, time_scoring
 
-from gavo_jax.alignment import align, align_batch
+from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.trajectory import inverse
 
 BYTES = 7 * 4

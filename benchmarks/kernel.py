@@ -29,14 +29,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment import objectives_of
+from gavo_jax.alignment.visits import objectives_of
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import Objective, Residuals, _lane_sum, l2
-from gavo_jax.pyramid import Pyramid, build_pyramid
+from gavo_jax.image.pyramid import Pyramid, build_pyramid
+from gavo_jax.objective.error import Objective, Residuals, lane_sum
+from gavo_jax.objective.losses import l2
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 
@@ -82,10 +83,10 @@ class TwoMarks(Objective):
         return cls(**{field.name: getattr(objective, field.name) for field in fields(objective)})
 
     def _cost(self, r: Residuals) -> jax.Array:
-        return jnp.stack([jnp.where(r.inside > 0, super()._cost(r), 0.0), r.inside])
+        return jnp.stack([jnp.where(r.inside > 0, super().cost(r), 0.0), r.inside])
 
     def _sums(self, cost: jax.Array) -> jax.Array:
-        return jnp.stack([_lane_sum(cost[0]), _lane_sum(cost[1])])
+        return jnp.stack([lane_sum(cost[0]), lane_sum(cost[1])])
 
 
 @jax.jit

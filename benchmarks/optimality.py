@@ -22,12 +22,16 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment import Images, align_views, levels_of, objectives_of, prepare_pair
+from gavo_jax.alignment.pairs import Images
+from gavo_jax.alignment.search import align_views
+from gavo_jax.alignment.visits import levels_of, objectives_of, prepare_pair
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.objective import Objective, Problem, preconditioner, reference_curvature
-from gavo_jax.pyramid import build_pyramid
+from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.objective.error import Objective
+from gavo_jax.objective.preconditioning import preconditioner, reference_curvature
+from gavo_jax.objective.problem import Problem
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton

@@ -23,11 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from kernel import make_objective, pyramid_of, random_motions
 
-from gavo_jax.alignment import Alignment, align_batch
-from gavo_jax.cli.screen import number, print_table
+from gavo_jax.alignment.pairs import align_batch
+from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.objective import Objective
+from gavo_jax.objective.error import Objective
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.settings import AlignmentOptions
 
 LARGE = 1e6

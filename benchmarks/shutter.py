@@ -19,9 +19,9 @@ import common
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.cli.screen import number, print_table
-from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.tracked import track_visibly
 
 
 def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:

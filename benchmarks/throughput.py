@@ -23,12 +23,12 @@ from typing import Any
 import common
 import numpy as np
 
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.output.screen import number, print_table
 
 METHODS = "ga,ga:fast,ga:wide,ga:paper,pso,gauss-newton,adam"
 OVER = "opencv-rgb,opencv-rgbd,open3d-color"

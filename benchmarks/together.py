@@ -27,13 +27,13 @@ import jax
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.settings import Settings
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)

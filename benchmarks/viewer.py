@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import common
 import numpy as np
 
-from gavo_jax.cli.screen import number, print_table
-from gavo_jax.cli.tracking import track_visibly
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry
-from gavo_jax.results import RECORDING
-from gavo_jax.viewer import ViewerMode, make_viewer
+from gavo_jax.output.files import RECORDING
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.tracked import track_visibly
+from gavo_jax.viewer.base import ViewerMode
+from gavo_jax.viewer.live import make_viewer
 
 MODES: tuple[ViewerMode, ...] = ("none", "save")
 

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import gavo_jax as gavo
-from gavo_jax.alignment import align_views, levels_of, prepare_pair
-from gavo_jax.objective import Reference
-from gavo_jax.pyramid import build_pyramid
-from gavo_jax.warp import Target
+from gavo_jax.alignment.search import align_views
+from gavo_jax.alignment.visits import levels_of, prepare_pair
+from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.image.sampling import Target
+from gavo_jax.objective.points import Reference
 
 SOLVER = gavo.GeneticAlgorithm(population=(0, 0, 0, 32, 64), iterations=(0, 0, 0, 10, 12))
 """An entry a pyramid level, the full image first: the two coarsest levels, 40 x 30 and 80 x 60 pixels."""

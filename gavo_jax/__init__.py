@@ -7,10 +7,9 @@ from gavo_jax.compiler import prepare_process
 prepare_process()  # before anything imports JAX
 
 from gavo_jax import solvers as solvers
-from gavo_jax.alignment import Alignment as Alignment
-from gavo_jax.alignment import AlignmentStatus as AlignmentStatus
-from gavo_jax.alignment import align as align
-from gavo_jax.alignment import align_batch as align_batch
+from gavo_jax.alignment.pairs import align as align
+from gavo_jax.alignment.pairs import align_batch as align_batch
+from gavo_jax.alignment.result import Alignment as Alignment
 from gavo_jax.camera import Camera as Camera
 from gavo_jax.camera import load_camera as load_camera
 from gavo_jax.compilation_cache import enable_compilation_cache as enable_compilation_cache
@@ -27,7 +26,7 @@ from gavo_jax.errors import GavoError as GavoError
 from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error
 from gavo_jax.evaluation import distance_error as distance_error
 from gavo_jax.evaluation import relative_pose_error as relative_pose_error
-from gavo_jax.objective import LOSSES as LOSSES
+from gavo_jax.objective.losses import LOSSES as LOSSES
 from gavo_jax.odometry.driver import Odometry as Odometry
 from gavo_jax.odometry.driver import Step as Step
 from gavo_jax.odometry.driver import track as track
@@ -44,6 +43,7 @@ from gavo_jax.solvers.gauss_newton import GaussNewton as GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm as GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent as GradientDescent
 from gavo_jax.solvers.particle_swarm import ParticleSwarm as ParticleSwarm
+from gavo_jax.status import AlignmentStatus as AlignmentStatus
 from gavo_jax.trajectory import Trajectory as Trajectory
 
 _RENAMED = {"get_preset": "preset", "Preset": "Settings"}

@@ -98,15 +98,14 @@ class Camera:
         them, and those behind the camera, is the caller's part.
         """
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        return _stack(self.fx * x / z + self.cx, self.fy * y / z + self.cy)
+        return _stack(*to_pixels(self, x, y, 1 / z))
 
     def back_project(
         self, pixels: Float[Array | np.ndarray, "*batch 2"], depth: Float[Array | np.ndarray, "*batch"]
     ) -> Float[Array | np.ndarray, "*batch 3"]:
         """Lift pixels at a depth (metres along z) to points of the camera frame: P⁻¹, no distortion. Equation (6)."""
-        x = (pixels[..., 0] - self.cx) / self.fx * depth
-        y = (pixels[..., 1] - self.cy) / self.fy * depth
-        return _stack(x, y, depth)
+        x, y = to_ray(self, pixels[..., 0], pixels[..., 1])
+        return _stack(x * depth, y * depth, depth)
 
     def rectified(self) -> "Camera":
         """Return the camera of undistorted images: the same intrinsics, no distortion."""
@@ -149,6 +148,18 @@ class Camera:
     def _check_size(self, image: np.ndarray) -> None:
         if image.shape[:2] != (self.height, self.width):
             raise ValueError(f"image of {self.height} rows and {self.width} columns expected, got {image.shape[:2]}")
+
+
+def to_pixels(camera: Any, x: Any, y: Any, per_depth: Any = 1.0) -> tuple[Any, Any]:
+    """Columns and rows at which points x, y (metres) at depth 1/`per_depth` are seen, by a `Camera` or whatever has its
+    fx, fy, cx and cy.
+    """
+    return camera.fx * x * per_depth + camera.cx, camera.fy * y * per_depth + camera.cy
+
+
+def to_ray(camera: Any, u: Any, v: Any) -> tuple[Any, Any]:
+    """x/z and y/z of what is seen at columns and rows, the inverse of `to_pixels`."""
+    return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
 READOUT = 0.02

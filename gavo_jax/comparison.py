@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment import AlignmentStatus, no_alignment
+from gavo_jax.alignment.result import no_alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
@@ -14,6 +14,7 @@ from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.peers import Peer, make_peer
 from gavo_jax.settings import OdometryOptions, Settings
+from gavo_jax.status import AlignmentStatus
 
 
 @dataclass(frozen=True)

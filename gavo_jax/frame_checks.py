@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.alignment import MIN_DEPTH_SHARE, AlignmentStatus
+from gavo_jax.alignment.judgement import MIN_DEPTH_SHARE
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.status import AlignmentStatus
 
 
 class Use(enum.Enum):

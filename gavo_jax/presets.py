@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import l2
+from gavo_jax.objective.losses import l2
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.solvers.gauss_newton import GaussNewton

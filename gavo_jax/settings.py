@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import jax
 
-from gavo_jax.levels import PointsPerLevel
-from gavo_jax.objective import Loss, geman_mcclure
+from gavo_jax.image.levels import PointsPerLevel
+from gavo_jax.objective.losses import Loss, geman_mcclure
 from gavo_jax.solvers.base import Solver, static
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 

@@ -18,8 +18,8 @@ import tomli_w
 
 from gavo_jax import presets
 from gavo_jax.errors import GavoError, read_text, shown, write_bytes
-from gavo_jax.objective import LOSSES
-from gavo_jax.pyramid import LEVELS
+from gavo_jax.image.pyramid import LEVELS
+from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Schedule
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from gavo_jax.camera import Camera
-from gavo_jax.warp import INVERSE_DEPTH_STEP, SLOPE_STEP
+from gavo_jax.image.sampling import INVERSE_DEPTH_STEP, SLOPE_STEP
 
 LOSSES = {
     "l2": lambda s: s,
@@ -16,7 +16,7 @@ LOSSES = {
     "geman-mcclure": lambda s: s / (1 + s / 9),
     "truncated": lambda s: np.where(np.sqrt(s) <= 2.795, s, 2.795**2),
 }
-"""ρ of the squared normalised residual, by the names of `gavo_jax.objective.LOSSES`."""
+"""ρ of the squared normalised residual, by the names of `gavo_jax.objective.losses.LOSSES`."""
 
 
 def hat(xi: np.ndarray) -> np.ndarray:

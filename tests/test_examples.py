@@ -9,11 +9,11 @@ import pytest
 
 import gavo_jax as gavo
 from gavo_jax import presets
-from gavo_jax.alignment import AlignmentStatus
 from gavo_jax.cli import main
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.selection import choose_settings
 from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.status import AlignmentStatus
 
 FOLDER = Path(__file__).parent.parent / "examples"
 

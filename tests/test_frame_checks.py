@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gavo_jax.alignment import AlignmentStatus as Status
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame
+from gavo_jax.status import AlignmentStatus as Status
 
 CAMERA = DEFAULT_CAMERA.level(1)
 

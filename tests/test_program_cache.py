@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from gavo_jax import AlignmentOptions, presets, program_cache
-from gavo_jax.objective import geman_mcclure, huber
+from gavo_jax.image.warp import Points
+from gavo_jax.objective.losses import geman_mcclure, huber
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.program_cache import CachedProgram, Foreign, identify, keep_programs_in
-from gavo_jax.warp import Points
 
 OPTIONS = AlignmentOptions(points=100)
 NUMBERS = np.arange(4, dtype=np.float32)
@@ -200,7 +200,7 @@ def test_somebody_elses_code_is_never_kept(folder: Path, monkeypatch: pytest.Mon
         np.testing.assert_allclose(found.doubled, 2.0 * NUMBERS * OPTIONS.min_overlap)
     with pytest.raises(Foreign):
         identify(Solver())
-    monkeypatch.setattr("gavo_jax.objective.geman_mcclure", ours_no_more)
+    monkeypatch.setattr("gavo_jax.objective.losses.geman_mcclure", ours_no_more)
     program(NUMBERS, OPTIONS)
     assert not folder.exists()
 

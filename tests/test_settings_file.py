@@ -8,8 +8,8 @@ import pytest
 
 from gavo_jax import presets
 from gavo_jax.errors import GavoError
-from gavo_jax.objective import huber
-from gavo_jax.results import describe
+from gavo_jax.objective.losses import huber
+from gavo_jax.output.files import describe
 from gavo_jax.settings_file import assignments, flatten, load_settings, override, save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm

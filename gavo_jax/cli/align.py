@@ -4,14 +4,14 @@ import json
 
 import jax
 
-from gavo_jax.alignment import align as align_pair
+from gavo_jax.alignment.pairs import align as align_pair
 from gavo_jax.camera import Camera, camera_for_sequence, load_camera
 from gavo_jax.cli.options import Align
-from gavo_jax.cli.screen import waiting
 from gavo_jax.cli.selection import check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.tum import read_frame
-from gavo_jax.results import describe
+from gavo_jax.output.files import describe
+from gavo_jax.output.screen import waiting
 
 
 def align(options: Align) -> int:

@@ -6,19 +6,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax import plots, presets
+from gavo_jax import presets
 from gavo_jax.cli.options import Compare
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
-from gavo_jax.cli.tracking import INTERRUPTED, draw, save_figure, track_visibly
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.output import plots
+from gavo_jax.output.drawing import draw, save_figure
+from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
+from gavo_jax.output.report import REPORT, Table, write_report
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.tracked import INTERRUPTED, track_visibly
 from gavo_jax.peers import PEERS, make_peer
-from gavo_jax.report import REPORT, Table, write_report
-from gavo_jax.results import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.trajectory import Trajectory
 
 COMPARISON = "comparison.json"

@@ -10,9 +10,10 @@ from pathlib import Path
 import jax
 from packaging.requirements import Requirement
 
-from gavo_jax import compiler, selfcheck
+from gavo_jax import compiler
 from gavo_jax.cli.options import Doctor
 from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache
+from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
 OFF = 1
@@ -53,7 +54,7 @@ def doctor(command: Doctor) -> int:
 def _print_checks() -> list[str]:
     """Run and print checks and speed; the names of those that are wrong."""
     wrong = []
-    for outcome in selfcheck.full_size():
+    for outcome in checks.full_size():
         verdict = "ok" if outcome.is_right else "WRONG"
         print(
             f"check {verdict}: {outcome.name}: off by {outcome.deviation:.1e}, at most {outcome.tolerance:.0e}",
@@ -61,8 +62,8 @@ def _print_checks() -> list[str]:
         )
         if not outcome.is_right:
             wrong.append(outcome.name)
-    recorded = ", ".join(f"{time} on an {name}" for name, time in selfcheck.RECORDED_NANOSECONDS.items())
-    print(f"speed: {selfcheck.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
+    recorded = ", ".join(f"{time} on an {name}" for name, time in checks.RECORDED_NANOSECONDS.items())
+    print(f"speed: {checks.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
     return wrong
 
 

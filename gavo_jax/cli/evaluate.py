@@ -1,9 +1,9 @@
 """`gavo evaluate`: errors of one trajectory file against another."""
 
 from gavo_jax.cli.options import Evaluate
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.trajectory import Trajectory
 
 

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax import plots, presets
+from gavo_jax import presets
 from gavo_jax.cli.options import Experiment
-from gavo_jax.cli.screen import markdown_table, number, pair_progress, print_table
-from gavo_jax.cli.tracking import save_figure
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
@@ -19,10 +17,13 @@ from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
-from gavo_jax.report import REPORT as PAGE
-from gavo_jax.report import Picture, write_report
-from gavo_jax.report import Table as ReportTable
-from gavo_jax.results import environment, prepare_folder, write_json
+from gavo_jax.output import plots
+from gavo_jax.output.drawing import save_figure
+from gavo_jax.output.files import environment, prepare_folder, write_json
+from gavo_jax.output.report import REPORT as PAGE
+from gavo_jax.output.report import Picture, write_report
+from gavo_jax.output.report import Table as ReportTable
+from gavo_jax.output.screen import markdown_table, number, pair_progress, print_table
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"

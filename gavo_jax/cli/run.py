@@ -10,17 +10,20 @@ from typing import Any
 import jax
 
 from gavo_jax.cli.options import Run
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
-from gavo_jax.cli.tracking import INTERRUPTED, draw, draw_search, track_visibly
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import compute_metrics, trajectory_of
 from gavo_jax.odometry.tracking import blank_state
-from gavo_jax.results import RECORDING, RunFolder, environment
+from gavo_jax.output.drawing import draw, draw_search
+from gavo_jax.output.files import RECORDING, environment
+from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.tracked import INTERRUPTED, track_visibly
 from gavo_jax.settings import Settings
-from gavo_jax.viewer import Viewer, make_viewer
+from gavo_jax.viewer.base import Viewer
+from gavo_jax.viewer.live import make_viewer
 
 LOST = 3
 """Exit status where a pair was lost and `--strict` asked to know."""

@@ -4,12 +4,12 @@ from typing import Any
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Tune
-from gavo_jax.cli.screen import number, print_table
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.tuning import Choice, read_tuning
 from gavo_jax.experiments.tuning import tune as search
-from gavo_jax.results import prepare_folder, write_json
+from gavo_jax.output.files import prepare_folder, write_json
+from gavo_jax.output.screen import number, print_table
 from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"

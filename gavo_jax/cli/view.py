@@ -10,8 +10,9 @@ from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
-from gavo_jax.results import CONFIG, VIEW, RecordedRun, read_run
-from gavo_jax.viewer import make_viewer
+from gavo_jax.output.files import CONFIG, VIEW
+from gavo_jax.output.frames import RecordedRun, read_run
+from gavo_jax.viewer.live import make_viewer
 
 
 def view(options: View) -> int:

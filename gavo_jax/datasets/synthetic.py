@@ -27,8 +27,8 @@ from gavo_jax.datasets.room import (
     render,
 )
 from gavo_jax.errors import GavoError
+from gavo_jax.image.shutter import row_time
 from gavo_jax.trajectory import Trajectory
-from gavo_jax.warp import row_time
 
 DEFAULT_CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
 """The factory calibration commonly used for Kinect-like cameras, 640 x 480, no distortion."""

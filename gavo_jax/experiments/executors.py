@@ -20,8 +20,8 @@ from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.output.files import environment
 from gavo_jax.peers import make_peer
-from gavo_jax.results import environment
 
 Row = dict[str, Any]
 

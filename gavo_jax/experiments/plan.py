@@ -19,9 +19,9 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError, read_text, shown
 from gavo_jax.experiments.together import program_of
+from gavo_jax.output.files import describe
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import PRESETS
-from gavo_jax.results import describe
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import MAX_REAL, flatten, override, refuse_unknown
 

@@ -9,7 +9,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment import Alignment, Images, align_rows, on_host, stacked_images
+from gavo_jax.alignment.pairs import Images, align_rows, stacked_images
+from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
 from gavo_jax.settings import Settings, as_settings

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax.errors import GavoError
-from gavo_jax.results import prepare_folder
+from gavo_jax.output.files import prepare_folder
 
 SUFFIX = ".parquet"
 ROWS = "runs"

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float64
 
-from gavo_jax.alignment import Alignment, AlignmentStatus, on_host
+from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -26,6 +26,7 @@ from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recove
 from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.settings import Settings
+from gavo_jax.status import AlignmentStatus
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
 

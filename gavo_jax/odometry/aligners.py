@@ -15,12 +15,14 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment import Alignment, AlignmentStatus, Population, on_host
+from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.se3 import exp, rigid
 from gavo_jax.settings import OdometryOptions, Settings
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment import Alignment, AlignmentStatus, Population, no_alignment
+from gavo_jax.alignment.result import Alignment, no_alignment
+from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
@@ -22,6 +23,7 @@ from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 

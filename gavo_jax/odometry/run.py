@@ -10,13 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from gavo_jax.alignment import Alignment, AlignmentStatus
+from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 

@@ -11,23 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.alignment import (
-    Alignment,
-    Exchanged,
-    Population,
-    align_views,
-    levels_of,
-    prepare_reference,
-    prepare_target,
-)
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.search import Population, align_views
+from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
-from gavo_jax.objective import Reference, move_reference, settle_reference
+from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
+from gavo_jax.image.sampling import Target
+from gavo_jax.image.warp import Points, synchronise_depth, warp
+from gavo_jax.objective.points import Reference, make_references, move_reference, settle_reference
 from gavo_jax.program_cache import CachedProgram
-from gavo_jax.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
-from gavo_jax.warp import Points, Target, synchronise_depth, warp
 
 
 class TrackerState(NamedTuple):
@@ -134,7 +129,7 @@ def track_frame(
     packed = prepare_target(target, levels)
     exchanged = None
     if alignment.symmetric:
-        exchanged = Exchanged(prepare_reference(target, camera, levels), state.previous_image)
+        exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
     key = jax.random.fold_in(key, clock.frame)
     result, populations = align_views(
         views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout
@@ -142,7 +137,7 @@ def track_frame(
     motion = jnp.where(is_first, 0.0, result.xi)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * motion, finest)
-    newest, keyframe = prepare_reference(target, camera, levels), state.keyframe
+    newest, keyframe = make_references(target, camera, levels), state.keyframe
     if readout is not None:
         unsettled = newest.row_time
         newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
@@ -157,7 +152,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
     """State after the first frame, by a program of its own."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     levels = levels_of(camera, solver, alignment)
-    reference, packed = prepare_reference(pyramid, camera, levels), prepare_target(pyramid, levels)
+    reference, packed = make_references(pyramid, camera, levels), prepare_target(pyramid, levels)
     return TrackerState(reference, reference, packed, jnp.zeros(6), jnp.float32(1.0))
 
 

@@ -1,6 +1,6 @@
 """Solvers: one protocol, one loop, four methods; and what the author of another one needs."""
 
-from gavo_jax.objective import Problem as Problem
+from gavo_jax.objective.problem import Problem as Problem
 from gavo_jax.solvers.base import Best as Best
 from gavo_jax.solvers.base import Bounds as Bounds
 from gavo_jax.solvers.base import Candidates as Candidates

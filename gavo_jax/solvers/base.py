@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
-from gavo_jax.objective import Problem
+from gavo_jax.objective.problem import Problem
 
 
 def static(default: Any) -> Any:

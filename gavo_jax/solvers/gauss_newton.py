@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.objective import Linearization, Problem
+from gavo_jax.objective.derivatives import Linearization
+from gavo_jax.objective.problem import Problem
 from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 
 

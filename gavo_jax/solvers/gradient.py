@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.objective import Problem
+from gavo_jax.objective.problem import Problem
 from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
 
 

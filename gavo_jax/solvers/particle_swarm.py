@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.objective import Problem
+from gavo_jax.objective.problem import Problem
 from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
 from gavo_jax.solvers.operators import initial_population
 

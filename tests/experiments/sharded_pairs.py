@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment import Alignment
+from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
 from gavo_jax.experiments.sharding import align_batch_sharded

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sharded_pairs import FIGURES, PAIRS, figures_of, methods, pairs
 
-from gavo_jax.alignment import align_batch
+from gavo_jax.alignment.pairs import align_batch
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.sharding import align_batch_sharded
 

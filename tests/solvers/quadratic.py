@@ -1,4 +1,4 @@
-"""Analytic stand-ins for `gavo_jax.objective.Problem`: the solvers are handed nothing else of it."""
+"""Analytic stand-ins for `gavo_jax.objective.problem.Problem`: the solvers are handed nothing else of it."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.objective import Linearization
+from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.solvers.base import Bounds, Solution, solve
 
 

@@ -10,7 +10,7 @@ import optax
 import pytest
 from quadratic import Quadratic, bowl, cube, search
 
-from gavo_jax.objective import Linearization
+from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.gradient import GradientDescent
 from gavo_jax.solvers.particle_swarm import ParticleSwarm, SwarmState

@@ -1,0 +1,1 @@
+"""From two frames to a motion with its covariance and status."""

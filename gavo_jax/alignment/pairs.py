@@ -1,0 +1,189 @@
+"""`align` and `align_batch`: from images to `Alignment` in one compiled program."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.search import align_views
+from gavo_jax.alignment.visits import levels_of, prepare_pair
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.errors import GavoError
+from gavo_jax.image.pyramid import LEVELS, build_pyramid
+from gavo_jax.program_cache import CachedProgram
+from gavo_jax.settings import AlignmentOptions, Settings, as_settings
+from gavo_jax.solvers.base import Solver
+
+
+class Images(NamedTuple):
+    """Grey [H, W] and depth [H, W] of one frame, or of a batch with a leading axis."""
+
+    grey: Any
+    depth: Any
+
+
+def _align_images(
+    reference: Images,
+    target: Images,
+    camera: Camera,
+    solver: Solver,
+    options: AlignmentOptions,
+    key: PRNGKeyArray,
+    guess: Float[Array, "4 4"],
+) -> Alignment:
+    before, after = (
+        build_pyramid(frame.grey, frame.depth, camera.depth_scale, LEVELS) for frame in (reference, target)
+    )
+    levels = levels_of(camera, solver, options)
+    view, packed, exchanged = prepare_pair(before, after, camera, levels, options)
+    return align_views((view,), packed, camera, levels, solver, options, key, guess[None], exchanged=exchanged)[0]
+
+
+POINTS_SIDE_BY_SIDE = 2**20
+"""Points a level of the pairs that an accelerator aligns at once, some 200 pairs by most presets: each takes memory for
+its images' pyramids (some 10 MB) and its candidates' residuals. Reckoned, not measured."""
+
+
+@partial(CachedProgram, returns=(Alignment,))
+def _align_pairs(count, references, targets, camera, solver, options, keys, guesses):
+    """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere,
+    `POINTS_SIDE_BY_SIDE` at a time.
+
+    The count is an input, so that XLA compiles one and the same loop body for one pair and for many, whose results then
+    agree to the last bit; unrolled, a single pair would round differently.
+    """
+
+    def one(i):
+        reference, target, key, guess = jax.tree.map(lambda leaf: leaf[i], (references, targets, keys, guesses))
+        return _align_images(reference, target, camera, solver, options, key, guess)
+
+    if jax.default_backend() != "cpu":
+        at_once = max(1, POINTS_SIDE_BY_SIDE // levels_of(camera, solver, options).most_points)
+        return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=at_once)
+    empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
+    return jax.lax.fori_loop(
+        0, count, lambda i, results: jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i)), empty
+    )
+
+
+def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
+    """`align_batch` of images that are stacked already, its results on the device."""
+    count = len(guesses)
+    if count == 1:  # padded to two rows, of which one is computed
+        sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
+    result = _align_pairs(
+        jnp.int32(count),
+        *sides,
+        camera.rectified(),
+        settings.solver,
+        settings.alignment,
+        keys,
+        guesses,
+    )
+    return jax.tree.map(lambda leaf: leaf[:count], result)
+
+
+def align(
+    reference: Frame | tuple[Any, Any],
+    target: Frame | tuple[Any, Any],
+    camera: Camera,
+    settings: Settings | Solver | None = None,
+    *,
+    key: PRNGKeyArray | None = None,
+    guess: Float[Array | np.ndarray, "4 4"] | None = None,
+    solver: Solver | None = None,
+    options: AlignmentOptions | None = None,
+) -> Alignment:
+    """Estimate the motion of the camera between two RGB-D frames.
+
+    Args:
+        reference: Frame t: a `Frame`, or a pair of arrays (grey, depth) of [H, W]; depth in units of
+            `camera.depth_scale` a metre, 0 = no reading.
+        target: Frame t + 1.
+        camera: Their camera. Lens distortion, where it has any, is taken out first.
+        settings: What searches and what is minimised; a solver stands for the default settings with that solver.
+        key: Random key; `jax.random.key(0)` by default. The same key gives the same result, bit for bit.
+        guess: A motion target_T_reference to start from; the identity by default.
+        solver: Takes the place of the settings' solver.
+        options: Deprecated: `alignment` of the settings.
+
+    Returns:
+        `Alignment`; the camera's own motion is the inverse of its `target_T_reference`.
+
+    Raises:
+        GavoError: The images are not of the camera's size, or of a wrong shape.
+    """
+    settings = as_settings(settings, solver, alignment=options)
+    sides = [stacked_images([frame], camera) for frame in (reference, target)]
+    keys = (jax.random.key(0) if key is None else key)[None]
+    guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
+    result = align_rows(sides, camera, settings, keys, guesses)
+    return on_host(jax.tree.map(lambda leaf: leaf[0], result))
+
+
+def align_batch(
+    references: Any,
+    targets: Any,
+    camera: Camera,
+    settings: Settings | Solver | None = None,
+    *,
+    keys: PRNGKeyArray | None = None,
+    guesses: Float[Array | np.ndarray, "b 4 4"] | None = None,
+    solver: Solver | None = None,
+    options: AlignmentOptions | None = None,
+) -> Alignment:
+    """Align B pairs in one compiled call; what it takes of memory beside the images does not grow with a large B.
+
+    Args:
+        references: B frames: a list of `Frame` or of (grey, depth), or a pair of arrays of [B, H, W] from a camera
+            without distortion.
+        targets: The other B frames, alike.
+        camera: Their camera.
+        settings: As in `align`.
+        keys: [B] random keys; `jax.random.split(jax.random.key(0), B)` by default.
+        guesses: [B, 4, 4] motions to start from; the identity by default.
+        solver: As in `align`.
+        options: As in `align`.
+
+    Returns:
+        An `Alignment` of NumPy arrays with a leading axis B; `status` is an integer array.
+
+    Raises:
+        GavoError: The images are not of the camera's size, or the two sides differ in number.
+    """
+    settings = as_settings(settings, solver, alignment=options)
+    sides = [stacked_images(side, camera) for side in (references, targets)]
+    count = len(sides[0].grey)
+    if len(sides[1].grey) != count:
+        raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
+    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
+    guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
+    return on_host(align_rows(sides, camera, settings, keys, guesses))
+
+
+def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
+    grey, depth = (frame.grey, frame.depth) if isinstance(frame, Frame) else frame
+    expected = (camera.height, camera.width)
+    for name, image in (("grey", grey), ("depth", depth)):
+        if np.shape(image) != expected:
+            raise GavoError(f"{name} image is of shape {np.shape(image)}, the camera's is {expected}")
+    if camera.is_distorted:
+        grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
+    return Images(grey, depth)
+
+
+def stacked_images(side: Any, camera: Camera) -> Images:
+    """B frames as `align_batch` takes them, stacked and free of lens distortion."""
+    if isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3:
+        if camera.is_distorted:
+            return stacked_images(list(zip(*side, strict=True)), camera)
+        if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
+            raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
+        return Images(jnp.asarray(side[0]), jnp.asarray(side[1]))
+    images = [_rectified_images(frame, camera) for frame in side]
+    return Images(jnp.stack([i.grey for i in images]), jnp.stack([i.depth for i in images]))

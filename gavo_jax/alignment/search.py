@@ -1,0 +1,233 @@
+"""Coarse to fine: the motion between two RGB-D frames (paper, section 3).
+
+`align_views` is the method in one place. From the coarsest level to the finest it takes the reference's points,
+estimates what the data say about brightness and noise, chooses search coordinates, lets a solver minimise E there, and
+starts the next level from its best candidate.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
+
+from gavo_jax.alignment.judgement import conclude
+from gavo_jax.alignment.modes import best_distinct, rival_error
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.visits import (
+    Exchanged,
+    Level,
+    Search,
+    fit_objective,
+    level_objective,
+    stack_levels,
+    unchanged_brightness,
+    visited_levels,
+)
+from gavo_jax.camera import Camera
+from gavo_jax.image.levels import Levels
+from gavo_jax.image.sampling import Target
+from gavo_jax.objective.error import Objective
+from gavo_jax.objective.points import Reference
+from gavo_jax.objective.preconditioning import preconditioner, reference_curvature, unconditioner
+from gavo_jax.objective.problem import Problem
+from gavo_jax.se3 import exp, log
+from gavo_jax.settings import AlignmentOptions
+from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
+from gavo_jax.solvers.gauss_newton import GaussNewton
+
+
+def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[Array, "4 4"]:
+    """The guess with the smallest grey residuals.
+
+    Unscaled residuals are compared: each guess would have its own scales, and E in units of them says nothing.
+    """
+    if guesses.shape[0] == 1:
+        return guesses[0]
+    plain = replace(objective, use_depth=False, loss=jnp.sqrt, outside_cost=jnp.float32(0.0))
+    return guesses[jnp.argmin(jax.vmap(lambda guess: plain.error(guess)[0])(guesses))]
+
+
+class Population(NamedTuple):
+    """The candidates of the levels' searches, [L], iteration after iteration, for people to look at."""
+
+    level: Integer[Array, "..."]
+    xi: Float[Array, "... iterations p 6"]
+    """Twists of target_T_reference (m, rad); those of all islands. NaN from the iteration that stagnation, or a level's
+    smaller number of iterations, left out."""
+    error: Float[Array, "... iterations p"]
+    """E, squared grey levels; +inf where a candidate is worthless."""
+    centre: Float[Array, "... 6"]
+    """Twist that the search is held about, and `half_widths` of the box it is held in."""
+    half_widths: Float[Array, "... 6"]
+
+    def trimmed(self) -> "Population":
+        """One level's candidates on the host, without the places and iterations that the level left empty."""
+        host = jax.device_get(self)
+        rows, places = ~np.isnan(host.error).all(axis=1), ~np.isnan(host.xi[..., 0]).all(axis=0)
+        return host._replace(xi=host.xi[rows][:, places], error=host.error[rows][:, places])
+
+
+def align_views(
+    views: tuple[Reference, ...],
+    target: Target,
+    camera: Camera,
+    levels: Levels,
+    solver: Solver,
+    options: AlignmentOptions,
+    key: PRNGKeyArray,
+    guesses: Float[Array, "g 4 4"],
+    record: bool = False,
+    exchanged: Exchanged | None = None,
+    readout: Float[Array, ""] | None = None,
+) -> tuple[Alignment, Population | None]:
+    """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
+
+    The levels are one `lax.scan`: what a level does is compiled once and serves all of them.
+
+    Args:
+        views: Of `make_references`; the first one's frame is the anchor, in whose camera the others' points are too.
+        target: Of `prepare_target`, for the same solver.
+        camera: Camera of level 0.
+        levels: Of `levels_of`.
+        solver: Any `solvers.base.Solver` with an entry a level.
+        options: What is minimised.
+        key: Random key.
+        guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
+        record: Whether the candidates are kept (static).
+        exchanged: What the `symmetric` error needs; None where it is not asked for.
+        readout: Time that the shutter takes from the first to the last row, over the time between anchor and target;
+            None where all rows are exposed at once.
+
+    Returns:
+        The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
+    """
+    visits = stack_levels(views, camera, levels, options, exchanged, readout)
+    first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
+    searched = visited_levels(levels.numbers, options)
+    keys = jax.random.split(key, (len(searched) + 1, max(options.islands)))
+    origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
+    start = Search(
+        islands=origins,
+        box=jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
+        brightness=unchanged_brightness(first),
+        rival=jnp.float32(jnp.inf),
+    )
+    of_levels = partial(_search_levels, target=target, options=options, exchanged=exchanged, centre=origins[0])
+    places = np.array([levels.numbers.index(number) for number in searched])
+    rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
+    search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
+    if options.refine:
+        # nothing competes any more, and the brightness can be told from the first level on
+        visits = visits._replace(is_first=jnp.zeros_like(visits.is_first), islands=jnp.ones_like(visits.islands))
+        finest = jax.tree.map(lambda leaf: leaf[-1], visits)
+        winner = search._replace(islands=search.islands[:1], box=start.box)
+        search, *_ = of_levels(REFINER, winner, visits, jax.random.split(key, (len(levels.numbers), 1)), record=False)
+    iterations = [solver.iterations[number] for number in searched]
+    history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
+    objective = level_objective(finest, target, options, search.brightness).merged()
+    return conclude(objective, search, finest, options, history, origins[0]), populations
+
+
+REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
+"""What refines the winner of many islands. These are small and widely spread, which finds the basin, not its middle: on
+pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+
+
+def _search_levels(
+    solver: Solver,
+    start: Search,
+    visits: Level,
+    keys: PRNGKeyArray,
+    *,
+    target: Target,
+    options: AlignmentOptions,
+    exchanged: Exchanged | None,
+    centre: Float[Array, "4 4"],
+    record: bool,
+) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
+    """Search some levels, one after the other, each from the islands of the last; held about a centre."""
+    places = start.islands.shape[0]
+
+    def search_level(
+        search: Search, visit: tuple[Level, PRNGKeyArray]
+    ) -> tuple[Search, tuple[jax.Array, Population | None]]:
+        level, keys = visit
+        objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
+        basis = jnp.eye(6)
+        if options.precondition:
+            basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
+        problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=centre)
+        island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
+        inhabited = jnp.arange(places) < level.islands
+        if places == 1:
+            results = jax.tree.map(lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0]))
+        else:
+            results = jax.vmap(island)(keys, search.islands, inhabited)
+        found, errors, history, trail = results
+        population = None
+        if trail is not None:
+            about = centre if options.precondition else search.islands[0]
+            motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
+            population = Population(level.number, log(motions), error, log(about), search.box)
+        order = best_distinct(found, errors, places)
+        rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
+        search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
+        return search, (history[order[0]], population)
+
+    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys))
+    return search, histories, populations
+
+
+def _search_island(
+    problem: Problem,
+    solver: Solver,
+    options: AlignmentOptions,
+    box: Float[Array, " 6"],
+    record: bool,
+    key: PRNGKeyArray,
+    origin: Float[Array, "4 4"],
+    inhabited: Bool[Array, ""],
+) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
+    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
+    if options.precondition:
+        problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]), searched=inhabited)
+        reach = jnp.abs(unconditioner(problem.basis)) @ box
+        bounds = Bounds(-reach, reach)
+        guess = jnp.zeros((1, 6))
+    else:
+        problem = replace(problem, origin=jnp.eye(4), searched=inhabited)
+        bounds = Bounds(log(origin) - box, log(origin) + box)
+        guess = log(origin)[None]
+    solution = solve(key, solver, problem, guess, bounds, record)
+    trail = solution.trail
+    if trail is not None:
+        trail = trail._replace(x=problem.transform(trail.x))
+    return problem.transform(solution.x), solution.error, solution.history, trail
+
+
+def _origins(
+    level: Level,
+    target: Target,
+    options: AlignmentOptions,
+    guesses: Float[Array, "g 4 4"],
+    key: PRNGKeyArray,
+    exchanged: Exchanged | None,
+) -> Float[Array, "i 4 4"]:
+    """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
+    about it.
+    """
+    objective = level_objective(level, target, options, unchanged_brightness(level))
+    leader = _best_guess(objective, guesses)
+    places = max(options.islands)
+    if not options.scouts:
+        return jnp.repeat(leader[None], places, axis=0)
+    objective, _ = fit_objective(level, target, options, leader, exchanged)
+    spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
+    twists = spread * jax.random.normal(key, (options.scouts, 6))
+    scouts = leader @ exp(twists.at[0].set(0.0))
+    errors, _ = objective.score(scouts)
+    return scouts[best_distinct(scouts, errors, places)]

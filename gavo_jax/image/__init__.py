@@ -1,0 +1,1 @@
+"""One image of a frame: pyramid, levels, warp, shutter and sampling."""

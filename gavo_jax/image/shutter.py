@@ -1,0 +1,67 @@
+"""The rolling shutter: rows are exposed one after the other while the camera moves on."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gavo_jax.camera import Camera, to_pixels
+from gavo_jax.image.levels import ImagePlane
+from gavo_jax.image.warp import Points, Warped
+
+
+class Slopes(NamedTuple):
+    """Derivatives of what is sampled at warped points."""
+
+    along_u: Float[Array, "*n"]
+    along_v: Float[Array, "*n"]
+    along_inverse_depth: Float[Array, "*n"]
+
+
+class Shutter(NamedTuple):
+    """A rolling shutter that reads row after row while the camera moves on."""
+
+    readout: Float[Array, ""]
+    """Of the motion between the two frames, the share that falls between the target's first and last row; negative
+    where the target was taken before the reference."""
+    row_time: Float[Array, "*n"]
+    """When each reference point was seen, in readouts after its frame's moment (that of the middle row); 0 where the
+    point was moved there."""
+
+
+def row_time(v: Float[Array | np.ndarray, "*n"] | float, camera: Camera | ImagePlane) -> Any:
+    """When rows are exposed, in readouts after the middle of the image."""
+    return (v + 0.5) / camera.height - 0.5
+
+
+def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane) -> Warped:
+    """Where warped points really are when the row on which they land is read.
+
+    The camera moves on along ξ meanwhile, so each point goes on along its own way from the reference, by the share of
+    the motion that falls into its delay. To first order in that share, a few hundredths between frames of a video.
+    """
+    share, way = _passed(points, warped, shutter, camera)
+    u, v, inverse_depth = (start + share * step for start, step in zip(warped[:3], way, strict=True))
+    inside = (warped.inside > 0) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    return Warped(u, v, inverse_depth, inside.astype(jnp.float32))
+
+
+def delayed_slopes(
+    slopes: Slopes, points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane
+) -> Slopes:
+    """Slopes along `warped`'s own (u, v, 1/z), from those along its `delay`ed values."""
+    share, way = _passed(points, warped, shutter, camera)
+    later = shutter.readout / camera.height * sum(slope * step for slope, step in zip(slopes, way, strict=True))
+    along_u, along_v, along_inverse_depth = ((1.0 + share) * slope for slope in slopes)
+    return Slopes(along_u, along_v + later, along_inverse_depth)
+
+
+def _passed(
+    points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
+    """Share of the motion that falls into each point's delay, and the points' ways (u, v, 1/z) from the reference."""
+    share = shutter.readout * (row_time(warped.v, camera) - shutter.row_time)
+    u, v = to_pixels(camera, points.x, points.y)
+    return share, (warped.u - u, warped.v - v, warped.inverse_depth - points.q)

@@ -1,0 +1,51 @@
+"""Losses: what a residual costs."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+Loss = Callable[[jax.Array], jax.Array]
+"""A cost of the squared normalised residual s = (r/σ)², never negative. Any callable of arrays will do."""
+
+
+def l2(s: jax.Array) -> jax.Array:
+    """ρ(s) = s: plain least squares, as in the paper's error."""
+    return s
+
+
+def huber(s: jax.Array) -> jax.Array:
+    """Quadratic up to 1.345 σ, linear beyond (95 % efficient under Gaussian noise)."""
+    k = 1.345
+    return jnp.where(s <= k * k, s, 2.0 * k * jnp.sqrt(jnp.maximum(s, k * k)) - k * k)
+
+
+def cauchy(s: jax.Array) -> jax.Array:
+    """c² log(1 + s/c²), c = 2.385."""
+    c2 = 2.385**2
+    return c2 * jnp.log1p(s / c2)
+
+
+def student_t(s: jax.Array) -> jax.Array:
+    """Negative log-likelihood of a t distribution of 5 degrees of freedom (Kerl et al. 2013), scaled to ρ'(0) = 1."""
+    return 5.0 * jnp.log1p(s / 5.0)
+
+
+def geman_mcclure(s: jax.Array) -> jax.Array:
+    """s/(1 + s/c²), c = 3: redescending and free of transcendental functions."""
+    return s / (1.0 + s / 9.0)
+
+
+def truncated(s: jax.Array) -> jax.Array:
+    """min(s, 2.795²): squares up to 2.8 σ, constant beyond. A population needs no derivative there."""
+    return jnp.minimum(s, 2.795**2)
+
+
+LOSSES: dict[str, Loss] = {
+    "l2": l2,
+    "huber": huber,
+    "cauchy": cauchy,
+    "student-t": student_t,
+    "geman-mcclure": geman_mcclure,
+    "truncated": truncated,
+}

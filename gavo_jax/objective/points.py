@@ -1,0 +1,115 @@
+"""The points of a reference frame: how they are chosen, and how they are seen from elsewhere."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Integer
+
+from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.levels import Levels
+from gavo_jax.image.pyramid import NO_PIXEL, Pyramid, make_atlas
+from gavo_jax.image.sampling import inverse_depth_slopes
+from gavo_jax.image.shutter import row_time
+from gavo_jax.image.warp import Points, moved
+
+
+class Reference(NamedTuple):
+    """What the objective keeps of a level of the reference frame: arrays of N points, with an axis of views before it
+    where several frames serve together.
+    """
+
+    points: Points
+    grey: Float[Array, "*views n"]
+    grey_u: Float[Array, "*views n"]
+    """Intensity gradient along u (grey levels a pixel), and `grey_v` along v."""
+    grey_v: Float[Array, "*views n"]
+    slope_u: Float[Array, "*views n"]
+    """Inverse-depth slope along u (1/m a pixel), and `slope_v` along v."""
+    slope_v: Float[Array, "*views n"]
+    facing: Float[Array, "*views n"]
+    """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""
+    row_time: Float[Array, "*views n"]
+    """When the point's row was exposed; see `Shutter`."""
+
+
+def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """∂/∂u and ∂/∂v by central differences of an image with a margin of one pixel; a neighbour that is `NO_PIXEL`
+    counts as the pixel itself.
+    """
+    middle = grey[1:-1, 1:-1]
+
+    def along(before: jax.Array, after: jax.Array) -> jax.Array:
+        return 0.5 * (jnp.where(after == NO_PIXEL, middle, after) - jnp.where(before == NO_PIXEL, middle, before))
+
+    return along(grey[1:-1, :-2], grey[1:-1, 2:]), along(grey[:-2, 1:-1], grey[2:, 1:-1])
+
+
+def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Reference:
+    """Points of some levels, [L, N]: one a square block of pixels, that of the steepest grey with a reading.
+
+    The choice is stratified, so its cost in accuracy is small, and N is static. Shorter levels are filled up with
+    points without a reading.
+
+    Args:
+        pyramid: Of the reference frame.
+        camera: Of level 0.
+        levels: Which ones, in the order of the result.
+    """
+    layout = levels.layout
+    grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[number] for number in levels.numbers]))
+    gradient, slopes = central_gradient(grey), inverse_depth_slopes(inverse_depth)
+    grey, inverse_depth = grey[1:-1, 1:-1], inverse_depth[1:-1, 1:-1]
+    steepness = jnp.where(inverse_depth > 0, gradient[0] ** 2 + gradient[1] ** 2, -1.0)
+    chosen = []
+    for (height, width), (row, column), cell in zip(levels.sizes, layout.corners, levels.cells, strict=True):
+        u, v = _steepest_of_blocks(steepness[row : row + height, column : column + width], cell)
+        chosen.append(((v + row) * layout.width + u + column).reshape(-1))
+    place = jnp.stack([jnp.pad(p, (0, levels.most_points - p.shape[0]), constant_values=layout.gap) for p in chosen])
+    q, grey, grey_u, grey_v, slope_u, slope_v = (
+        image.reshape(-1).at[place].get(mode="promise_in_bounds") for image in (inverse_depth, grey, *gradient, *slopes)
+    )
+    plane = jax.tree.map(lambda leaf: leaf[:, None], levels.planes(camera))
+    row, column = np.array(layout.corners).T[..., None]
+    u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
+    near = jnp.maximum(q, 1e-3)
+    facing = jax.lax.rsqrt(1.0 + (plane.fx * slope_u / near) ** 2 + (plane.fy * slope_v / near) ** 2)
+    rays = Points(*to_ray(plane, u, v), q)
+    return Reference(rays, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, plane))
+
+
+def _steepest_of_blocks(steepness: Float[Array, "h w"], cell: int) -> tuple[Integer[Array, "r c"], ...]:
+    """Column and row of the largest pixel of each cell x cell block, the first of equal ones."""
+    rows, columns = (size // cell for size in steepness.shape)
+    blocks = steepness[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
+    within = jnp.argmax(blocks.reshape(rows, columns, cell * cell), axis=-1)
+    return jnp.arange(columns) * cell + within % cell, jnp.arange(rows)[:, None] * cell + within // cell
+
+
+def move_reference(reference: Reference, camera_T_reference: Float[Array, "4 4"]) -> Reference:
+    """The same points as rays of another camera; what falls behind it loses its reading."""
+    return reference._replace(points=_rays(moved(reference.points, camera_T_reference), reference.points.q))
+
+
+def settle_reference(reference: Reference, twist: Float[Array, " 6"]) -> Reference:
+    """The points where they were at their frame's moment instead of when their rows were exposed.
+
+    Args:
+        reference: As the camera's rolling shutter saw it.
+        twist: Motion of the points in the camera during one readout, small.
+    """
+    (v, w), (x, y, q), back = (twist[:3], twist[3:]), reference.points, -reference.row_time
+    settled = (
+        x + back * (w[1] - w[2] * y + v[0] * q),
+        y + back * (w[2] * x - w[0] + v[1] * q),
+        1.0 + back * (w[0] * y - w[1] * x + v[2] * q),
+    )
+    return reference._replace(points=_rays(settled, q), row_time=jnp.zeros_like(reference.row_time))
+
+
+def _rays(coordinates: tuple[jax.Array, jax.Array, jax.Array], q: jax.Array) -> Points:
+    """Points from their coordinates times their old inverse depth; those behind the camera lose their reading."""
+    before = (q > 0) & (coordinates[2] > 1e-3)
+    depth = jnp.where(before, coordinates[2], 1.0)
+    return Points(coordinates[0] / depth, coordinates[1] / depth, jnp.where(before, q / depth, 0.0))

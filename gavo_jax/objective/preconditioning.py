@@ -1,0 +1,49 @@
+"""Search coordinates in which a unit step in any direction changes the image alike."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gavo_jax.camera import to_pixels
+from gavo_jax.image.shutter import Slopes
+from gavo_jax.image.warp import Warped
+from gavo_jax.objective.derivatives import pixel_jacobian
+from gavo_jax.objective.error import Objective
+
+
+def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
+    """A = mean of JᵀJ at zero motion from the reference frame alone: half the Hessian of E for a perfect match.
+
+    J is taken in a step on the reference's side, target_T_reference = origin · exp(ξ), where it does not depend on
+    the origin. No target is needed, so A is known before the search.
+    """
+    reference, plane, scales = objective.reference, objective.plane, objective.scales
+    points, facing = reference.points, reference.facing
+    valid = (points.q > 0).astype(jnp.float32)
+    warped = Warped(*to_pixels(plane, points.x, points.y), points.q, valid)
+
+    def curvature(slopes: Slopes) -> jax.Array:
+        jacobian = pixel_jacobian(slopes, warped, plane) * valid.reshape(-1)
+        return jacobian @ jacobian.T / jnp.maximum(jnp.sum(valid), 1.0)
+
+    total = curvature(Slopes(reference.grey_u, reference.grey_v, jnp.zeros_like(valid)))
+    if objective.use_depth:
+        depth = curvature(Slopes(facing * reference.slope_u, facing * reference.slope_v, -facing))
+        total += scales.depth_weight * (scales.grey / scales.depth) ** 2 * depth
+    return total
+
+
+LARGEST_UNIT_STEP = 0.05
+"""Metres or radians: a direction that the image hardly constrains is not searched further than this a unit."""
+
+
+def preconditioner(curvature: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """B with BᵀAB = identity, B = V Λ^(−1/2) of A = V Λ Vᵀ, limited where A is nearly singular."""
+    ridge = jnp.eye(6) / LARGEST_UNIT_STEP**2
+    values, vectors = jnp.linalg.eigh(curvature + ridge)
+    return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-9))
+
+
+def unconditioner(basis: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """The inverse of a `preconditioner`, whose columns are at right angles."""
+    return (basis / jnp.sum(basis**2, axis=0)).T

@@ -1,0 +1,115 @@
+"""An objective in search coordinates: what a solver is handed."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.objective.derivatives import Linearization, linearization, linearize, normal_equations, weighted_terms
+from gavo_jax.objective.error import Objective, Residuals, both_directions
+from gavo_jax.se3 import adjoint, exp, log, right_jacobian, rigid_inverse
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Problem:
+    """An objective in search coordinates x: target_T_reference = origin · exp(basis · x).
+
+    With origin = basis = identity x is ξ itself, the paper's chromosome. With `precondition` a unit step in any
+    direction of x changes the image by one grey level.
+    """
+
+    objective: Objective
+    origin: Float[Array, "4 4"]
+    basis: Float[Array, "6 6"]
+    centre: Float[Array, "4 4"] | None = None
+    """Motion that the search is held about, and `reach`, the largest translation (m) and rotation (rad) from it; a
+    candidate further off is worthless. None: the solver's bounds alone hold it."""
+    reach: Float[Array, " 2"] | None = None
+    searched: Bool[Array, ""] | bool = True
+    """Whether anything is to be found here; if not, no candidate is worth anything and none costs anything."""
+
+    def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
+        """target_T_reference of search coordinates."""
+        return self.origin @ exp(x @ self.basis.T)
+
+    def coordinates(self, target_T_reference: Float[Array, "4 4"]) -> Float[Array, " 6"]:
+        """Search coordinates of a motion, the inverse of `transform`."""
+        return jnp.linalg.solve(self.basis, log(rigid_inverse(self.origin) @ target_T_reference))
+
+    def score(
+        self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None
+    ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every solver.
+
+        Candidates that are not `counted` cost nothing and have an error of +inf: a population that is smaller on one
+        level than on another leaves places empty.
+        """
+        # held back, or XLA would compute each motion anew for each of its 16 entries
+        motions = jax.lax.optimization_barrier(self.transform(x))
+        counted = jnp.ones(x.shape[0], bool) if counted is None else counted
+        error, overlap = self.objective.score(motions, counted & self.searched)
+        return jnp.where(jnp.isnan(error) | self.is_out_of_reach(motions), jnp.inf, error), overlap
+
+    def is_out_of_reach(self, motions: Float[Array, "*p 4 4"]) -> Bool[Array, "*p"]:
+        """Which motions lie further from the centre than the search is held."""
+        if self.centre is None or self.reach is None:
+            return jnp.zeros(motions.shape[:-2], bool)
+        offset = rigid_inverse(self.centre) @ motions
+        cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
+        return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
+
+    def linearize(self, x: Float[Array, " 6"]) -> Linearization:
+        """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
+        motion, tangent = self._tangent(x)
+        model = linearize(self.objective, motion, tangent)
+        backward = self.objective.backward
+        if backward is None:
+            return model
+        inverse = rigid_inverse(motion)
+        other = linearize(backward, inverse, -adjoint(inverse) @ tangent)
+        error, overlap = both_directions(model[:2], other[:2])
+        return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
+
+    def linearize_residuals(self, r: Residuals) -> Linearization:
+        """E and its derivatives at x = 0, of which these are the residuals; from the reference to the target alone."""
+        objective = self.objective
+        sums = objective.sums(objective.cost(r))
+        tangent = adjoint(self.origin) @ self.basis
+        return linearization(
+            objective, tangent, sums, *normal_equations(weighted_terms(objective, objective.reference, r))
+        )
+
+    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
+        """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient; from the
+        reference to the target alone.
+
+        The covariance comes from the gradient's spread over tiles of the target image: residuals of neighbouring
+        pixels are correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both
+        sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
+        """
+        objective, plane = self.objective, self.objective.plane
+        tangent = adjoint(self.origin) @ self.basis
+        terms = weighted_terms(objective, objective.reference, r)
+        sums = objective.sums(objective.cost(r))
+        column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
+        row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
+        tile = (row * TILES[0] + column).reshape(-1)
+        pull = jnp.asarray(sum(jacobian * (weight * residual) for jacobian, residual, weight in terms))
+        sum_by_tile = partial(jax.ops.segment_sum, segment_ids=tile, num_segments=TILES[0] * TILES[1])
+        by_tile = tangent.T @ jax.vmap(sum_by_tile)(pull)
+        by_tile *= 2.0 / objective.divisor(sums[1])
+        used = jnp.sum(jnp.any(by_tile != 0, axis=0))
+        scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
+        return linearization(objective, tangent, sums, *normal_equations(terms)), scatter
+
+    def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
+        """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
+        motion = self.transform(x)
+        return motion, adjoint(motion) @ right_jacobian(self.basis @ x) @ self.basis
+
+
+TILES = (8, 6)
+"""Tiles across and down the image, for `Problem.examine`."""

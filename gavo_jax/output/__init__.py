@@ -1,0 +1,1 @@
+"""What a run leaves: files, figures, reports, and words on the screen."""

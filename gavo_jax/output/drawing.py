@@ -1,0 +1,89 @@
+"""The figures of a run as files, where matplotlib is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gavo_jax.alignment.visits import visited_levels
+from gavo_jax.datasets.base import FrameError, Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import distance_error
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.output import plots
+from gavo_jax.output.landscape import Landscape, error_landscape
+from gavo_jax.output.report import Picture
+from gavo_jax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw(folder: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> list[Picture]:
+    """Write the figures of named trajectories, where matplotlib is installed; errors where there is a truth.
+
+    Raises:
+        GavoError: a figure cannot be written.
+    """
+    if not plots.available():
+        return []
+    pictures = [save_figure(plots.plot_trajectories(estimates, truth), folder, "trajectory")]
+    if truth is None:
+        return pictures
+    try:
+        errors = {name: distance_error(estimate, truth) for name, estimate in estimates.items()}
+    except GavoError:
+        return pictures
+    return [*pictures, save_figure(plots.plot_distance_error(errors), folder, "distance_error")]
+
+
+def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: list[Step]) -> None:
+    """Write the figures of the search, where matplotlib is installed: convergence, landscape, last population.
+
+    Raises:
+        GavoError: a figure cannot be written.
+    """
+    good = [step for step in steps if not step.lost]
+    if not plots.available() or not good:
+        return
+    settings = odometry.settings
+    solver = settings.solver
+    visits = visited_levels(solver.levels, settings.alignment)
+    widths = [solver.iterations[level] for level in visits]
+    whole = [step.alignment.history for step in good if len(step.alignment.history) == sum(widths)]
+    if whole:
+        parts = np.split(np.stack(whole), np.cumsum(widths)[:-1], axis=1)
+        histories = dict(zip(visits, parts, strict=True))
+        save_figure(plots.plot_convergence(histories), folder, "convergence")
+    if odometry.candidates:
+        trimmed = [population.trimmed() for population in odometry.candidates]
+        errors = {int(population.level): np.asarray(population.error) for population in trimmed}
+        save_figure(plots.plot_population(errors), folder, "population")
+    landscape = _landscape_of(sequence, odometry, good[len(good) // 2])
+    if landscape is not None:
+        save_figure(plots.plot_landscape(landscape), folder, "landscape")
+
+
+def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landscape | None:
+    """Return E around the motion of a step at the coarsest and the finest level; None where a frame is unreadable."""
+    reference = int(np.searchsorted(sequence.timestamps, step.reference_timestamp))
+    settings = odometry.settings
+    levels = dict.fromkeys((settings.solver.levels[0], settings.solver.levels[-1]))
+    try:
+        frames = sequence[reference], sequence[step.index]
+    except FrameError:
+        return None
+    return error_landscape(*frames, odometry.camera, step.alignment, settings.alignment, tuple(levels))
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> Picture:
+    """Write a figure as NAME.png and NAME.svg, and return it as a report takes it.
+
+    Raises:
+        GavoError: a file cannot be written.
+    """
+    _, vector = plots.save(figure, folder, name)
+    return Picture(plots.CAPTIONS[name], vector)

@@ -1,0 +1,126 @@
+"""A run's files by name, and JSON and folders as they are written and read."""
+
+import dataclasses
+import enum
+import json
+import math
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+
+from gavo_jax.errors import PARTIAL, GavoError, read_text
+from gavo_jax.output.plots import CAPTIONS as FIGURES
+from gavo_jax.output.plots import FORMATS as FIGURE_FORMATS
+from gavo_jax.settings_file import name_of
+from gavo_jax.trajectory import write_lines
+from gavo_jax.version import __version__
+
+TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+CHECKPOINT = "checkpoint.npz"
+RECORDING = "run.rrd"
+"""What `--viewer save` writes."""
+VIEW = "view.rrd"
+"""What `gavo view --viewer save` writes."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        GavoError: it is missing, unreadable or none.
+    """
+    text = read_text(path)
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise GavoError(f"{path}: not a JSON object")
+    return value
+
+
+def environment() -> dict[str, str]:
+    """Return the versions that decide a result."""
+    return {
+        "gavo-jax": __version__,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def describe(value: Any) -> Any:
+    """Return a value as JSON knows it: settings with the name of their type, arrays as lists, not-a-number as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        shown = [field.name for field in dataclasses.fields(value) if field.repr]
+        entries = {name: describe(getattr(value, name)) for name in shown}
+        return {"type": type(value).__name__, **entries}
+    if isinstance(value, enum.Enum):
+        return value.name.lower()
+    if isinstance(value, Mapping):
+        return {str(key): describe(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return describe(np.asarray(value).tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [describe(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    return name_of(value) or getattr(value, "__name__", str(value))
+
+
+def prepare_folder(folder: str | Path) -> Path:
+    """Make a folder where it is missing, see that files can be made in it, and return it.
+
+    Raises:
+        GavoError: it is no folder or cannot be written to.
+    """
+    folder = Path(folder)
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise GavoError(f"{folder}: output folder is not a folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise GavoError(f"{folder}: output folder cannot be written to: {error.strerror or error}") from None
+    return folder
+
+
+def remove_files(folder: Path, *names: str) -> None:
+    """Remove files of an earlier run, and what a kill left half written, where there are any.
+
+    Raises:
+        GavoError: one cannot be removed.
+    """
+    for path in (folder / (name + suffix) for name in names for suffix in ("", PARTIAL)):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise GavoError(f"{path}: cannot be replaced: {error.strerror or error}") from None
+
+
+def remove_figures(folder: Path) -> None:
+    """Remove an earlier run's figures, where there are any.
+
+    Raises:
+        GavoError: one cannot be removed.
+    """
+    remove_files(folder, *(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value (see `describe`) as JSON, whole or not at all.
+
+    Raises:
+        GavoError: the file cannot be written.
+    """
+    write_lines(path, [json.dumps(describe(value), indent=2, allow_nan=False)])

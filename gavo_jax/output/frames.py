@@ -1,0 +1,122 @@
+"""frames.csv: a step as a row, and the steps of a run read back."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.odometry.driver import Step
+from gavo_jax.output.files import CONFIG, FRAMES, TRAJECTORY, read_json
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import Trajectory, inverse
+
+DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
+FRAME_COLUMNS = (
+    ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "undetermined", "lost", "on_lost")
+    + DEVIATIONS
+    + ("milliseconds",)
+)
+"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction that
+a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations of
+the motion's translation (m) and rotation (rad) along the axes of the reference camera."""
+
+
+def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
+    """The steps of a run as its trajectory.txt and frames.csv tell them.
+
+    Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame without a pose has
+    the one before it.
+
+    Args:
+        folder: Of the run.
+        trajectory: Of trajectory.txt, where it has been read already.
+
+    Raises:
+        GavoError: a file cannot be read or is damaged.
+    """
+    poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
+    by_stamp = {f"{stamp:.6f}": i for i, stamp in enumerate(poses.timestamps)}
+    steps: list[Step] = []
+    place = 0
+    for number, row in enumerate(csv.DictReader(read_text(folder / FRAMES).splitlines()), start=2):
+        try:
+            stamp = float(row["timestamp"])
+            if row["timestamp"] in by_stamp:
+                place = by_stamp[row["timestamp"]]
+                stamp = float(poses.timestamps[place])
+            world_T_camera = poses.world_T_camera[place]
+            reference = poses.world_T_camera[by_stamp.get(row["reference_timestamp"], place)]
+            steps.append(_read_step(row, stamp, world_T_camera, inverse(world_T_camera) @ reference))
+        except (KeyError, TypeError, ValueError):
+            raise GavoError(f"{folder / FRAMES}:{number}: not a row of a run") from None
+    return steps
+
+
+def _read_step(
+    row: Mapping[str, str], timestamp: float, world_T_camera: np.ndarray, target_T_reference: np.ndarray
+) -> Step:
+    deviations = np.array([float(row[name]) for name in DEVIATIONS])
+    alignment = no_alignment(AlignmentStatus[row["status"].upper()])._replace(
+        target_T_reference=target_T_reference,
+        error=np.float32(row["error"]),
+        overlap=np.float32(row["overlap"]),
+        covariance=np.diag(deviations**2),
+    )
+    return Step(
+        int(row["index"]),
+        float(row["reference_timestamp"]),
+        timestamp,
+        alignment,
+        world_T_camera,
+        float(row["milliseconds"]),
+        row["lost"] == "1",
+        row["on_lost"],  # pyright: ignore[reportArgumentType]
+    )
+
+
+def frame_row(step: Step) -> list[Any]:
+    """Return the values of `FRAME_COLUMNS` of one step; numbers in the shortest digits that read back exactly."""
+    alignment = step.alignment
+    deviations = np.sqrt(np.maximum(np.diag(np.asarray(alignment.covariance, np.float64)), 0.0))
+    return [
+        step.index,
+        f"{step.reference_timestamp:.6f}",
+        f"{step.timestamp:.6f}",
+        _digits(alignment.error),
+        _digits(alignment.overlap),
+        alignment.status.name.lower(),
+        alignment.undetermined,
+        int(step.lost),
+        step.policy,
+        *map(_digits, deviations),
+        f"{step.milliseconds:.3f}",
+    ]
+
+
+class RecordedRun(NamedTuple):
+    """What a run folder tells of its run."""
+
+    config: dict[str, Any]
+    trajectory: Trajectory
+    steps: list[Step]
+    """Of each frame after the first; see `read_steps`."""
+
+
+def read_run(folder: str | Path) -> RecordedRun:
+    """Read the files of a run, whether it came to its end or not.
+
+    Raises:
+        GavoError: a file is missing or damaged, or trajectory.txt and frames.csv are not of the same run.
+    """
+    folder = Path(folder)
+    config = read_json(folder / CONFIG)
+    trajectory = Trajectory.read_tum(folder / TRAJECTORY)
+    return RecordedRun(config, trajectory, read_steps(folder, trajectory))
+
+
+def _digits(value: Any) -> str:
+    return np.format_float_positional(value, unique=True) if np.isfinite(value) else str(float(value))

@@ -1,0 +1,318 @@
+"""Figures as files: trajectories and their errors, convergence, the error's landscape, basins and drift; PNG and SVG.
+
+Every function draws one figure from arrays and returns it, with a caption that defines what is measured; `save` writes
+it. Colours are those of Okabe and Ito, which colour-blind people tell apart; line styles, markers and hatches tell the
+curves and bars apart without colour.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import ErrorSeries
+from gavo_jax.trajectory import Trajectory, inverse
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from gavo_jax.output.landscape import Landscape
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
+FORMATS = ("png", "svg")
+TRUTH_STYLE = {"color": "black", "linewidth": 2.5, "alpha": 0.45, "label": "ground truth"}
+
+
+def available() -> bool:
+    """Whether matplotlib is installed."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+SMALLEST_EXCESS = 1e-3
+"""Per cent; a smaller excess is drawn as this."""
+CAPTION_WIDTH = 18
+"""Letters of a caption an inch of the figure."""
+
+CAPTIONS = {
+    "trajectory": "Estimated and true camera positions, all seen from their first camera. The truth is interpolated at "
+    "the frames' stamps and laid on the first estimate's first pose that it covers.",
+    "distance_error": "Distance error of each frame: distance between the estimated and the true position of the "
+    "camera, both relative to the first pose; the truth is interpolated at the frames' stamps.",
+    "drift": "Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, fixed delta); translation "
+    "in m/s, rotation in deg/s. Bars: median over the runs; whiskers: smallest and largest.",
+    "convergence": "By how much the best error E so far exceeds the last one of the same level, over the iterations of "
+    "its search: median over the pairs of the run, and the range of their middle 80 %. Levels from coarse to fine.",
+    "population": "Root of E over the iterations of each level's search of one pair: best and median of the "
+    "population, and the range of its middle 80 %. Levels from coarse to fine; their errors are not comparable.",
+    "landscape": "Root of E around the motion that was found, along the eigenvectors of its covariance with the "
+    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left.",
+    "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
+    "rotation between the frames of a pair.",
+}
+"""By the name of the figure's files."""
+
+
+def plot_distance_error(errors: Mapping[str, ErrorSeries]) -> Figure:
+    """Draw the distance error of each named run over time and frames, as the paper's figures 5 and 9."""
+    figure = _figure(7.0, 4.4, "distance_error")
+    axes = figure.add_subplot()
+    stamps = np.unique(np.concatenate([series.timestamps for series in errors.values()])) - min(
+        series.timestamps[0] for series in errors.values()
+    )
+    for (name, series), style in zip(errors.items(), _styles(), strict=False):
+        seconds = series.timestamps - series.timestamps[0] + stamps[0]
+        axes.plot(seconds, series.values, label=name, **style, markevery=_marks(len(series.values)))
+    axes.set(xlabel="time (s)", ylabel="distance error (m)", ylim=(0, None))
+    axes.margins(x=0.01)
+    if len(stamps) > 1:
+        _number_frames(axes, stamps)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> Figure:
+    """Draw each named trajectory from above and in space, all seen from their first camera (x right, z forward).
+
+    The truth, where there is any, is taken at the stamps of the first estimate that it covers; its first such pose is
+    laid on that estimate's.
+    """
+    figure = _figure(10.0, 5.2, "trajectory")
+    above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
+    paths = {name: (inverse(t.world_T_camera[0]) @ t.world_T_camera)[:, :3, 3] for name, t in estimates.items()}
+    styles = dict(zip(paths, _styles(), strict=False))
+    true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
+    if true_path is not None:
+        above.plot(true_path[:, 0], true_path[:, 2], **TRUTH_STYLE)
+        space.plot(true_path[:, 0], true_path[:, 2], -true_path[:, 1], **TRUTH_STYLE)
+    for name, path in paths.items():
+        style = {**styles[name], "markevery": _marks(len(path))}
+        above.plot(path[:, 0], path[:, 2], label=name, **style)
+        space.plot(path[:, 0], path[:, 2], -path[:, 1], label=name, **style)
+    above.set(xlabel="x, right (m)", ylabel="z, forward (m)", title="From above", aspect="equal")
+    above.set_adjustable("datalim")
+    above.grid(alpha=0.3)
+    above.legend()
+    space.set(xlabel="x, right (m)", ylabel="z, forward (m)", zlabel="−y, up (m)", title="In space")
+    _limit_to_cube(space, [*paths.values(), *([] if true_path is None else [true_path])])
+    return figure
+
+
+def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations"]]) -> Figure:
+    """Draw how the best error falls within each level, over the pairs of a run.
+
+    Args:
+        histories: best E so far after every iteration, by level in the order of the search; NaN where a search had
+            ended: its last error is carried on.
+    """
+    figure = _figure(3.0 * len(histories), 3.6, "convergence")
+    panels = _panels(figure, len(histories), one_scale=True)
+    for axes, (level, history) in zip(panels, histories.items(), strict=True):
+        error = _carry_on(history)
+        excess = 100.0 * (error[:, :-1] / np.maximum(error[:, -1:], 1e-12) - 1.0)
+        iterations = np.arange(1, excess.shape[1] + 1)
+        _draw_band(axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of them")
+        axes.set(title=f"level {level}", xlabel="iteration", yscale="log")
+        axes.minorticks_off()
+    figure.axes[0].set_ylabel("excess of E (%)")
+    figure.axes[0].legend(fontsize="small")
+    return figure
+
+
+def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> Figure:
+    """Draw how the errors of a population fall within each level of one pair's search.
+
+    Args:
+        errors: E of every candidate after every iteration, by level in the order of the search; NaN rows where the
+            search had ended, +inf where a candidate is worthless.
+    """
+    figure = _figure(3.0 * len(errors), 3.6, "population")
+    for axes, (level, error) in zip(_panels(figure, len(errors)), errors.items(), strict=True):
+        error = error[~np.isnan(error).all(axis=1)]
+        rmse = np.sqrt(np.where(np.isfinite(error), error, np.nan))
+        iterations = np.arange(1, len(rmse) + 1)
+        _draw_band(axes, iterations, rmse.T, "median", "middle 80 %")
+        axes.plot(iterations, np.nanmin(rmse, axis=1), color=COLORS[1], linestyle="--", marker="s", label="best")
+        axes.set(title=f"level {level}, {error.shape[1]} candidates", xlabel="iteration")
+    figure.axes[0].set_ylabel("√E (grey levels)")
+    figure.axes[0].legend(fontsize="small")
+    return figure
+
+
+def plot_landscape(landscape: Landscape) -> Figure:
+    """Draw the error around the optimum along the worst- and the best-conditioned direction, level by level."""
+    figure = _figure(8.0, 4.6, "landscape")
+    titles = ("worst-conditioned direction", "best-conditioned direction")
+    for i, (axes, title) in enumerate(zip(_panels(figure, 2), titles, strict=True)):
+        for (level, errors), style in zip(landscape.errors.items(), _styles(), strict=False):
+            rmse = np.sqrt(np.where(np.isfinite(errors[i]), errors[i], np.nan))
+            axes.plot(landscape.steps * 1e3, rmse, label=f"level {level}", **style, markevery=_marks(len(rmse)))
+        numbers = ", ".join(f"{value:.2f}" for value in landscape.directions[i])
+        axes.set(title=title, xlabel=f"step (mm, mrad) along\n(v, w) = ({numbers})", ylim=(0, None))
+    figure.axes[0].set_ylabel("√E (grey levels)")
+    figure.axes[0].legend(fontsize="small")
+    return figure
+
+
+def plot_basin(motion: Float[np.ndarray, " n"], success: Mapping[str, Float[np.ndarray, " n"]], title: str) -> Figure:
+    """Draw how often each method still finds a motion, over the motion's size.
+
+    Args:
+        motion: median rotation of the pairs, degrees, in any order.
+        success: share of the pairs found, by method.
+        title: what the pairs are of.
+    """
+    figure = _figure(9.0, 4.6, "basin")
+    axes = figure.add_subplot()
+    order = np.argsort(motion)
+    for (name, rates), style in zip(success.items(), _styles(), strict=False):
+        axes.plot(motion[order], rates[order], label=name, **style)
+    axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
+    axes.set(ylim=(-0.03, 1.03), xlim=(0, None))
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize="small", loc="outside right upper")
+    return figure
+
+
+def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], ours: Sequence[str]) -> Figure:
+    """Draw the drift of every method on every clip as bars, other libraries' hatched.
+
+    Args:
+        clips: translation (m/s) and rotation (deg/s) of every run, by clip and method.
+        ours: which of the methods are the project's own.
+    """
+    rows = max(len(methods) for methods in clips.values())
+    figure = _figure(9.0, (0.9 + 0.2 * rows) * len(clips) + 0.6, "drift")
+    panels = figure.subplots(len(clips), 2, squeeze=False)
+    for (clip, methods), pair in zip(clips.items(), panels, strict=True):
+        for column, (axes, label) in enumerate(zip(pair, ("translation (m/s)", "rotation (deg/s)"), strict=True)):
+            for place, (name, runs) in enumerate(methods.items()):
+                values = runs[:, column]
+                middle = float(np.median(values))
+                style = {"color": COLORS[0]} if name in ours else {"color": "#DDDDDD", "hatch": "//"}
+                spread = [[middle - values.min()], [values.max() - middle]] if len(values) > 1 else None
+                axes.barh(place, middle, xerr=spread, edgecolor="black", linewidth=0.5, capsize=2, **style)
+                axes.annotate(f" {middle:#.3g}", (values.max(), place), va="center", fontsize=7)
+            names = list(methods) if column == 0 else [""] * len(methods)
+            axes.set_yticks(range(len(methods)), names, fontsize="small")
+            axes.invert_yaxis()
+            axes.margins(x=0.15)
+            axes.set(xlabel=label, title=clip)
+            axes.grid(alpha=0.3, axis="x")
+            axes.set_axisbelow(True)
+    return figure
+
+
+def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
+    """Write a figure as NAME.png and NAME.svg (`FORMATS`) into a folder and return their paths.
+
+    Raises:
+        GavoError: a file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    def write_png(path: Path) -> None:
+        FigureCanvasAgg(figure).print_png(path, pil_kwargs={"optimize": True})
+
+    def write_svg(path: Path) -> None:
+        FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None})
+
+    # not by `savefig`, which draws twice for each file and lays out anew: that takes the most time
+    figure.set_dpi(120)
+    paths = []
+    for suffix, write in zip(FORMATS, (write_png, write_svg), strict=True):
+        path = Path(folder) / f"{name}.{suffix}"
+        try:
+            write(path)
+        except OSError as error:
+            raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+        figure.set_layout_engine("none")
+        paths.append(path)
+    return paths
+
+
+def _figure(width: float, height: float, name: str) -> Figure:
+    """Return a figure (inches) with a caption and nothing else, that belongs to no window and to no global state."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.supxlabel(textwrap.fill(CAPTIONS[name], int(CAPTION_WIDTH * width)), fontsize=7, x=0.01, ha="left")
+    return figure
+
+
+def _number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
+    """Add an axis on top that counts the frames at these times."""
+    numbers = np.arange(len(stamps))
+
+    def frame_at(time: Any) -> Any:
+        return np.interp(time, stamps, numbers)
+
+    def time_of(frame: Any) -> Any:
+        return np.interp(frame, numbers, stamps)
+
+    axes.secondary_xaxis("top", functions=(frame_at, time_of)).set_xlabel("frame")
+
+
+def _panels(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
+    """Return panels side by side, each with a scale of its own upwards, or all with one."""
+    panels = list(figure.subplots(1, count, squeeze=False, sharey=one_scale)[0])
+    for axes in panels:
+        axes.grid(alpha=0.3)
+        axes.locator_params(axis="x", integer=True)
+    return panels
+
+
+def _draw_band(axes: Any, x: Any, samples: Float[np.ndarray, "samples n"], middle: str, range_: str) -> None:
+    """Draw the median of samples with the range of their middle 80 %."""
+    low, median, high = np.nanquantile(samples, [0.1, 0.5, 0.9], axis=0)
+    axes.fill_between(x, low, high, facecolor=COLORS[5], alpha=0.35, edgecolor=COLORS[0], linewidth=0.5, label=range_)
+    axes.plot(x, median, color=COLORS[0], marker="o", markersize=3, label=middle)
+
+
+def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarray, "pairs iterations"]:
+    """Return the history with NaN replaced by the last value before it."""
+    last = np.maximum.accumulate(np.where(np.isnan(history), 0, np.arange(history.shape[1])), axis=1)
+    return np.take_along_axis(history, last, axis=1)
+
+
+def _limit_to_cube(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
+    """Give the three axes of a drawing in space the same scale and a few ticks each."""
+    points = np.concatenate(paths)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = max(0.55 * float(np.max(high - low)), 1e-3)
+    for axis, middle in zip("xyz", (low + high) / 2, strict=True):
+        getattr(space, f"set_{axis}lim")(middle - half, middle + half)
+        space.locator_params(axis=axis, nbins=4)
+    space.set_box_aspect((1, 1, 1), zoom=0.85)
+
+
+def _styles() -> Iterator[dict[str, Any]]:
+    """Yield a colour, line style and marker for each curve; neighbours differ in all three."""
+    for color, line, marker in zip(cycle(COLORS), cycle(LINES), cycle(MARKERS), strict=False):
+        yield {"color": color, "linestyle": line, "marker": marker, "markersize": 4, "linewidth": 1.5}
+
+
+def _marks(count: int) -> int:
+    """Return the spacing of about ten markers along a curve."""
+    return max(1, count // 10)
+
+
+def _true_path(estimate: Trajectory, truth: Trajectory) -> Float[np.ndarray, "n 3"] | None:
+    """Return true positions at the estimate's stamps in its first camera's frame; None where nothing is covered."""
+    world_T_camera, valid = truth.interpolate(estimate.timestamps)
+    if not valid.any():
+        return None
+    true, first = world_T_camera[valid], estimate.world_T_camera[valid][0]
+    first_camera_T_start = inverse(estimate.world_T_camera[0]) @ first
+    return (first_camera_T_start @ inverse(true[0]) @ true)[:, :3, 3]

@@ -1,0 +1,66 @@
+"""A sequence through a driver under the eyes of a user, who may stop it with Ctrl-C."""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.output.screen import pair_progress
+from gavo_jax.trajectory import Trajectory
+from gavo_jax.viewer.base import NO_VIEWER, Viewer
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
+
+class Tracked(NamedTuple):
+    """What came of a sequence; where the user stopped it, up to there."""
+
+    trajectory: Trajectory
+    steps: list[Step]
+    metrics: dict[str, Any]
+    """`odometry.compute_metrics`."""
+    interrupted: bool
+
+
+def track_visibly(
+    label: str,
+    sequence: Sequence,
+    odometry: Odometry,
+    on_step: Callable[[Step], None] | None = None,
+    viewer: Viewer = NO_VIEWER,
+) -> Tracked:
+    """Compile, then track every frame, from where the driver stands, under a progress bar and before a viewer's eyes.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it before the first pair was done.
+    """
+    pairs, done = len(sequence) - 1, max(odometry.progress.last_index, 0)
+    steps: list[Step] = []
+    interrupted = False
+
+    def watch(frame: Frame | None, step: Step | None) -> None:
+        viewer.watch(frame, step, odometry.candidates)
+
+    with pair_progress(label, pairs, done) as bar:
+        compile_seconds = odometry.warm_up()
+        start = time.perf_counter()
+        try:
+            for step in track(sequence, odometry=odometry, watch=watch):
+                if on_step is not None:
+                    on_step(step)
+                steps.append(step)
+                bar.advance()
+        except KeyboardInterrupt:
+            if not steps:
+                raise
+            interrupted = True
+        seconds = time.perf_counter() - start
+    if interrupted:
+        print(f"gavo: {label}: interrupted after {done + len(steps)} of {pairs} pairs", file=sys.stderr)
+    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
+    return Tracked(trajectory, steps, metrics, interrupted)

@@ -1,0 +1,51 @@
+"""What can be said of a frame or of a pair, each with a sentence for people."""
+
+import enum
+
+
+class AlignmentStatus(enum.IntEnum):
+    """What is known of a pair's result; `sentence` says it for people."""
+
+    OK = 0
+    LOW_OVERLAP = 1
+    LOW_TEXTURE = 2
+    AMBIGUOUS = 3
+    HIGH_ERROR = 4
+    NO_DEPTH = 5
+    NOT_FINITE = 6
+    UNREADABLE = 7
+    BLANK = 8
+    NOISE = 9
+    FROZEN = 10
+    DEPTH_UNITS = 11
+    PARTIAL_DEPTH = 12
+    BAD_TIMESTAMP = 13
+    GAP = 14
+    NO_REFERENCE = 15
+    NOT_RIGID = 16
+
+    @property
+    def sentence(self) -> str:
+        """One sentence for people."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    AlignmentStatus.OK: "The motion was found.",
+    AlignmentStatus.LOW_OVERLAP: "Too few of the reference's pixels land inside the target.",
+    AlignmentStatus.LOW_TEXTURE: "The images leave at least one direction of the motion undetermined.",
+    AlignmentStatus.AMBIGUOUS: "Distinct motions explain the images about equally well.",
+    AlignmentStatus.HIGH_ERROR: "The best motion found does not explain the target image.",
+    AlignmentStatus.NO_DEPTH: "A frame has too few depth readings.",
+    AlignmentStatus.NOT_FINITE: "The error is not a finite number.",
+    AlignmentStatus.UNREADABLE: "The frame could not be read.",
+    AlignmentStatus.BLANK: "The image is black, white or saturated.",
+    AlignmentStatus.NOISE: "The image is noise.",
+    AlignmentStatus.FROZEN: "The image is the last one once more.",
+    AlignmentStatus.DEPTH_UNITS: "The depth's range is unlikely: its units may not be the camera's.",
+    AlignmentStatus.PARTIAL_DEPTH: "Much of the usual depth is missing.",
+    AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
+    AlignmentStatus.GAP: "Frames are missing before this one.",
+    AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
+    AlignmentStatus.NOT_RIGID: "The result is no rigid motion: this machine computes wrong numbers (see gavo doctor).",
+}

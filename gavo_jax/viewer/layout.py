@@ -1,0 +1,70 @@
+"""Where the viewer's window shows what."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gavo_jax.viewer.colors import DARK
+
+if TYPE_CHECKING:
+    from rerun.blueprint import Blueprint
+
+
+IMAGES = {
+    "reference": "Reference",
+    "target": "Target",
+    "warped": "Target, warped",
+    "residual": "Residual (blue below, orange above)",
+}
+"""Entities below `images`, and the titles of their views."""
+
+
+def make_blueprint() -> Blueprint:
+    """Return the layout: search space, trajectories, state and curves above, the four images below.
+
+    On the time line `frame` the particles of all generations of a frame are shown at once, on `generation` one's.
+    """
+    import rerun.blueprint as layout
+
+    everything = [
+        layout.VisibleTimeRange(
+            timeline, start=layout.TimeRangeBoundary.infinite(), end=layout.TimeRangeBoundary.cursor_relative()
+        )
+        for timeline in ("frame", "generation")
+    ]
+    now = [
+        layout.VisibleTimeRange(
+            timeline,
+            start=layout.TimeRangeBoundary.cursor_relative(seq=0),
+            end=layout.TimeRangeBoundary.cursor_relative(seq=0),
+        )
+        for timeline in ("frame", "generation")
+    ]
+    search = layout.Spatial3DView(
+        origin="search",
+        name="Search space (mm)",
+        background=DARK,
+        eye_controls=layout.EyeControls3D(position=(30, -30, -50), look_target=(0, 0, 0), eye_up=(0, -1, 0)),
+        overrides={"search/particles": layout.VisibleTimeRanges(now)},
+    )
+    world = layout.Spatial3DView(
+        origin="world",
+        name="Trajectory (m): estimate blue, truth white",
+        background=DARK,
+        overrides={path: layout.VisibleTimeRanges(everything) for path in ("world/estimate", "world/truth")},
+    )
+    curves = layout.Vertical(
+        layout.TextDocumentView(origin="state", name="State"),
+        layout.TimeSeriesView(origin="curves/rmse", name="RMSE of the best particle (grey levels)"),
+        layout.TimeSeriesView(origin="curves/distance_error", name="Distance error (m)"),
+    )
+    images = [layout.Spatial2DView(origin=f"images/{name}", name=title) for name, title in IMAGES.items()]
+    return layout.Blueprint(
+        layout.Vertical(
+            layout.Horizontal(search, world, curves, column_shares=[3, 3, 2]),
+            layout.Horizontal(*images),
+            row_shares=[5, 2],
+        ),
+        layout.TimePanel(timeline="frame", state="collapsed"),
+        collapse_panels=True,
+    )

@@ -1,0 +1,244 @@
+"""The live viewer on Rerun (extra `[viewer]`): window, server or file.
+
+A frame's pictures are prepared and sent by a thread of their own, so that a run hardly waits for them. Two time lines:
+`frame`, and `generation`, which counts on from frame to frame, for the evolution of the populations inside a frame.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import webbrowser
+from pathlib import Path
+from queue import Empty, Queue
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.alignment.search import Population
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import Trajectory
+from gavo_jax.viewer.base import NO_VIEWER, Viewer, ViewerMode
+from gavo_jax.viewer.layout import make_blueprint
+from gavo_jax.viewer.scene import Scene
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+
+WAITING_FRAMES = 8
+"""Frames that wait to be shown before the run waits for them."""
+SECONDS_TOGETHER = 0.25
+"""What is shown within this time is sent together; a window lags behind the run by at most this."""
+MEMORY = "512MiB"
+"""What the server of the web viewer keeps for browsers that come later."""
+HOST, GRPC_PORT, WEB_PORT = "127.0.0.1", 9876, 9090
+"""Where the web viewer is found: on this machine only; at other ports where something else is at these."""
+WINDOW_SECONDS = 1.0
+"""After which a window that found no screen would have ended."""
+PATIENCE = 60.0
+"""Seconds for the server to start, and for the last frames to arrive."""
+NOTHING_NEW: Any = ()
+"""In place of a frame, where none came for a while."""
+GUARD = """
+import os, signal, subprocess, sys
+subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
+sys.stdin.read()
+os.killpg(0, signal.SIGTERM)
+"""
+"""Serves until its standard input closes, which it does however the run ends; Ctrl-C does not reach it."""
+
+
+def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
+    """Return a viewer, not open yet.
+
+    Args:
+        mode: `spawn` a window, serve to a browser on the `web`, `save` to a file, or `none` of these.
+        recording: the file to save to.
+
+    Raises:
+        GavoError: Rerun is not installed, or there is no screen for a window.
+    """
+    if mode == "none":
+        return NO_VIEWER
+    if importlib.util.find_spec("rerun") is None:
+        raise GavoError(f"--viewer {mode}: rerun is not installed: pip install 'gavo-jax[viewer]'")
+    if mode == "spawn" and not _has_screen():
+        raise GavoError("--viewer spawn: no screen here: use --viewer web or --viewer save")
+    return RerunViewer(mode, recording)
+
+
+class RerunViewer(Viewer):
+    """Shows a run in Rerun, live or in a file."""
+
+    wants_populations = True
+
+    def __init__(self, mode: ViewerMode, recording: Path) -> None:
+        self.mode, self.recording = mode, recording
+        self.url = ""
+        """Where a browser finds it, in mode `web`."""
+        self._queue: Queue[Any] = Queue(WAITING_FRAMES)
+        self._thread: threading.Thread | None = None
+        self._fault: Exception | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
+        """Open window, server or file, send the layout, and start the thread.
+
+        Raises:
+            GavoError: the file cannot be written, or Rerun cannot be started.
+        """
+        import rerun
+
+        stream = rerun.RecordingStream("gavo-jax")
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        self._connect(stream)
+        stream.send_recording_name(title)
+        stream.send_blueprint(make_blueprint())
+        self._stream = stream
+        self._thread = threading.Thread(target=self._work, args=(Scene(stream, camera, stamps, truth),), daemon=True)
+        self._thread.start()
+
+    def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
+        """Queue a frame; waits while `WAITING_FRAMES` others are yet to be shown."""
+        self._raise_fault()
+        self._queue.put((frame, step, populations))
+
+    def close(self) -> None:
+        """Wait for what is queued.
+
+        Raises:
+            GavoError: a frame could not be shown.
+        """
+        if self._thread is None:
+            return
+        self._queue.put(None)
+        self._thread.join()
+        self._thread = None
+        try:
+            self._stream.flush(timeout_sec=PATIENCE)
+        except Exception as fault:
+            self._fault = self._fault or fault
+        if self.mode == "save":
+            self._stream.disconnect()
+        self._raise_fault()
+
+    def stay(self) -> None:
+        """Serve the browser until Ctrl-C; a window of its own and a file need nothing."""
+        if self.mode != "web":
+            return
+        print(f"viewer at {self.url} (Ctrl-C ends it)", flush=True)
+        try:
+            while True:
+                time.sleep(1.0)
+        except KeyboardInterrupt:
+            return
+
+    def _connect(self, stream: RecordingStream) -> None:
+        try:
+            if self.mode == "save":
+                stream.save(self.recording)
+            elif self.mode == "spawn":
+                self._open_window(stream)
+            else:
+                self._serve(stream)
+        except (OSError, RuntimeError) as error:
+            where = f"{self.recording}: cannot be written" if self.mode == "save" else f"--viewer {self.mode}"
+            raise GavoError(f"{where}: {error}") from None
+
+    def _open_window(self, stream: RecordingStream) -> None:
+        """Start Rerun's own program, which stays when the run ends; unlike Rerun's call, for this machine alone."""
+        port, quiet = _free_port(GRPC_PORT), subprocess.DEVNULL
+        command = [sys.executable, "-m", "rerun", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
+        self._process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        try:
+            _await_port(port, self._process)
+            self._process.wait(timeout=WINDOW_SECONDS)
+        except subprocess.TimeoutExpired:
+            stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
+            return
+        except RuntimeError:
+            pass
+        raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
+
+    def _serve(self, stream: RecordingStream) -> None:
+        """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
+        port, page = _free_port(GRPC_PORT), _free_port(WEB_PORT)
+        options = {"bind": HOST, "port": port, "web-viewer-port": page, "server-memory-limit": MEMORY}
+        command = [sys.executable, "-c", GUARD]
+        command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        quiet = subprocess.DEVNULL
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
+        )
+        for served in (port, page):
+            _await_port(served, self._process)
+        address = f"rerun+http://{HOST}:{port}/proxy"
+        stream.connect_grpc(address)
+        self.url = f"http://{HOST}:{page}/?url={quote(address, safe='')}"
+        print(f"viewer at {self.url}", file=sys.stderr, flush=True)
+        if _has_screen():
+            webbrowser.open(self.url)
+
+    def _work(self, scene: Scene) -> None:
+        """Add what is queued to the scene, and send it every `SECONDS_TOGETHER`, until None comes."""
+        sent, item = time.monotonic(), NOTHING_NEW
+        while item is not None:
+            try:
+                item = self._queue.get(timeout=SECONDS_TOGETHER)
+            except Empty:
+                item = NOTHING_NEW
+            try:
+                if item and self._fault is None:
+                    scene.add(*item)
+                if not item or time.monotonic() - sent > SECONDS_TOGETHER:
+                    scene.send()
+                    sent = time.monotonic()
+            except Exception as fault:
+                self._fault = fault
+
+    def _raise_fault(self) -> None:
+        if self._fault is not None:
+            raise GavoError(f"--viewer {self.mode}: {self._fault}") from self._fault
+
+
+def _has_screen() -> bool:
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
+
+
+def _await_port(port: int, process: subprocess.Popen[bytes]) -> None:
+    """Wait until a process that was started answers at a port.
+
+    Raises:
+        RuntimeError: it has ended, or does not answer for `PATIENCE` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline and process.poll() is None:
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return
+        time.sleep(0.05)
+    raise RuntimeError("Rerun does not start")
+
+
+def _free_port(wanted: int) -> int:
+    """Return the port, or one that is free where that one is taken."""
+    for port in (wanted, 0):
+        with socket.socket() as probe:
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise GavoError("--viewer web: no free port")

@@ -1,0 +1,84 @@
+"""The images that are shown: shrunk, warped, and their residual."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from gavo_jax.camera import Camera
+from gavo_jax.viewer.colors import RESIDUAL_COLORS
+
+IMAGE_WIDTH = 320
+"""Pixels: images are shown at the pyramid level of at most this width."""
+JPEG_QUALITY = 85
+RESIDUAL_RANGE = 40.0
+"""Grey levels at which the residual image's colours saturate."""
+
+
+def encode_jpeg(image: UInt8[np.ndarray, "h w *channels"]) -> bytes:
+    """Return an image, grey or BGR, as the bytes of a JPEG file."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+
+
+class Shown(NamedTuple):
+    """A frame as it is shown."""
+
+    timestamp: float
+    grey: UInt8[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    """Metres; 0 = no reading."""
+    jpeg: bytes
+    """The grey image, encoded."""
+
+
+def color_residual(
+    warped: UInt8[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return BGR of the residuals warped − reference; black where nothing is seen."""
+    factor = 127.5 / RESIDUAL_RANGE
+    colored = cv2.applyColorMap(cv2.addWeighted(warped, factor, reference, -factor, 127.5), RESIDUAL_COLORS)
+    return cv2.bitwise_and(colored, colored, mask=seen.view(np.uint8))
+
+
+def shown_camera(camera: Camera) -> Camera:
+    """Return the camera of the images that are shown: of the finest level at most `IMAGE_WIDTH` wide."""
+    level = 0
+    while camera.width >> level > IMAGE_WIDTH:
+        level += 1
+    return camera.level(level)
+
+
+def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """Return the points at depth 1 that pixels see."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
+    return np.asarray(camera.back_project(np.stack([u, v], axis=-1), np.ones_like(u)), np.float32)
+
+
+def warp_target(
+    reference: Shown, target: Shown, target_T_reference: Float[np.ndarray, "4 4"], camera: Camera
+) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return I_{t+1}(ω(ξ, p)) at every reference pixel, black where it is not defined, and where it is.
+
+    Args:
+        reference: with its depth.
+        target: the image that is sampled.
+        target_T_reference: g(ξ).
+        camera: of both, without distortion.
+    """
+    height, width = reference.grey.shape
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    known = reference.depth > 0
+    inverse_depth = np.divide(1, reference.depth, out=np.zeros_like(reference.depth), where=known)
+    turn = (matrix @ target_T_reference[:3, :3] @ np.linalg.inv(matrix)).astype(np.float32)
+    shift = (matrix @ target_T_reference[:3, 3]).astype(np.float32)
+    x, y, z = (a * u + (b * v + c) + d * inverse_depth for (a, b, c), d in zip(turn, shift, strict=True))
+    seen = known & (z > 1e-3)
+    x /= z
+    y /= z
+    seen &= (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    sampled = cv2.remap(target.grey, x, y, cv2.INTER_LINEAR)
+    return cv2.bitwise_and(sampled, sampled, mask=seen.view(np.uint8)), seen

@@ -1,0 +1,263 @@
+"""From frames, steps and populations to what Rerun is sent."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float64
+
+from gavo_jax.alignment.search import Population
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.viewer.colors import BLUE, GREEN, GREY, GREYS, VERMILION, WHITE
+from gavo_jax.viewer.layout import IMAGES
+from gavo_jax.viewer.pictures import Shown, color_residual, encode_jpeg, rays, shown_camera, warp_target
+from gavo_jax.viewer.search_space import MILLIMETRES, Level, level_of, star_strips
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+
+CLOUD_STRIDE = 4
+"""Every so many shown pixels along either side make a point of the cloud."""
+
+
+class Rows(NamedTuple):
+    """Rows of one entity that belong to one frame."""
+
+    generations: list[int]
+    """Where each stands on that time line."""
+    sizes: list[int]
+    """Number of instances (points, boxes, …) of each."""
+    values: dict[str, Any]
+    """Components of all instances: arrays, or lists of text or bytes."""
+    frame: int
+
+
+class Scene:
+    """Turns frames, steps and populations into what Rerun shows; remembers what a segment or a warp starts from.
+
+    What is to be shown gathers until `send`: a call to Rerun costs much the same for one row as for hundreds.
+    """
+
+    def __init__(
+        self, stream: RecordingStream, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None
+    ) -> None:
+        import rerun as rr
+
+        self._stream = stream
+        self._camera = shown_camera(camera)
+        self._shrink = camera.width // self._camera.width
+        self._depth_scale = camera.depth_scale
+        self._cloud = np.s_[CLOUD_STRIDE // 2 :: CLOUD_STRIDE, CLOUD_STRIDE // 2 :: CLOUD_STRIDE]
+        self._rays = rays(self._camera)[self._cloud]
+        self._truth = Truth(stamps, truth)
+        self._frame, self._generation = 0, 0
+        self._world_T_camera = np.eye(4)
+        self._last_truth: Float64[np.ndarray, "4 4"] | None = None
+        self._shown: deque[Shown] = deque(maxlen=8)
+        """The last frames that could be read; an older one is never a reference."""
+        # in the order of sending: particles, shown at their own frame alone, are there before the time moves on
+        self._archetypes: dict[str, Any] = {
+            "search/particles": rr.Points3D,
+            "world/camera": rr.Transform3D,
+            "world/camera/image": rr.EncodedImage,
+            "world/camera/cloud": rr.Points3D,
+            "world/estimate": rr.LineStrips3D,
+            "world/truth": rr.LineStrips3D,
+            "curves/rmse": rr.Scalars,
+            "curves/distance_error": rr.Scalars,
+            **{f"images/{name}": rr.EncodedImage for name in IMAGES},
+            "search/bounds": rr.Boxes3D,
+            "search/error": rr.Arrows3D,
+            "search/truth": rr.LineStrips3D,
+            "state": rr.TextDocument,
+        }
+        self._waiting: dict[str, list[Rows]] = {path: [] for path in self._archetypes}
+        self._send_static()
+
+    def add(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...]) -> None:
+        """Add one frame to what is to be sent."""
+        self._frame = 0 if step is None else step.index
+        world_T_camera = np.eye(4) if step is None else step.world_T_camera
+        truth = self._truth.at(self._frame, world_T_camera)
+        shown = None if frame is None else self._shrunk(frame)
+        if shown is not None:
+            self._add_camera(world_T_camera, shown)
+        if step is not None:
+            self._add_trajectory(world_T_camera, truth)
+            self._add_images(shown, step)
+        generations = 0
+        if step is not None and populations:
+            search = [level for level in map(level_of, populations) if level is not None]
+            generations = self._add_search(search, self._truth.motion(step))
+        self._generation += max(generations, 1)
+        self._world_T_camera, self._last_truth = world_T_camera, truth
+        if shown is not None:
+            self._shown.append(shown)
+
+    def send(self) -> None:
+        """Send what was added since the last time, each entity's in one call."""
+        import rerun as rr
+
+        for path, rows in self._waiting.items():
+            if not rows:
+                continue
+            frames = np.repeat([part.frame for part in rows], [len(part.generations) for part in rows])
+            times = [
+                rr.TimeColumn("frame", sequence=frames),
+                rr.TimeColumn("generation", sequence=sum((part.generations for part in rows), [])),
+            ]
+            values = {name: _joined([part.values[name] for part in rows]) for name in rows[0].values}
+            columns = self._archetypes[path].columns(**values)
+            self._stream.send_columns(path, times, columns.partition(sum((part.sizes for part in rows), [])))
+            rows.clear()
+
+    def _add(self, path: str, generations: list[int] | None = None, sizes: list[int] | None = None, **values: Any):
+        """Add rows of an entity, one or one for each of some generations, each of one instance or of `sizes`."""
+        generations = [self._generation] if generations is None else generations
+        sizes = [1] * len(generations) if sizes is None else sizes
+        self._waiting[path].append(Rows(generations, sizes, values, self._frame))
+
+    def _send_static(self) -> None:
+        """Send what stays as it is, among it the looks of what does not."""
+        import rerun as rr
+
+        camera, points = self._camera, rr.Radius.ui_points
+        pinhole = rr.Pinhole(
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + 0.5, camera.cy + 0.5],
+            resolution=[camera.width, camera.height],
+            image_plane_distance=0.4,
+        )
+        last = rr.Points3D([[0, 0, 0]], radii=points(5), colors=[WHITE], labels=["last camera"], show_labels=False)
+        jpeg = rr.EncodedImage.from_fields(media_type="image/jpeg")
+        looks = {
+            "world": [rr.ViewCoordinates.RDF],
+            "search": [rr.ViewCoordinates.RDF],
+            "world/camera/image": [pinhole, jpeg],
+            "world/camera/cloud": [rr.Points3D.from_fields(radii=points(1.5))],
+            "world/estimate": [rr.LineStrips3D.from_fields(colors=[BLUE], radii=points(2))],
+            "world/truth": [rr.LineStrips3D.from_fields(colors=[WHITE], radii=points(2))],
+            "curves/rmse": [rr.SeriesLines(colors=[BLUE], widths=[2], names=["RMSE of the pair"])],
+            "curves/distance_error": [rr.SeriesLines(colors=[VERMILION], widths=[2], names=["distance error"])],
+            **{f"images/{name}": [jpeg] for name in IMAGES},
+            "search/particles": [rr.Points3D.from_fields(radii=points(2.5))],
+            "search/bounds": [rr.Boxes3D.from_fields(colors=[GREY])],
+            "search/error": [rr.Arrows3D.from_fields(colors=[VERMILION], radii=points(1.5))],
+            "search/truth": [rr.LineStrips3D.from_fields(colors=[GREEN], radii=points(2))],
+            "search/last_camera": [last],
+            "state": [rr.TextDocument.from_fields(media_type="text/markdown")],
+        }
+        for path, archetypes in looks.items():
+            self._stream.log(path, *archetypes, static=True)
+
+    def _shrunk(self, frame: Frame) -> Shown:
+        size, k = (self._camera.width, self._camera.height), self._shrink
+        grey = np.asarray(frame.grey)
+        if k > 1:
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        raw = np.asarray(frame.depth)[k // 2 :: k, k // 2 :: k][: size[1], : size[0]]
+        return Shown(
+            frame.timestamp, grey, raw.astype(np.float32) * np.float32(1 / self._depth_scale), encode_jpeg(grey)
+        )
+
+    def _add_camera(self, world_T_camera: Float64[np.ndarray, "4 4"], shown: Shown) -> None:
+        self._add("world/camera", translation=world_T_camera[None, :3, 3], mat3x3=world_T_camera[None, :3, :3])
+        self._add("world/camera/image", blob=[shown.jpeg])
+        self._add("images/target", blob=[shown.jpeg])
+        depth = shown.depth[self._cloud]
+        seen = depth > 0
+        points = self._rays[seen] * depth[seen][:, None]
+        grey = shown.grey[self._cloud][seen]
+        self._add("world/camera/cloud", sizes=[len(points)], positions=points, colors=GREYS[grey])
+
+    def _add_trajectory(
+        self, world_T_camera: Float64[np.ndarray, "4 4"], truth: Float64[np.ndarray, "4 4"] | None
+    ) -> None:
+        """Add this frame's piece of either path; the view gathers the pieces."""
+        for path, start, end in (
+            ("world/estimate", self._world_T_camera, world_T_camera),
+            ("world/truth", self._last_truth, truth),
+        ):
+            if start is not None and end is not None:
+                self._add(path, strips=np.stack([start[:3, 3], end[:3, 3]])[None])
+        if truth is not None:
+            error = float(np.linalg.norm(world_T_camera[:3, 3] - truth[:3, 3]))
+            self._add("curves/distance_error", scalars=[error])
+
+    def _add_images(self, shown: Shown | None, step: Step) -> None:
+        if np.isfinite(step.alignment.error):
+            self._add("curves/rmse", scalars=[float(np.sqrt(step.alignment.error))])
+        reference = next((s for s in reversed(self._shown) if s.timestamp == step.reference_timestamp), None)
+        if shown is None or reference is None:
+            return
+        warped, seen = warp_target(reference, shown, np.asarray(step.alignment.target_T_reference), self._camera)
+        self._add("images/reference", blob=[reference.jpeg])
+        self._add("images/warped", blob=[encode_jpeg(warped)])
+        self._add("images/residual", blob=[encode_jpeg(color_residual(warped, reference.grey, seen))])
+
+    def _add_search(self, search: list[Level], motion: Float64[np.ndarray, "4 4"] | None) -> int:
+        """Add every generation of a frame; return how many there are."""
+        if not search:
+            return 0
+        sizes = [level.positions.shape[1] for level in search for _ in level.texts]
+        count = len(sizes)
+        generations = list(range(self._generation, self._generation + count))
+        positions = np.concatenate([level.positions.reshape(-1, 3) for level in search])
+        colors = np.concatenate([level.colors.ravel() for level in search])
+        self._add("search/particles", generations, sizes, positions=positions, colors=colors)
+        self._add("state", generations, text=[text for level in search for text in level.texts])
+        starts = np.cumsum([0, *(len(level.texts) for level in search[:-1])]) + self._generation
+        self._add(
+            "search/bounds",
+            starts.tolist(),
+            centers=np.stack([level.centre for level in search]),
+            half_sizes=np.stack([level.half_sizes for level in search]),
+        )
+        if motion is None:
+            return count
+        true = motion[:3, 3] * MILLIMETRES
+        best = np.concatenate([level.positions[:, 0] for level in search])
+        arrows = true - best
+        labels = [f"error {error:.1f} mm" for error in np.linalg.norm(arrows, axis=1)]
+        self._add("search/error", generations, origins=best, vectors=arrows, labels=labels)
+        strips = star_strips(true, max(0.05 * float(np.linalg.norm(true)), 0.5))
+        self._add("search/truth", sizes=[len(strips)], strips=strips)
+        return count
+
+
+def _joined(parts: list[Any]) -> Any:
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else sum(parts, [])
+
+
+class Truth:
+    """Where the camera was, in the estimate's world: the first pose that is known is laid on the estimate's."""
+
+    def __init__(self, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
+        self._stamps = stamps
+        self._truth_T_camera = np.zeros((len(self._stamps), 4, 4))
+        self._known = np.zeros(len(self._stamps), bool)
+        if truth is not None:
+            self._truth_T_camera, self._known = truth.interpolate(stamps)
+        self._world_T_truth: Float64[np.ndarray, "4 4"] | None = None
+
+    def at(self, index: int, world_T_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:
+        """Return the true world_T_camera of a frame, None where it is not known."""
+        if not self._known[index]:
+            return None
+        if self._world_T_truth is None:
+            self._world_T_truth = world_T_camera @ inverse(self._truth_T_camera[index])
+        return self._world_T_truth @ self._truth_T_camera[index]
+
+    def motion(self, step: Step) -> Float64[np.ndarray, "4 4"] | None:
+        """Return the true reference_T_target of a step, None where it is not known."""
+        reference = min(int(np.searchsorted(self._stamps, step.reference_timestamp)), len(self._stamps) - 1)
+        if not (self._known[reference] and self._known[step.index]):
+            return None
+        return inverse(self._truth_T_camera[reference]) @ self._truth_T_camera[step.index]

@@ -1,0 +1,411 @@
+"""The command `gavo`, in process: files, exit statuses, refusals."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+import pytest
+
+from gavo_jax.camera import Camera
+from gavo_jax.cli import main, options
+from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
+from gavo_jax.evaluation import relative_pose_error
+from gavo_jax.output import tracked
+from gavo_jax.output.frames import FRAME_COLUMNS
+from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.trajectory import Trajectory
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_translation_rmse_m_per_s
+rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
+compile_seconds milliseconds_per_pair_median frames_per_second""".split()
+FAST = ("--method", "gauss-newton")
+
+
+class Done(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def gavo(capsys, monkeypatch, tmp_path):
+    """Run the command in a folder of its own and return status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: Any) -> Done:
+        status = main([str(argument) for argument in arguments])
+        return Done(status, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def pristine(tmp_path_factory) -> Path:
+    """Thirty-six frames of 160×120 pixels over 1.2 s: no test changes them."""
+    folder = tmp_path_factory.mktemp("clips") / "clip"
+    write_tum(SyntheticSequence(frames=36, noise=KINECT, camera=CAMERA), folder)
+    return folder
+
+
+@pytest.fixture
+def clip(pristine, tmp_path) -> Path:
+    """The first six frames, to be damaged."""
+    folder = tmp_path / "clip"
+    for part in ("rgb", "depth"):
+        (folder / part).mkdir(parents=True)
+        rows = (pristine / f"{part}.txt").read_text().splitlines()[:7]
+        (folder / f"{part}.txt").write_text("\n".join(rows) + "\n")
+        for row in rows[1:]:
+            shutil.copy(pristine / row.split()[1], folder / row.split()[1])
+    for name in ("groundtruth.txt", "camera.toml"):
+        shutil.copy(pristine / name, folder / name)
+    return folder
+
+
+def images(folder: Path, part: str) -> list[Path]:
+    return [folder / row.split()[1] for row in (folder / f"{part}.txt").read_text().splitlines()[1:]]
+
+
+def read_json(path: Path) -> Any:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def read_rows(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "frames.csv").read_text().splitlines()))
+
+
+def is_refused(done: Done, *words: str) -> bool:
+    """Status 2, nothing on standard output, one line on standard error that holds every word."""
+    return done.status == 2 and not done.out and done.err.count("\n") == 1 and all(word in done.err for word in words)
+
+
+def test_run_writes_its_files(gavo, pristine, tmp_path):
+    camera = ("--camera", pristine / "camera.toml")
+    done = gavo("run", pristine, *camera, "--seed", 3, "--output", tmp_path / "out", *FAST)
+    assert done.status == 0, done.err
+    out = tmp_path / "out"
+    metrics = read_json(out / "metrics.json")
+    assert set(METRICS) <= set(metrics)
+    assert [metrics[key] for key in ("sequence", "method", "seed", "frames", "pairs")] == [
+        "clip",
+        "gauss-newton",
+        3,
+        36,
+        35,
+    ]
+    assert metrics["lost_pairs"] == 0 and metrics["complete"] and metrics["rpe_translation_rmse_m_per_s"] < 0.1
+    estimate, truth = Trajectory.read_tum(out / "trajectory.txt"), Trajectory.read_tum(pristine / "groundtruth.txt")
+    assert len(estimate) == 36 and np.array_equal(estimate.world_T_camera[0], np.eye(4))
+    assert relative_pose_error(estimate, truth).translation.rmse == pytest.approx(
+        metrics["rpe_translation_rmse_m_per_s"], rel=1e-12
+    )
+    rows = read_rows(out)
+    assert tuple(rows[0]) == FRAME_COLUMNS and len(rows) == 35
+    assert all(float(row[f"std_{axis}"]) > 0 for row in rows for axis in ("vx", "vy", "vz", "wx", "wy", "wz"))
+    config = read_json(out / "config.json")
+    assert config["solver"]["type"] == "GaussNewton" and config["options"]["seed"] == 3
+    assert {"gavo-jax", "jax", "numpy", "opencv", "python"} <= set(config["versions"])
+    for name in ("trajectory", "distance_error", "convergence", "landscape"):
+        assert (out / f"{name}.png").stat().st_size and (out / f"{name}.svg").stat().st_size
+
+    evaluated = gavo("evaluate", out / "trajectory.txt", pristine / "groundtruth.txt")
+    assert evaluated.status == 0 and f"{metrics['rpe_translation_rmse_m_per_s']:.6f}" in evaluated.out
+
+
+def test_same_seed_same_bytes_and_default_folder(gavo, clip, tmp_path):
+    arguments = ("run", "clip", "--camera", clip / "camera.toml", *FAST, "--frames", 3, "--seed", 7)
+    assert gavo(*arguments).status == 0
+    assert gavo(*arguments, "--output", "again").status == 0
+    first = tmp_path / "runs" / "clip-gauss-newton-default" / "trajectory.txt"
+    assert first.read_bytes() == (tmp_path / "again" / "trajectory.txt").read_bytes()
+
+
+def test_range_of_frames(gavo, clip, tmp_path):
+    camera = ("--camera", clip / "camera.toml")
+    done = gavo("run", clip, *camera, *FAST, "--start", 1, "--stride", 2, "--frames", 2, "--output", tmp_path / "out")
+    assert done.status == 0, done.err
+    stamps = [float(image.stem) for image in images(clip, "rgb")]
+    assert Trajectory.read_tum(tmp_path / "out" / "trajectory.txt").timestamps.tolist() == [stamps[1], stamps[3]]
+
+
+def test_without_ground_truth_errors_are_null(gavo, clip, tmp_path):
+    (clip / "groundtruth.txt").unlink()
+    done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert done.status == 0, done.err
+    metrics = read_json(tmp_path / "out" / "metrics.json")
+    assert metrics["rpe_translation_rmse_m_per_s"] is None and metrics["ate_translation_rmse_m"] is None
+    assert (tmp_path / "out" / "trajectory.png").exists()
+    assert not (tmp_path / "out" / "distance_error.png").exists()
+
+
+def test_torn_frame_is_flagged_and_the_run_goes_on(gavo, clip, tmp_path):
+    torn = images(clip, "rgb")[2]
+    torn.write_bytes(torn.read_bytes()[:3000])
+    arguments = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert gavo(*arguments).status == 0
+    metrics = read_json(tmp_path / "out" / "metrics.json")
+    rows = read_rows(tmp_path / "out")
+    assert metrics["frames"] == 6 and metrics["lost_pairs"] == sum(int(row["lost"]) for row in rows) >= 1
+    assert [row["status"] for row in rows].count("unreadable") == 1 and len(rows) == 5
+    assert all(row["on_lost"] == ("hold" if row["lost"] == "1" else "") for row in rows)
+    assert metrics["statuses"]["unreadable"] == 1 and sum(metrics["statuses"].values()) == 5
+    assert gavo(*arguments, "--strict").status == 3
+
+
+def test_equal_stamps_are_flagged_and_have_no_pose(gavo, pristine, tmp_path):
+    clip = tmp_path / "clip"
+    shutil.copytree(pristine, clip)
+    rows = (clip / "rgb.txt").read_text().splitlines()
+    rows[8] = f"{rows[7].split()[0]} {rows[8].split()[1]}"
+    (clip / "rgb.txt").write_text("\n".join(rows) + "\n")
+    done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--frames", 14, "--output", tmp_path / "out")
+    assert done.status == 0 and "bad_timestamp" in done.out
+    table = read_rows(tmp_path / "out")
+    assert [row["index"] for row in table if row["status"] == "bad_timestamp"] == ["6", "7"]
+    assert [row["status"] for row in table].count("ok") >= 10
+    stamps = Trajectory.read_tum(tmp_path / "out" / "trajectory.txt").timestamps
+    assert len(stamps) == 12 and np.all(np.diff(stamps) > 0)
+    assert read_json(tmp_path / "out" / "metrics.json")["frames"] == 14
+
+
+def test_interrupted_run_keeps_what_is_done(gavo, clip, tmp_path, monkeypatch):
+    track = tracked.track
+
+    def interrupted(*arguments: Any, **settings: Any) -> Any:
+        for i, step in enumerate(track(*arguments, **settings)):
+            if i == 2:
+                raise KeyboardInterrupt
+            yield step
+
+    monkeypatch.setattr(tracked, "track", interrupted)
+    done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert done.status == 130 and "Traceback" not in done.err
+    metrics = read_json(tmp_path / "out" / "metrics.json")
+    assert metrics["frames"] == 3 and metrics["complete"] is False
+    assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.txt")) == 3
+
+
+def test_a_run_that_dies_leaves_nothing_that_looks_whole(gavo, clip, tmp_path, monkeypatch):
+    arguments = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert gavo(*arguments).status == 0
+
+    def dies(*arguments: Any, **settings: Any) -> Any:
+        raise RuntimeError("power")
+
+    monkeypatch.setattr(tracked, "track", dies)
+    with pytest.raises(RuntimeError, match="power"):
+        gavo(*arguments)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "frames.csv", "trajectory.txt"]
+
+
+def test_refused_run_leaves_an_earlier_one_alone(gavo, clip, tmp_path):
+    arguments = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert gavo(*arguments).status == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    images(clip, "rgb")[3].unlink()
+    assert is_refused(gavo(*arguments), "missing")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+
+
+def write(name: str, text: str) -> Any:
+    return lambda clip: (clip / name).write_text(text)
+
+
+def replace_image(part: str, index: int, content: Any) -> Any:
+    def damage(clip: Path) -> None:
+        path = images(clip, part)[index]
+        path.unlink() if content is None else path.write_bytes(content(clip))
+
+    return damage
+
+
+DAMAGES = {
+    "missing folder": (shutil.rmtree, ["clip", "no such folder"]),
+    "no rgb.txt": (lambda clip: (clip / "rgb.txt").unlink(), ["rgb.txt"]),
+    "no depth.txt": (lambda clip: (clip / "depth.txt").unlink(), ["depth.txt"]),
+    "empty list": (write("rgb.txt", "# nothing\n"), ["rgb.txt"]),
+    "malformed line": (write("depth.txt", "not a line at all\n"), ["depth.txt:1"]),
+    "path leaves the folder": (write("rgb.txt", "0.0 ../../etc/passwd\n"), ["rgb.txt:1"]),
+    "missing image": (replace_image("depth", 1, None), ["depth/", "missing"]),
+    "first frame is no image": (replace_image("rgb", 0, lambda clip: b"hello"), ["rgb/"]),
+    "first depth of 8 bits": (
+        replace_image("depth", 0, lambda clip: images(clip, "rgb")[0].read_bytes()),
+        ["depth/", "16 bits"],
+    ),
+    "nothing associates": (write("depth.txt", "99.0 depth/0.000000.png\n"), ["rgb.txt", "depth.txt"]),
+    "empty ground truth": (write("groundtruth.txt", ""), ["groundtruth.txt"]),
+    "ground truth of NaN": (write("groundtruth.txt", "nan nan nan nan nan nan nan nan\n"), ["groundtruth.txt:1"]),
+    "camera of another size": (lambda clip: None, ["160x120", "640x480"]),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_sequence_is_refused(gavo, clip, tmp_path, name):
+    camera = tmp_path / "camera.toml"
+    shutil.copy(clip / "camera.toml", camera)
+    damage, words = DAMAGES[name]
+    damage(clip)
+    done = gavo("run", clip, "--camera", "fr1" if "another size" in name else camera, "--output", tmp_path / "out")
+    assert is_refused(done, *words), done
+    assert not (tmp_path / "out").exists()
+
+
+BAD_OPTIONS = {
+    "no method": (["--method", "nonsense"], ["--method", "gauss-newton"]),
+    "no preset": (["--preset", "nonsense"], ["--preset"]),
+    "no camera": (["--camera", "nonsense"], ["nonsense", "fr1"]),
+    "no camera file": (["--camera", "nonsense.toml"], ["nonsense.toml"]),
+    "camera by name of folder": (["--camera", "auto"], ["clip", "--camera"]),
+    "one frame": (["--frames", "1"], ["--frames"]),
+    "no frames": (["--frames", "0"], ["--frames"]),
+    "text for frames": (["--frames", "many"], ["--frames"]),
+    "start after the end": (["--start", "6"], ["clip", "start"]),
+    "one frame left": (["--start", "5"], ["clip", "start"]),
+    "negative start": (["--start", "-1"], ["--start"]),
+    "no stride": (["--stride", "0"], ["--stride"]),
+    "negative seed": (["--seed", "-1"], ["--seed"]),
+    "unknown option": (["--nonsense"], ["--nonsense"]),
+    "output is a file": (["--output", "clip/rgb.txt"], ["clip/rgb.txt"]),
+    "output below a file": (["--output", "clip/rgb.txt/out"], ["clip/rgb.txt/out"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OPTIONS)
+def test_bad_option_is_refused(gavo, clip, name):
+    bad, words = BAD_OPTIONS[name]
+    camera = [] if "--camera" in bad else ["--camera", clip / "camera.toml"]
+    assert is_refused(gavo("run", "clip", *camera, *bad), *words)
+
+
+@pytest.mark.parametrize("arguments", [(), ("nonsense",), ("align", "a.png"), ("evaluate", "one.txt")], ids=str)
+def test_usage_error_is_one_line(gavo, arguments):
+    assert is_refused(gavo(*arguments), "--help")
+
+
+def test_align_prints_json(gavo, clip):
+    rgb, depth = images(clip, "rgb"), images(clip, "depth")
+    done = gavo("align", rgb[0], depth[0], rgb[2], depth[2], "--camera", clip / "camera.toml", *FAST)
+    assert done.status == 0, done.err
+    answer = json.loads(done.out)
+    target_T_reference, covariance = np.array(answer["target_T_reference"]), np.array(answer["covariance"])
+    assert target_T_reference.shape == (4, 4) and len(answer["xi"]) == 6 and answer["status"] == "ok"
+    assert covariance.shape == (6, 6) and np.array_equal(covariance, covariance.T)
+    truth = Trajectory.read_tum(clip / "groundtruth.txt").world_T_camera
+    reference_T_target = np.linalg.inv(truth[0]) @ truth[2]
+    assert np.linalg.norm((reference_T_target @ target_T_reference)[:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize("role", range(4))
+@pytest.mark.parametrize("fault", ["missing", "text", "other kind", "folder"])
+def test_align_refuses_a_bad_image(gavo, clip, role, fault):
+    rgb, depth = images(clip, "rgb"), images(clip, "depth")
+    files = [rgb[0], depth[0], rgb[1], depth[1]]
+    text = clip / "text.png"
+    text.write_text("hello")
+    bad = {"missing": clip / "none.png", "text": text, "other kind": files[role ^ 1], "folder": clip}[fault]
+    files[role] = bad
+    assert is_refused(gavo("align", *files, "--camera", clip / "camera.toml"), str(bad))
+
+
+def test_align_takes_the_camera_from_the_folder(gavo, clip):
+    rgb, depth = images(clip, "rgb")[0], images(clip, "depth")[0]
+    assert is_refused(gavo("align", rgb, depth, rgb, depth), "clip", "--camera")
+
+
+def test_evaluate_refuses(gavo, clip):
+    truth = clip / "groundtruth.txt"
+    assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "delta")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100")
+
+
+def test_compare(gavo, pristine, tmp_path):
+    arguments = ("compare", pristine, "--camera", pristine / "camera.toml", "--output", tmp_path / "out")
+    done = gavo(*arguments, "--methods", "gauss-newton,opencv-rgb", "--frames", 34)
+    assert done.status == 0, done.err
+    assert "gauss-newton" in done.out and "opencv-rgb" in done.out
+    table = read_json(tmp_path / "out" / "comparison.json")
+    assert [row["method"] for row in table] == ["gauss-newton", "opencv-rgb"]
+    assert all(set(METRICS) <= set(row) and row["frames"] == 34 for row in table)
+    assert table[0]["rpe_translation_rmse_m_per_s"] < 0.1 and table[1]["rpe_translation_rmse_m_per_s"] < 0.5
+    figures = ("trajectory", "distance_error", "drift")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "comparison.json",
+        "report.html",
+        "gauss-newton.txt",
+        "opencv-rgb.txt",
+        *(f"{name}.{suffix}" for name in figures for suffix in ("png", "svg")),
+    }
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert f"<td>{table[1]['rpe_translation_rmse_m_per_s']:.4f}</td>" in report and report.count("<img") == 3
+
+
+def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ("run", "clip", "--camera", "clip/camera.toml", *FAST, "--output", "out", "--viewer", "save")
+    done = gavo(*arguments)
+    assert done.status == 0, done.err
+    assert (tmp_path / "out" / "run.rrd").stat().st_size and (tmp_path / "out" / "population.svg").exists()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    done = gavo("view", "../out", "--viewer", "save")
+    assert done.status == 0 and not done.err, done
+    whole = (tmp_path / "out" / "view.rrd").stat().st_size
+    shutil.rmtree(clip)
+    done = gavo("view", "../out", "--viewer", "save")
+    assert done.status == 0 and done.err.count("\n") == 1 and "no such folder" in done.err
+    assert 0 < (tmp_path / "out" / "view.rrd").stat().st_size < whole / 2
+
+
+@pytest.mark.parametrize("fault", ["frames.csv", "trajectory.txt", "config.json"])
+def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
+    assert gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", "out").status == 0
+    path = tmp_path / "out" / fault
+    path.write_text("index\n7\n" if fault == "frames.csv" else "{")
+    assert is_refused(gavo("view", "out", "--viewer", "save"), fault)
+    path.unlink()
+    assert is_refused(gavo("view", "out", "--viewer", "save"), fault, "no such file")
+    assert not (tmp_path / "out" / "view.rrd").exists()
+
+
+@pytest.mark.parametrize("methods", ["nonsense", "", "ga,,pso", "ga,ga"])
+def test_compare_refuses_methods(gavo, clip, methods):
+    assert is_refused(gavo("compare", clip, "--camera", clip / "camera.toml", "--methods", methods), "--methods")
+
+
+def test_names_of_options_are_those_of_the_presets():
+    shown = options.Method.__metadata__[0].metavar  # pyright: ignore[reportAttributeAccessIssue]
+    assert shown == "{" + ",".join(METHODS) + ",…}"
+    assert get_args(options.PresetName) == PRESETS
+
+
+def test_help_and_version(gavo):
+    assert "compare" in gavo("--help").out
+    assert "--on-lost" in gavo("run", "--help").out
+    assert gavo("--version").out.startswith("gavo-jax ")
+
+
+def test_module_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "gavo_jax", "run", "nowhere", "--camera", "fr1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert is_refused(Done(done.returncode, done.stdout, done.stderr), "nowhere")
+
+
+def test_real_clip(gavo, data_dir, tmp_path):
+    """By its name the folder brings its camera; the drift over the first second is that of a working odometry."""
+    done = gavo("run", data_dir / "fr1_xyz", *FAST, "--frames", 34, "--output", tmp_path / "out")
+    assert done.status == 0, done.err
+    assert read_json(tmp_path / "out" / "metrics.json")["rpe_translation_rmse_m_per_s"] < 0.05

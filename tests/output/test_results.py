@@ -1,0 +1,94 @@
+"""The files of a run, while it goes on and after."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry.driver import Step
+from gavo_jax.output.files import describe, prepare_folder, write_json
+from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
+from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.status import AlignmentStatus
+
+
+@dataclass(frozen=True)
+class Settings:
+    rate: float
+    sizes: tuple[int, ...]
+
+
+def step(covariance: float = 4.0) -> Step:
+    alignment = Alignment(
+        target_T_reference=np.eye(4, dtype=np.float32),  # pyright: ignore[reportArgumentType]
+        xi=np.zeros(6, np.float32),  # pyright: ignore[reportArgumentType]
+        error=np.float32(0.1),  # pyright: ignore[reportArgumentType]
+        overlap=np.float32(1.0),  # pyright: ignore[reportArgumentType]
+        covariance=np.eye(6, dtype=np.float32) * covariance,  # pyright: ignore[reportArgumentType]
+        status=AlignmentStatus.LOW_TEXTURE,
+        history=np.zeros(0, np.float32),  # pyright: ignore[reportArgumentType]
+    )
+    return Step(1, 100.0, 100.033333, alignment, np.eye(4), 12.5, True)
+
+
+def test_row_of_a_pair():
+    row = dict(zip(FRAME_COLUMNS, frame_row(step()), strict=True))
+    assert row["status"] == "low_texture" and row["lost"] == 1 and row["index"] == 1
+    assert row["timestamp"] == "100.033333" and np.float32(row["error"]) == np.float32(0.1)
+    assert [float(row[f"std_{axis}"]) for axis in ("vx", "vy", "vz", "wx", "wy", "wz")] == [2.0] * 6
+
+
+@pytest.mark.parametrize("covariance, deviation", [(math.nan, math.isnan), (-1.0, lambda value: value == 0)])
+def test_deviation_of_a_useless_covariance(covariance, deviation):
+    row = dict(zip(FRAME_COLUMNS, frame_row(step(covariance)), strict=True))
+    assert deviation(float(row["std_vx"]))
+
+
+def test_rows_are_on_disk_as_soon_as_added(tmp_path):
+    with RunFolder(tmp_path / "run") as folder:
+        folder.start({}, 99.0)
+        folder.add(step())
+        assert len((folder.path / "trajectory.txt").read_text().splitlines()) == 3
+        assert len((folder.path / "frames.csv").read_text().splitlines()) == 2
+        assert not (folder.path / "metrics.json").exists()
+
+
+def test_describe_is_strict_json():
+    value = {
+        "settings": Settings(0.5, (1, 2)),
+        "nan": math.nan,
+        "array": np.array([[1.0, math.inf]], np.float32),
+        "status": AlignmentStatus.OK,
+        "path": Path("a") / "b",
+        "function": math.sqrt,
+        "flag": True,
+    }
+    assert json.loads(json.dumps(describe(value), allow_nan=False)) == {
+        "settings": {"type": "Settings", "rate": 0.5, "sizes": [1, 2]},
+        "nan": None,
+        "array": [[1.0, None]],
+        "status": "ok",
+        "path": str(Path("a") / "b"),
+        "function": "sqrt",
+        "flag": True,
+    }
+
+
+def test_json_is_whole_or_absent(tmp_path):
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(GavoError, match="taken"):
+        write_json(tmp_path / "taken", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_prepared_folder(tmp_path):
+    assert prepare_folder(tmp_path / "a" / "b").is_dir()
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(GavoError, match="file"):
+            prepare_folder(path)

@@ -1,0 +1,247 @@
+"""The viewer: what it saves is read back with Rerun's own reader and compared with the run."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from gavo_jax.alignment.search import Population
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
+from gavo_jax.solvers.genetic import GeneticAlgorithm
+from gavo_jax.viewer import colors, live, pictures, search_space
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+SOLVER = GeneticAlgorithm(population=(0, 0, 0, 8, 12), iterations=(0, 0, 0, 2, 3))
+SEARCH_ALONE = AlignmentOptions(last_step=False)
+"""So that a pair's result is the best of the candidates that are shown."""
+PLAIN = OdometryOptions(recover=False)
+"""So few candidates find little: no second search is the subject here."""
+SETTINGS = Settings(SOLVER, SEARCH_ALONE, PLAIN)
+FRAMES, GENERATIONS, PARTICLES = 4, 2 + 3, (12, 12, 12, 8, 8)
+ENTITIES_OF_A_PAIR = (
+    "/curves/rmse",
+    "/curves/distance_error",
+    "/images/reference",
+    "/images/warped",
+    "/images/residual",
+    "/search/truth",
+    "/world/estimate",
+    "/world/truth",
+)
+ENTITIES_OF_A_FRAME = ("/images/target", "/world/camera", "/world/camera/cloud", "/world/camera/image")
+ENTITIES_OF_A_GENERATION = ("/search/error", "/search/particles", "/state")
+LEVELS = 2
+
+
+def read_recording(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """Rows of every entity that change with time: values by the name of time line or component."""
+    from rerun.chunk import RrdReader
+
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static and not chunk.entity_path.startswith("/__"):
+            batch = chunk.to_record_batch().to_pylist()
+            rows.setdefault(chunk.entity_path, []).extend(batch)
+    return rows
+
+
+def component(row: dict[str, Any], name: str) -> Any:
+    [value] = [value for key, value in row.items() if key.endswith(f":{name}")]
+    return value
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Save a short run; return its steps, its sequence and the rows of the recording."""
+    path = tmp_path_factory.mktemp("viewer") / "run.rrd"
+    sequence = SyntheticSequence(frames=FRAMES, camera=CAMERA)
+    shown = live.make_viewer("save", path)
+    odometry = Odometry(sequence.camera, SETTINGS, record=shown.wants_populations)
+    with shown:
+        shown.open("a run", sequence.camera, sequence.timestamps, sequence.ground_truth)
+        steps = list(
+            track(
+                sequence,
+                odometry=odometry,
+                watch=lambda frame, step: shown.watch(frame, step, odometry.candidates),
+            )
+        )
+    return steps, sequence, path
+
+
+@pytest.fixture(scope="module")
+def rows(run):
+    return read_recording(run[2])
+
+
+def test_every_entity_has_its_rows(rows):
+    pairs = FRAMES - 1
+    expected = {
+        **dict.fromkeys(ENTITIES_OF_A_FRAME, FRAMES),
+        **dict.fromkeys(ENTITIES_OF_A_PAIR, pairs),
+        **dict.fromkeys(ENTITIES_OF_A_GENERATION, pairs * GENERATIONS),
+        "/search/bounds": pairs * LEVELS,
+    }
+    assert {path: len(own) for path, own in rows.items()} == expected
+
+
+def test_both_time_lines_count_on(rows):
+    for path, own in rows.items():
+        assert {"frame", "generation"} <= set(own[0]) and not {"log_time", "log_tick"} & set(own[0]), path
+    particles = sorted(rows["/search/particles"], key=lambda row: row["generation"])
+    assert [row["generation"] for row in particles] == list(range(1, 1 + (FRAMES - 1) * GENERATIONS))
+    assert [row["frame"] for row in particles] == [i for i in range(1, FRAMES) for _ in range(GENERATIONS)]
+    starts = [row["generation"] for row in rows["/curves/rmse"]]
+    assert sorted(starts) == [1 + i * GENERATIONS for i in range(FRAMES - 1)]
+
+
+def test_particles_curves_and_path_are_those_of_the_run(run, rows):
+    steps, sequence, _ = run
+    particles = sorted(rows["/search/particles"], key=lambda row: row["generation"])
+    assert [len(component(row, "positions")) for row in particles] == list(PARTICLES) * (FRAMES - 1)
+    for step in steps:
+        found = np.linalg.inv(np.asarray(step.alignment.target_T_reference, np.float64))[:3, 3] * 1e3
+        last = component(particles[step.index * GENERATIONS - 1], "positions")[0]
+        assert np.allclose(last, found, atol=0.01)
+        [rmse] = [row for row in rows["/curves/rmse"] if row["frame"] == step.index]
+        assert component(rmse, "scalars")[0] == pytest.approx(float(np.sqrt(step.alignment.error)))
+        [piece] = [row for row in rows["/world/estimate"] if row["frame"] == step.index]
+        assert np.allclose(component(piece, "strips")[0][1], step.world_T_camera[:3, 3], atol=1e-6)
+    texts = [component(row, "text")[0] for row in sorted(rows["/state"], key=lambda row: row["generation"])]
+    assert "| 12 | 4 | 1/16 | 1 of 3 |" in texts[0] and "| 8 | 3 | 1/8 | 2 of 2 |" in texts[GENERATIONS - 1]
+    errors = [component(row, "scalars")[0] for row in rows["/curves/distance_error"]]
+    assert len(errors) == FRAMES - 1 and max(errors) < 0.05
+
+
+def test_a_frame_is_small(run):
+    assert run[2].stat().st_size / FRAMES < 2**20
+
+
+def test_recording_changes_nothing(run):
+    steps, sequence, _ = run
+    plain = list(track(sequence, odometry=Odometry(sequence.camera, SETTINGS)))
+    assert all(np.array_equal(a.world_T_camera, b.world_T_camera) for a, b in zip(steps, plain, strict=True))
+
+
+def test_a_lost_and_an_unreadable_frame_are_shown_as_far_as_known(run, tmp_path):
+    steps, sequence, _ = run
+    shown = live.make_viewer("save", tmp_path / "lost.rrd")
+    with shown:
+        shown.open("lost", sequence.camera, sequence.timestamps, None)
+        shown.watch(sequence[0], None)
+        shown.watch(None, steps[0])
+        shown.watch(sequence[2], replace(steps[1], reference_timestamp=float(sequence.timestamps[1]), lost=False))
+    found = read_recording(tmp_path / "lost.rrd")
+    assert len(found["/images/target"]) == 2 and len(found["/world/estimate"]) == 2
+    assert "/world/truth" not in found and "/images/warped" not in found
+
+
+def test_generations_are_sorted_coloured_and_thinned():
+    rng = np.random.default_rng(0)
+    error = rng.uniform(4.0, 100.0, (3, 2000)).astype(np.float32)
+    error[0, :5], error[2] = np.inf, np.nan
+    xi = rng.normal(0, 0.01, (3, 2000, 6)).astype(np.float32)
+    population = Population(np.int32(3), xi, error, np.zeros(6), np.full(6, 0.5))  # pyright: ignore[reportArgumentType]
+    level = search_space.level_of(population)
+    assert level is not None and level.positions.shape[0] == len(level.texts) == 2
+    assert level.positions.shape[1] <= search_space.MAX_PARTICLES and np.allclose(level.half_sizes, 500.0)
+    best = xi[1, np.argmin(error[1])]
+    assert np.allclose(level.positions[1, 0], search_space.camera_positions(best[None])[0] * 1e3, atol=1e-3)
+    overall = int(np.argmin(error[:2].min(axis=1)))
+    blue, vermilion = colors.packed(np.array([colors.BLUE, colors.VERMILION], np.uint8))
+    assert level.colors[overall, 0] == blue and level.colors[0, -1] == vermilion
+    assert f"{blue:08x}" == "".join(f"{value:02x}" for value in (*colors.BLUE, 255))
+    assert "| 2000 | 3 |" in level.texts[0] and f"{np.sqrt(error[1].min()):.2f} grey levels" in level.texts[1]
+    assert search_space.level_of(population._replace(error=np.full_like(error, np.inf))) is None  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 2.0])
+def test_camera_position_is_the_inverse_motion(size):
+    xi = size * np.random.default_rng(1).normal(size=(10, 6))
+    with jax.enable_x64(True):
+        expected = np.linalg.inv(np.asarray(exp(xi)))[:, :3, 3]
+    assert np.allclose(search_space.camera_positions(xi), expected, atol=1e-9)
+
+
+def test_warping_back_gives_the_reference():
+    sequence = SyntheticSequence(frames=2, camera=CAMERA)
+    truth = sequence.ground_truth.interpolate(sequence.timestamps)[0]
+    reference, target = (
+        pictures.Shown(frame.timestamp, frame.grey, frame.depth / np.float32(CAMERA.depth_scale), b"")
+        for frame in sequence
+    )
+    warped, seen = pictures.warp_target(reference, target, np.linalg.inv(truth[1]) @ truth[0], CAMERA)
+    still, _ = pictures.warp_target(reference, target, np.eye(4), CAMERA)
+
+    def error(image: np.ndarray) -> float:
+        return float(np.mean(np.abs(image.astype(float) - reference.grey)[seen]))
+
+    assert seen.mean() > 0.7 and error(warped) < 0.5 * error(still)
+    colors = pictures.color_residual(warped, reference.grey, seen)
+    assert not colors[~seen].any()
+
+
+def test_residuals_are_blue_below_and_vermilion_above():
+    bright, dark = np.full((2, 3), 200, np.uint8), np.full((2, 3), 100, np.uint8)
+    seen = np.array([[True, True, False]] * 2)
+    for warped, reference, color in ((bright, dark, colors.VERMILION), (dark, bright, colors.BLUE)):
+        shown = pictures.color_residual(warped, reference, seen)
+        assert np.all(shown[seen] == color[::-1]) and not shown[~seen].any()
+
+
+def test_no_viewer_asks_for_nothing(tmp_path):
+    nothing = live.make_viewer("none", tmp_path / "run.rrd")
+    with nothing:
+        nothing.open("", CAMERA, np.zeros(1), None)
+        nothing.watch(None, None)
+    nothing.stay()
+    assert not nothing.wants_populations and not list(tmp_path.iterdir())
+
+
+def test_missing_package_and_missing_screen_are_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(live.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(GavoError, match="--viewer web"):
+        live.make_viewer("spawn", tmp_path / "run.rrd")
+    monkeypatch.setattr(live.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(GavoError, match=r"pip install 'gavo-jax\[viewer\]'"):
+        live.make_viewer("save", tmp_path / "run.rrd")
+
+
+def test_a_window_that_does_not_open_is_said_in_one_line(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "gavo_jax",
+        "run",
+        "--viewer",
+        "spawn",
+        "--frames",
+        "3",
+        "--method",
+        "gauss-newton",
+    ]
+    outside = {**os.environ, "DISPLAY": ":4711"}
+    outside.pop("WAYLAND_DISPLAY", None)
+    run = subprocess.run(command, cwd=tmp_path, env=outside, capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == 2 and run.stderr.startswith("gavo: --viewer spawn: ") and run.stderr.count("\n") == 1
+
+
+def test_a_fault_in_the_thread_reaches_the_user(tmp_path):
+    shown = live.make_viewer("save", tmp_path / "run.rrd")
+    shown.open("", CAMERA, np.zeros(1), None)
+    shown.watch("no frame", None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="--viewer save"):
+        shown.close()
