@@ -44,6 +44,26 @@ def test_sequence(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(capsys.readouterr().out.splitlines()) == 4 + len(run.metrics)
 
 
+def test_own_dataset(capsys: pytest.CaptureFixture[str]) -> None:
+    module = load("own_dataset")
+    run = module.main(frames=4)
+    truth = SyntheticSequence(frames=4).ground_truth.world_T_camera
+    moved = np.linalg.inv(truth[0]) @ truth[-1]
+    assert np.linalg.norm(run.trajectory.world_T_camera[-1][:3, 3] - moved[:3, 3]) < 0.01
+    assert capsys.readouterr().out == "room: 4 frames, 0 pairs lost\n"
+    short = module.ArraySequence("short", None, np.zeros((2, 4, 4)), np.zeros((1, 4, 4)), np.zeros(2))
+    with pytest.raises(gavo.GavoError, match="differ in length"):
+        gavo.run_odometry(short)
+
+
+def test_live_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    world_T_camera = load("live_frames").main(frames=4)
+    truth = SyntheticSequence(frames=4).ground_truth.world_T_camera
+    moved = np.linalg.inv(truth[0]) @ truth[-1]
+    assert np.linalg.norm(world_T_camera[:3, 3] - moved[:3, 3]) < 0.01
+    assert capsys.readouterr().out.count("The motion was found.") == 3
+
+
 def test_seeds_batch(capsys: pytest.CaptureFixture[str]) -> None:
     errors = load("seeds_batch").main(seeds=4, decays=(0.7, 0.9))
     assert errors.shape == (2, 4)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gavo_jax import alignment as alignment_module
 from gavo_jax import presets
+from gavo_jax.alignment import pairs
 from gavo_jax.alignment.judgement import Evidence, _judge
 from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.result import Alignment
@@ -243,7 +243,7 @@ def test_an_accelerator_aligns_a_batch_in_chunks(
     expected = align_batch(references, targets, sequence.camera, QUICK)
     jax.clear_caches()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(alignment_module, "POINTS_SIDE_BY_SIDE", 2 * 4800 + 1)
+    monkeypatch.setattr(pairs, "POINTS_SIDE_BY_SIDE", 2 * 4800 + 1)
     sizes, plain = [], jax.lax.map
 
     def noted(function: Callable[..., Any], rows: Any, batch_size: int) -> Any:

@@ -1,5 +1,7 @@
 """Equations (3) to (8) and the sampling of packed images, against SciPy and plain formulas."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,13 +51,15 @@ def hat(xi: np.ndarray) -> np.ndarray:
 
 
 jit_exp, jit_log, jit_jacobian = jax.jit(exp), jax.jit(log), jax.jit(right_jacobian)
-jit_warp = jax.jit(warp)
+jit_warp, jit_delay = jax.jit(warp), jax.jit(delay)
 
 
+@partial(jax.jit, static_argnums=(2, 3))
 def words_of(target: Target, warped: Warped, height: int, width: int) -> Words:
     return look_up(target, warped, image_plane(Camera(1.0, 1.0, 0.0, 0.0, width, height)))
 
 
+@jax.jit
 def packed(grey: jax.Array, inverse_depth: jax.Array) -> Target:
     return pack_target(make_atlas([PyramidLevel(grey, inverse_depth)]))
 
@@ -267,19 +271,17 @@ def test_delayed_points_are_where_the_camera_sees_them_when_it_reads_their_row(
     ahead = np.stack([x / q, y / q, 1 / q, np.ones_like(q)])
     points = Points(*map(jnp.asarray, (x, y, q)))
     shutter = Shutter(jnp.float32(readout), jnp.asarray(seen))
-    found = delay(points, warp(points, jit_exp(xi), CAMERA), shutter, CAMERA)
-    for i in range(50):
-        point, v = ahead[:, i], CAMERA.cy
-        for _ in range(30):  # when the point is on the row that is being read
-            motion = scipy.linalg.expm((1 + readout * (row_time(v, CAMERA) - seen[i])) * hat(xi))
-            point = motion @ ahead[:, i]
-            v = CAMERA.fy * point[1] / point[2] + CAMERA.cy
-        u = CAMERA.fx * point[0] / point[2] + CAMERA.cx
-        exact = (u, v, 1 / point[2])
-        at_once = np.array([leaf[i] for leaf in warp(points, jit_exp(xi), CAMERA)[:3]])
-        # what is left is of second order in the motion and in the share of it that passes
-        error = np.abs(np.array([leaf[i] for leaf in found[:3]]) - exact)
-        assert np.all(error <= 0.35 * np.abs(exact - at_once).max() + 2e-3)
+    found = jit_delay(points, jit_warp(points, jit_exp(xi), CAMERA), shutter, CAMERA)
+    v, point = np.full(50, CAMERA.cy), ahead
+    for _ in range(30):  # when each point is on the row that is being read
+        share = 1 + readout * (row_time(v, CAMERA) - seen)
+        point = np.einsum("nij,jn->in", scipy.linalg.expm(share[:, None, None] * hat(xi)), ahead)
+        v = CAMERA.fy * point[1] / point[2] + CAMERA.cy
+    exact = np.stack([CAMERA.fx * point[0] / point[2] + CAMERA.cx, v, 1 / point[2]])
+    at_once = np.stack(jit_warp(points, jit_exp(xi), CAMERA)[:3])
+    # what is left is of second order in the motion and in the share of it that passes
+    error = np.abs(np.stack(found[:3]) - exact)
+    assert np.all(error <= 0.35 * np.abs(exact - at_once).max(axis=0) + 2e-3)
 
 
 def test_slopes_of_delayed_points_are_their_derivatives() -> None:
@@ -353,8 +355,9 @@ def test_synchronised_depth_of_the_room() -> None:
 def test_levels_are_sampled_out_of_one_atlas() -> None:
     camera, rng = Camera(40.0, 41.0, 23.1, 17.2, 45, 35), np.random.default_rng(5)
     grey, depth = rng.uniform(0, 255, (35, 45)), rng.choice([0.0, 1.0, 1.02, 1.7], (35, 45))
-    pyramid, levels = build_pyramid(jnp.asarray(grey), jnp.asarray(depth), 1.0, 4), (3, 2, 0)
-    target = pack_target(make_atlas([pyramid[level] for level in levels]))
+    levels = (3, 2, 0)
+    pyramid = jax.jit(build_pyramid, static_argnums=3)(jnp.asarray(grey), jnp.asarray(depth), 1.0, 4)
+    target = jax.jit(lambda some: pack_target(make_atlas(some)))([pyramid[level] for level in levels])
     planes = Levels.of(camera, levels).planes(camera)
     for i, level in enumerate(levels):
         plane = jax.tree.map(lambda leaf, i=i: leaf[i], planes)
@@ -364,4 +367,4 @@ def test_levels_are_sampled_out_of_one_atlas() -> None:
         v, u = (axis.ravel().astype(np.float32) for axis in np.mgrid[: view.height - 1, : view.width - 1])
         warped = Warped(u, v, np.ones_like(u), np.ones_like(u))
         expected = words_of(alone, warped, view.height, view.width)
-        jax.tree.map(np.testing.assert_array_equal, look_up(target, warped, plane), expected)
+        jax.tree.map(np.testing.assert_array_equal, jax.jit(look_up)(target, warped, plane), expected)
