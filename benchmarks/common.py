@@ -22,6 +22,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS, ROTATION_DRIFT
 from gavo_jax.output import plots
 from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.screen import number
@@ -32,7 +33,7 @@ from gavo_jax.settings import Settings
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
 """Frames taken of a clip where its name says nothing: the paper's first experiment uses 90 of fr1_xyz."""
-TRANSLATION, ROTATION = "rpe_translation_rmse_m_per_s", "rpe_rotation_rmse_deg_per_s"
+TRANSLATION, ROTATION = DRIFT, ROTATION_DRIFT
 
 
 def command(main: Callable[..., Any]) -> None:
@@ -197,7 +198,7 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[Summary]:
                 float(np.median(rotation)),
                 float(rotation.max() / rotation.min()),
                 max(run["lost_pairs"] for run in group),
-                float(np.median([run["milliseconds_per_pair_median"] for run in group])),
+                float(np.median([run[MILLISECONDS] for run in group])),
                 len(group),
             )
         )

@@ -30,6 +30,7 @@ from gavo_jax.objective.losses import LOSSES as LOSSES
 from gavo_jax.odometry.driver import Odometry as Odometry
 from gavo_jax.odometry.driver import Step as Step
 from gavo_jax.odometry.driver import track as track
+from gavo_jax.odometry.metrics import Metrics as Metrics
 from gavo_jax.odometry.run import OdometryRun as OdometryRun
 from gavo_jax.odometry.run import run_odometry as run_odometry
 from gavo_jax.presets import preset as preset

@@ -14,6 +14,14 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import (
+    ABSOLUTE_ERROR,
+    DRIFT,
+    FINAL_DISTANCE,
+    FRAMES_PER_SECOND,
+    MILLISECONDS,
+    ROTATION_DRIFT,
+)
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
@@ -24,16 +32,15 @@ from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
 
 COMPARISON = "comparison.json"
-DRIFT, ROTATION_DRIFT = "rpe_translation_rmse_m_per_s", "rpe_rotation_rmse_deg_per_s"
 
 COLUMNS = (
     ("drift m/s", DRIFT, 4),
     ("deg/s", ROTATION_DRIFT, 3),
-    ("ATE m", "ate_translation_rmse_m", 4),
-    ("distance m", "distance_error_final_m", 4),
+    ("ATE m", ABSOLUTE_ERROR, 4),
+    ("distance m", FINAL_DISTANCE, 4),
     ("lost", "lost_pairs", 0),
-    ("ms/pair", "milliseconds_per_pair_median", 1),
-    ("frames/s", "frames_per_second", 1),
+    ("ms/pair", MILLISECONDS, 1),
+    ("frames/s", FRAMES_PER_SECOND, 1),
 )
 """Columns of the table: heading, key in comparison.json, decimals."""
 HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "drift from", "to")

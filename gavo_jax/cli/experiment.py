@@ -15,7 +15,7 @@ from gavo_jax.errors import GavoError, read_text
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
-from gavo_jax.experiments.summary import DRIFT, ROTATION, Comparison, Summary, compare, summarise
+from gavo_jax.experiments.summary import DRIFT, ROTATION_DRIFT, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import save_figure
@@ -186,7 +186,7 @@ def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
     clips: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in rows:
         if row[DRIFT] is not None:
-            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append((row[DRIFT], row[ROTATION]))
+            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append((row[DRIFT], row[ROTATION_DRIFT]))
     if not clips or not plots.available():
         return []
     drifts = {clip: {name: np.array(runs) for name, runs in methods.items()} for clip, methods in clips.items()}

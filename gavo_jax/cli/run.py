@@ -14,7 +14,18 @@ from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.odometry.metrics import (
+    ABSOLUTE_ERROR,
+    COMPILE_SECONDS,
+    DRIFT,
+    DRIFT_PER_FRAME,
+    FINAL_DISTANCE,
+    FRAMES_PER_SECOND,
+    MILLISECONDS,
+    ROTATION_DRIFT,
+    compute_metrics,
+)
+from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, environment
@@ -32,16 +43,16 @@ CHECKPOINT_SECONDS = 2.0
 """Between two checkpoints; each takes some 20 ms."""
 
 FIGURES_OF_MERIT = (
-    ("drift: RPE over 1 s, translation, RMSE", "rpe_translation_rmse_m_per_s", 6, "m/s"),
-    ("drift: RPE over 1 s, rotation, RMSE", "rpe_rotation_rmse_deg_per_s", 6, "deg/s"),
-    ("RPE over 1 frame, translation, RMSE", "rpe_translation_rmse_m_per_frame", 6, "m/frame"),
-    ("absolute error after alignment, RMSE", "ate_translation_rmse_m", 6, "m"),
-    ("distance error at the end", "distance_error_final_m", 6, "m"),
+    ("drift: RPE over 1 s, translation, RMSE", DRIFT, 6, "m/s"),
+    ("drift: RPE over 1 s, rotation, RMSE", ROTATION_DRIFT, 6, "deg/s"),
+    ("RPE over 1 frame, translation, RMSE", DRIFT_PER_FRAME, 6, "m/frame"),
+    ("absolute error after alignment, RMSE", ABSOLUTE_ERROR, 6, "m"),
+    ("distance error at the end", FINAL_DISTANCE, 6, "m"),
     ("frames", "frames", 0, ""),
     ("lost pairs", "lost_pairs", 0, ""),
-    ("compilation", "compile_seconds", 1, "s"),
-    ("time a pair, median", "milliseconds_per_pair_median", 1, "ms"),
-    ("speed, decoding included", "frames_per_second", 1, "frames/s"),
+    ("compilation", COMPILE_SECONDS, 1, "s"),
+    ("time a pair, median", MILLISECONDS, 1, "ms"),
+    ("speed, decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
 )
 """Rows of the table: what, key in metrics.json, decimals, unit."""
 
@@ -107,8 +118,8 @@ def _track(
         "preset": options.preset,
         "seed": options.seed,
         "complete": len(steps) == len(sequence) - 1,
-        **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics["compile_seconds"]),
-        "frames_per_second": tracked.metrics["frames_per_second"],
+        **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics[COMPILE_SECONDS]),
+        FRAMES_PER_SECOND: tracked.metrics[FRAMES_PER_SECOND],
     }
     draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
     draw_search(folder.path, sequence, odometry, tracked.steps)

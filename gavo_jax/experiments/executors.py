@@ -19,7 +19,8 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.odometry.metrics import Metrics, compute_metrics
+from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.files import environment
 from gavo_jax.peers import make_peer
 
@@ -198,7 +199,7 @@ def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
     return Odometry(sequence.camera, run.settings, seed=run.seed or 0)
 
 
-def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: dict[str, Any]) -> Row:
+def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: Metrics) -> Row:
     commit, modified = git_state()
     return {
         "run": run.id,

@@ -8,6 +8,7 @@ import numpy as np
 from gavo_jax.experiments.executors import Executor, Outcome
 from gavo_jax.experiments.plan import Batch, Plan, Run, batches, programs
 from gavo_jax.experiments.table import Table
+from gavo_jax.odometry.metrics import FRAMES_PER_SECOND
 
 MILLISECONDS = {"ga": 40.0, "pso": 60.0, "gauss-newton": 40.0, "adam": 60.0}
 """A frame of 640 x 480 by the default preset on two cores, for a plan's estimate before anything was measured."""
@@ -41,8 +42,8 @@ def estimate_seconds(runs: Sequence[Run], rows: Iterable[Mapping[str, Any]], slo
     """How long the runs will take, roughly: by the table's own times of the same label, else by `MILLISECONDS`."""
     measured: dict[str, list[float]] = {}
     for row in rows:
-        if row["frames_per_second"]:
-            measured.setdefault(row["label"], []).append(1e3 / row["frames_per_second"] * PIXELS / row["pixels"])
+        if row[FRAMES_PER_SECOND]:
+            measured.setdefault(row["label"], []).append(1e3 / row[FRAMES_PER_SECOND] * PIXELS / row["pixels"])
     seconds = COMPILE_SECONDS * programs(runs)
     for run in runs:
         typical = MILLISECONDS.get(run.method, PEER_MILLISECONDS) * PRESET_FACTOR.get(run.preset, 1.0)

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-DRIFT = "rpe_translation_rmse_m_per_s"
-ROTATION = "rpe_rotation_rmse_deg_per_s"
+from gavo_jax.odometry.metrics import DRIFT, FRAMES_PER_SECOND, ROTATION_DRIFT
+
 ALL = "all sequences"
 
 Row = Mapping[str, Any]
@@ -54,7 +54,7 @@ def summarise(rows: Iterable[Row]) -> list[Summary]:
 
 def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
     drifts = [row[DRIFT] for row in rows if row[DRIFT] is not None]
-    turns = [row[ROTATION] for row in rows if row[ROTATION] is not None]
+    turns = [row[ROTATION_DRIFT] for row in rows if row[ROTATION_DRIFT] is not None]
     quartiles = np.quantile(drifts, (0.25, 0.5, 0.75)).tolist() if drifts else None
     return Summary(
         sequence,
@@ -63,7 +63,7 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
         None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
         float(np.median(turns)) if turns else None,
         max(row["lost_pairs"] for row in rows),
-        float(np.median([1e3 / row["frames_per_second"] for row in rows])),
+        float(np.median([1e3 / row[FRAMES_PER_SECOND] for row in rows])),
         max(row["runs_together"] for row in rows),
     )
 

@@ -9,9 +9,10 @@ import os
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.metrics import Metrics
 from gavo_jax.output.files import prepare_folder
 
 SUFFIX = ".parquet"
@@ -19,6 +20,8 @@ ROWS = "runs"
 """Folder of the table within an experiment's folder."""
 
 TEXT, WHOLE, REAL, FLAG = "string", "int64", "float64", "bool"
+COLUMN_OF = {str: TEXT, int: WHOLE, float: REAL, float | None: REAL}
+"""By the type of a figure."""
 COLUMNS = {
     "run": TEXT,
     "experiment": TEXT,
@@ -28,18 +31,7 @@ COLUMNS = {
     "variant": TEXT,
     "label": TEXT,
     "seed": WHOLE,
-    "device": TEXT,
-    "frames": WHOLE,
-    "pairs": WHOLE,
-    "lost_pairs": WHOLE,
-    "rpe_translation_rmse_m_per_s": REAL,
-    "rpe_rotation_rmse_deg_per_s": REAL,
-    "rpe_translation_rmse_m_per_frame": REAL,
-    "ate_translation_rmse_m": REAL,
-    "distance_error_final_m": REAL,
-    "compile_seconds": REAL,
-    "milliseconds_per_pair_median": REAL,
-    "frames_per_second": REAL,
+    **{name: COLUMN_OF[kind] for name, kind in get_type_hints(Metrics).items() if kind in COLUMN_OF},
     "runs_together": WHOLE,
     "pixels": WHOLE,
     "configuration": TEXT,

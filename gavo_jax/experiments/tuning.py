@@ -11,6 +11,7 @@ from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
+from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
@@ -19,7 +20,6 @@ from gavo_jax.settings_file import flatten, override, refuse_unknown
 KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
 RANGE_KEYS = ("low", "high", "step", "log")
 TRIALS = 50
-DRIFT, TIME = "rpe_translation_rmse_m_per_s", "milliseconds_per_pair_median"
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int
             run = run_odometry(sequence, settings, seed=seed)
             if run.metrics[DRIFT] is None:
                 raise GavoError(f"{sequence.name}: no ground truth over a second of it")
-            figures.append((run.metrics[DRIFT], run.metrics[TIME]))
+            figures.append((run.metrics[DRIFT], run.metrics[MILLISECONDS]))
     drift, milliseconds = np.exp(np.mean(np.log(figures), axis=0))
     return float(drift), float(milliseconds)
 

@@ -1,20 +1,16 @@
 """A whole sequence at once: its trajectory, its steps and its figures."""
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
-import jax
 import numpy as np
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.metrics import RunMetrics, compute_metrics
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -27,7 +23,7 @@ class OdometryRun:
 
     trajectory: Trajectory
     steps: list[Step]
-    metrics: dict[str, Any]
+    metrics: RunMetrics
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -83,47 +79,3 @@ def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
     steps = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     stamps = np.array([first_timestamp] + [step.timestamp for step in steps])
     return Trajectory(stamps, np.stack([np.eye(4)] + [step.world_T_camera for step in steps]))
-
-
-def compute_metrics(
-    trajectory: Trajectory,
-    ground_truth: Trajectory | None,
-    steps: list[Step],
-    seconds: float,
-    compile_seconds: float,
-) -> dict[str, Any]:
-    """The figures of `metrics.json` that follow from a run; None where there is no, or too little, ground truth.
-
-    Args:
-        trajectory: The estimate.
-        ground_truth: The truth, or None.
-        steps: The run's steps.
-        seconds: Wall time of the run after compilation, decoding included.
-        compile_seconds: Time of the compilation.
-    """
-
-    def figure(compute: Callable[[Trajectory], float]) -> float | None:
-        if ground_truth is None:
-            return None
-        try:
-            return float(compute(ground_truth))
-        except GavoError:
-            return None
-
-    per_second = partial(relative_pose_error, trajectory, delta=1.0, unit="s")
-    per_frame = partial(relative_pose_error, trajectory, delta=1, unit="frames")
-    return {
-        "device": jax.devices()[0].device_kind,
-        "frames": len(steps) + 1,
-        "pairs": len(steps),
-        "lost_pairs": sum(step.lost for step in steps),
-        "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
-        "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
-        "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
-        "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),
-        "ate_translation_rmse_m": figure(lambda truth: absolute_trajectory_error(trajectory, truth).rmse),
-        "distance_error_final_m": figure(lambda truth: distance_error(trajectory, truth).final),
-        "compile_seconds": compile_seconds,
-        "milliseconds_per_pair_median": float(np.median([step.milliseconds for step in steps])) if steps else None,
-        "frames_per_second": (len(steps) + 1) / seconds if seconds > 0 else None,
-    }

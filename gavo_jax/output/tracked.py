@@ -3,11 +3,12 @@
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.odometry.driver import Odometry, Step, track
-from gavo_jax.odometry.run import compute_metrics, trajectory_of
+from gavo_jax.odometry.metrics import Metrics, compute_metrics
+from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import pair_progress
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
@@ -21,8 +22,7 @@ class Tracked(NamedTuple):
 
     trajectory: Trajectory
     steps: list[Step]
-    metrics: dict[str, Any]
-    """`odometry.compute_metrics`."""
+    metrics: Metrics
     interrupted: bool
 
 

@@ -1,0 +1,97 @@
+"""The figures of a run, and their names in every JSON file and table."""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Final, TypedDict
+
+import jax
+import numpy as np
+
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
+from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import Trajectory
+
+
+class Metrics(TypedDict):
+    """The figures of a run by their names; None where there is no, or too little, ground truth."""
+
+    device: str
+    frames: int
+    pairs: int
+    lost_pairs: int
+    statuses: dict[str, int]
+    """Pairs of each status."""
+    rpe_translation_rmse_m_per_s: float | None
+    """Drift, as by TUM's tool: relative pose error over 1 s."""
+    rpe_rotation_rmse_deg_per_s: float | None
+    rpe_translation_rmse_m_per_frame: float | None
+    ate_translation_rmse_m: float | None
+    """After alignment."""
+    distance_error_final_m: float | None
+    compile_seconds: float
+    milliseconds_per_pair_median: float | None
+    frames_per_second: float | None
+    """From files to poses, after compilation, decoding included."""
+
+
+class RunMetrics(Metrics):
+    """The same, and what was run."""
+
+    sequence: str
+    seed: int
+
+
+DRIFT: Final = "rpe_translation_rmse_m_per_s"
+ROTATION_DRIFT: Final = "rpe_rotation_rmse_deg_per_s"
+DRIFT_PER_FRAME: Final = "rpe_translation_rmse_m_per_frame"
+ABSOLUTE_ERROR: Final = "ate_translation_rmse_m"
+FINAL_DISTANCE: Final = "distance_error_final_m"
+COMPILE_SECONDS: Final = "compile_seconds"
+MILLISECONDS: Final = "milliseconds_per_pair_median"
+FRAMES_PER_SECOND: Final = "frames_per_second"
+
+
+def compute_metrics(
+    trajectory: Trajectory,
+    ground_truth: Trajectory | None,
+    steps: list[Step],
+    seconds: float,
+    compile_seconds: float,
+) -> Metrics:
+    """The figures of `metrics.json` that follow from a run; None where there is no, or too little, ground truth.
+
+    Args:
+        trajectory: The estimate.
+        ground_truth: The truth, or None.
+        steps: The run's steps.
+        seconds: Wall time of the run after compilation, decoding included.
+        compile_seconds: Time of the compilation.
+    """
+
+    def figure(compute: Callable[[Trajectory], float]) -> float | None:
+        if ground_truth is None:
+            return None
+        try:
+            return float(compute(ground_truth))
+        except GavoError:
+            return None
+
+    per_second = partial(relative_pose_error, trajectory, delta=1.0, unit="s")
+    per_frame = partial(relative_pose_error, trajectory, delta=1, unit="frames")
+    return {
+        "device": jax.devices()[0].device_kind,
+        "frames": len(steps) + 1,
+        "pairs": len(steps),
+        "lost_pairs": sum(step.lost for step in steps),
+        "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
+        "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
+        "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
+        "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),
+        "ate_translation_rmse_m": figure(lambda truth: absolute_trajectory_error(trajectory, truth).rmse),
+        "distance_error_final_m": figure(lambda truth: distance_error(trajectory, truth).final),
+        "compile_seconds": compile_seconds,
+        "milliseconds_per_pair_median": float(np.median([step.milliseconds for step in steps])) if steps else None,
+        "frames_per_second": (len(steps) + 1) / seconds if seconds > 0 else None,
+    }
