@@ -23,6 +23,9 @@ RIM = 4
 
 MAX_CAMERA_FILE_BYTES = 65536
 
+LONGEST_LENS = 20
+"""Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -292,8 +295,8 @@ def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
         raise GavoError(f"{path}: distortion: must be a list of 4 or 5 numbers (k1 k2 p1 p2 [k3])")
     k1, k2, p1, p2, k3 = (number("distortion", value, -100, 100) for value in [*distortion, 0.0][:5])
     return Camera(
-        fx=number("fx", values["fx"], 1, 100 * MAX_SIDE),
-        fy=number("fy", values["fy"], 1, 100 * MAX_SIDE),
+        fx=number("fx", values["fx"], 1, LONGEST_LENS * width),
+        fy=number("fy", values["fy"], 1, LONGEST_LENS * height),
         cx=number("cx", values["cx"], -width, 2 * width),
         cy=number("cy", values["cy"], -height, 2 * height),
         width=width,

@@ -1,5 +1,6 @@
 """Bad input as one kind of exception, the text files that users hand in, and files that are written whole."""
 
+import contextlib
 import os
 import reprlib
 from pathlib import Path
@@ -68,14 +69,19 @@ def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[s
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write a file whole or not at all: beside it first, then renamed into place.
 
+    What lies where it is written first, left by a kill or planted by somebody, is removed and not followed.
+
     Raises:
         GavoError: the file cannot be written.
     """
     path = Path(path)
     partial = path.with_name(path.name + PARTIAL)
     try:
-        partial.write_bytes(data)
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:
+            file.write(data)
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None

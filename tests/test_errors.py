@@ -1,0 +1,28 @@
+"""Files that are written whole or not at all."""
+
+import pytest
+
+from gavo_jax.errors import PARTIAL, GavoError, write_bytes
+
+
+def test_a_planted_link_is_not_followed(tmp_path):
+    foreign = tmp_path / "foreign.txt"
+    foreign.write_text("somebody else's")
+    (tmp_path / ("metrics.json" + PARTIAL)).symlink_to(foreign)
+    write_bytes(tmp_path / "metrics.json", b"{}")
+    assert foreign.read_text() == "somebody else's"
+    assert (tmp_path / "metrics.json").read_bytes() == b"{}" and not (tmp_path / "metrics.json").is_symlink()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign.txt", "metrics.json"]
+
+
+def test_what_a_kill_left_is_replaced(tmp_path):
+    (tmp_path / ("rows.txt" + PARTIAL)).write_bytes(b"half")
+    write_bytes(tmp_path / "rows.txt", b"whole")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("rows.txt", b"whole")]
+
+
+def test_a_folder_in_the_way_is_one_line(tmp_path):
+    (tmp_path / ("rows.txt" + PARTIAL)).mkdir()
+    with pytest.raises(GavoError, match="rows.txt: cannot be written: ") as fault:
+        write_bytes(tmp_path / "rows.txt", b"whole")
+    assert "\n" not in str(fault.value) and not (tmp_path / "rows.txt").exists()
