@@ -32,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Nothing is raised for bad input: one line on standard error names the file and the fault, and the status is 2.
     """
+    _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments == ["--version"]:
         print(f"gavo-jax {__version__}")
@@ -54,6 +55,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _silence_output()
         return _refuse(f"{error.filename or 'output'}: cannot be written to: {error.strerror}")
+
+
+def _open_streams() -> None:
+    """Make standard output and error take whatever is printed: closed ones swallow it, and where the encoding lacks a
+    character a question mark stands for it.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _execute(command: Command) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax import presets
+from gavo_jax.cli import INTERRUPTED
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
@@ -27,7 +28,7 @@ from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.output.report import REPORT, Table, write_report
 from gavo_jax.output.screen import number, print_table
-from gavo_jax.output.tracked import INTERRUPTED, track_visibly
+from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from gavo_jax.cli import INTERRUPTED
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -31,7 +32,7 @@ from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, environment
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import number, print_table
-from gavo_jax.output.tracked import INTERRUPTED, track_visibly
+from gavo_jax.output.tracked import track_visibly
 from gavo_jax.settings import Settings
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer

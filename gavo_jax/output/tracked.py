@@ -13,9 +13,6 @@ from gavo_jax.output.screen import pair_progress
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
-
 
 class Tracked(NamedTuple):
     """What came of a sequence; where the user stopped it, up to there."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -386,6 +387,24 @@ def test_names_of_options_are_those_of_the_presets():
     shown = options.Method.__metadata__[0].metavar  # pyright: ignore[reportAttributeAccessIssue]
     assert shown == "{" + ",".join(METHODS) + ",…}"
     assert get_args(options.PresetName) == PRESETS
+
+
+@pytest.mark.parametrize("encoding", ["latin-1"])
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["evaluate", "\u2192.txt", "b.txt"]])
+def test_any_encoding_of_the_screen_will_do(encoding, arguments):
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "1"}
+    done = subprocess.run([sys.executable, "-m", "gavo_jax", *arguments], capture_output=True, env=environment)
+    assert done.returncode == (0 if "--help" in arguments else 2), done.stderr
+    assert b"Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-"])
+@pytest.mark.parametrize(("words", "status"), [("--help", 0), ("evaluate a.txt b.txt", 2)])
+def test_a_closed_stream_is_no_fault(closed, words, status):
+    command = f"'{sys.executable}' -m gavo_jax {words} {closed}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
+    assert done.returncode == status and "Traceback" not in done.stderr
 
 
 def test_help_and_version(gavo):
