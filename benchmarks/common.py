@@ -33,7 +33,6 @@ from gavo_jax.settings import Settings
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
 """Frames taken of a clip where its name says nothing: the paper's first experiment uses 90 of fr1_xyz."""
-TRANSLATION, ROTATION = DRIFT, ROTATION_DRIFT
 
 
 def command(main: Callable[..., Any]) -> None:
@@ -156,7 +155,7 @@ def measure_drift(clips: Sequence[str], contenders: Sequence[Contender], seeds: 
                     continue
                 odometry = contender.make(sequence.camera, seed)
                 metrics = track_visibly(f"{clip}, {contender.name}, seed {seed}", sequence, odometry).metrics
-                if metrics[TRANSLATION] is None:
+                if metrics[DRIFT] is None:
                     raise GavoError(f"{clip}: no ground truth over a second of it")
                 runs.append({"clip": clip, "name": contender.name, "seed": seed, "random": contender.random, **metrics})
     return runs
@@ -188,7 +187,7 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[Summary]:
         groups.setdefault((run["clip"], run["name"]), []).append(run)
     summaries = []
     for (clip, name), group in groups.items():
-        translation, rotation = (np.array([run[key] for run in group]) for key in (TRANSLATION, ROTATION))
+        translation, rotation = (np.array([run[key] for run in group]) for key in (DRIFT, ROTATION_DRIFT))
         summaries.append(
             Summary(
                 clip,

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import common
 import numpy as np
 
+from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output import plots
 from gavo_jax.output.screen import number, print_table
 from gavo_jax.peers import PEERS
@@ -72,7 +73,7 @@ def drifts(runs: list[dict[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
     found: dict[str, dict[str, np.ndarray]] = {}
     for run in runs:
         clip = found.setdefault(run["clip"], {})
-        row = np.array([[run[common.TRANSLATION], run[common.ROTATION]]])
+        row = np.array([[run[DRIFT], run[ROTATION_DRIFT]]])
         clip[run["name"]] = np.concatenate([clip[run["name"]], row]) if run["name"] in clip else row
     return found
 

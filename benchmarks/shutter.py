@@ -20,6 +20,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output.screen import number, print_table
 from gavo_jax.output.tracked import track_visibly
 
@@ -41,8 +42,8 @@ def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
             {
                 "readout_ms": milliseconds,
                 "error": common.geometric_mean(list(errors[both] / first[both])),
-                "translation": tracked.metrics[common.TRANSLATION],
-                "rotation": tracked.metrics[common.ROTATION],
+                "translation": tracked.metrics[DRIFT],
+                "rotation": tracked.metrics[ROTATION_DRIFT],
             }
         )
     return rows

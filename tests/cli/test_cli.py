@@ -7,13 +7,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from command import Done, runner
 
 from gavo_jax.camera import Camera
-from gavo_jax.cli import main, options
+from gavo_jax.cli import options
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.output import tracked
@@ -28,22 +29,11 @@ compile_seconds milliseconds_per_pair_median frames_per_second""".split()
 FAST = ("--method", "gauss-newton")
 
 
-class Done(NamedTuple):
-    status: int
-    out: str
-    err: str
-
-
 @pytest.fixture
 def gavo(capsys, monkeypatch, tmp_path):
     """Run the command in a folder of its own and return status, standard output and standard error."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: Any) -> Done:
-        status = main([str(argument) for argument in arguments])
-        return Done(status, *capsys.readouterr())
-
-    return run
+    return runner(capsys)
 
 
 @pytest.fixture(scope="session")

@@ -2,24 +2,17 @@
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
+from command import Done, runner
 
 from gavo_jax import compiler
-from gavo_jax.cli import main
 from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
 RULED_OUT = "jax 0.0.1 may compute wrong numbers and is ruled out: pip install 'jax>=0.8.2'"
-
-
-class Done(NamedTuple):
-    status: int
-    out: str
-    err: str
 
 
 @pytest.fixture
@@ -30,11 +23,7 @@ def gavo(capsys, monkeypatch, tmp_path):
     cheap = {name: checks.CHECKS[name]._replace(sizes=(300,)) for name in ("inverse", "warp")}
     monkeypatch.setattr(checks, "CHECKS", cheap)
     monkeypatch.setattr(checks, "scoring_nanoseconds", lambda: 12.34)
-
-    def run(*arguments: Any) -> Done:
-        return Done(main([str(argument) for argument in arguments]), *capsys.readouterr())
-
-    return run
+    return runner(capsys)
 
 
 def test_doctor_tells_what_an_issue_report_needs(gavo, tmp_path):
