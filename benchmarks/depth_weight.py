@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment.visits import fit_objective, levels_of, stack_levels
+from gavo_jax.alignment.visits import Level, fit_objective, levels_of, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.error import Objective
@@ -48,27 +48,26 @@ FIGURES = ("by_scatter", "disagreement", "by_disagreement")
 @jax.jit
 def own_optima(
     before: TrackerState, after: TrackerState, camera: Camera, solver: Any, options: AlignmentOptions
-) -> list[list[tuple[jax.Array, ...]]]:
-    """For each level, coarsest first, and for grey and depth: the optimum, in steps about the motion that was tracked,
-    the Hessian of the mean cost there, residuals in units of their scale, and the covariance of its gradient.
+) -> list[tuple[jax.Array, ...]]:
+    """For grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about the
+    motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the covariance
+    of its gradient.
     """
     motion = exp(after.motion)
     geometry = levels_of(camera, solver, options)
     levels = stack_levels((before.previous,), camera, geometry, options, None, camera.readout / after.seconds)
-    found = []
-    for place in range(len(solver.levels)):
-        level = jax.tree.map(lambda leaf, place=place: leaf[place], levels)
+
+    def of_level(level: Level) -> list[tuple[jax.Array, ...]]:
         objective, _ = fit_objective(level, after.previous_image, options, motion)
         scales = objective.scales
         depth = replace(objective, scales=scales._replace(depth_weight=jnp.float32(DEPTH_ALONE)))
         unit = scales.grey**2
-        found.append(
-            [
-                optimum(replace(objective, use_depth=False), motion, unit),
-                optimum(depth, motion, unit * DEPTH_ALONE),
-            ]
-        )
-    return found
+        return [
+            optimum(replace(objective, use_depth=False), motion, unit),
+            optimum(depth, motion, unit * DEPTH_ALONE),
+        ]
+
+    return jax.lax.map(of_level, levels)
 
 
 def optimum(objective: Objective, motion: jax.Array, unit: jax.Array) -> tuple[jax.Array, ...]:
@@ -110,8 +109,9 @@ def measure(clip: str) -> dict[int, dict[str, float]]:
     def compare(_: Frame | None, step: Step | None) -> None:
         states.append(odometry.progress.tracker)
         if step is not None and not step.lost and None not in (states[-2], states[-1]):
-            levels = own_optima(*states[-2:], odometry.camera, settings.solver, settings.alignment)
-            pairs.append([weigh(channels) for channels in jax.device_get(levels)])
+            found = jax.device_get(own_optima(*states[-2:], odometry.camera, settings.solver, settings.alignment))
+            places = range(len(settings.solver.levels))
+            pairs.append([weigh(jax.tree.map(lambda leaf, i=i: leaf[i], found)) for i in places])
         del states[:-1]
 
     for _ in track(sequence, odometry=odometry, watch=compare):

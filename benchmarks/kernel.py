@@ -20,6 +20,7 @@ import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -82,10 +83,12 @@ class TwoMarks(Objective):
         """The same objective."""
         return cls(**{field.name: getattr(objective, field.name) for field in fields(objective)})
 
-    def _cost(self, r: Residuals) -> jax.Array:
+    def cost(self, r: Residuals) -> jax.Array:
+        """[2, N]: 0 outside, and 1 inside."""
         return jnp.stack([jnp.where(r.inside > 0, super().cost(r), 0.0), r.inside])
 
-    def _sums(self, cost: jax.Array) -> jax.Array:
+    def sums(self, cost: jax.Array) -> jax.Array:
+        """Of either array."""
         return jnp.stack([lane_sum(cost[0]), lane_sum(cost[1])])
 
 
@@ -105,6 +108,7 @@ def plain_score(points: jax.Array, grey: jax.Array, target: jax.Array, camera: C
     return jax.vmap(error)(motions)
 
 
+@cache
 def make_numba_score() -> Callable[..., np.ndarray]:
     """The hand-written loop: candidates in parallel, pixels one by one, nothing in memory between."""
     import numba
@@ -159,7 +163,7 @@ def make_objective(
     pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, options: AlignmentOptions
 ) -> Objective:
     """E of a level of a pair, every pixel a point."""
-    return jax.jit(lambda: objectives_of(*pyramids, camera, (level,), options, jnp.eye(4))[0])()
+    return jax.jit(lambda a, b: objectives_of(a, b, camera, (level,), options, jnp.eye(4))[0])(*pyramids)
 
 
 def make_scene(pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, motions: np.ndarray) -> Scene:

@@ -1,5 +1,9 @@
 """Dense RGB-D visual odometry by genetic algorithm, in JAX."""
 
+from gavo_jax.early import end_at_once
+
+end_at_once()  # before anything that takes time to import
+
 import warnings
 
 from gavo_jax.compiler import prepare_process
@@ -11,13 +15,18 @@ from gavo_jax.alignment.pairs import align as align
 from gavo_jax.alignment.pairs import align_batch as align_batch
 from gavo_jax.alignment.result import Alignment as Alignment
 from gavo_jax.camera import Camera as Camera
-from gavo_jax.camera import load_camera as load_camera
+from gavo_jax.camera_files import Calibration as Calibration
+from gavo_jax.camera_files import load_calibration as load_calibration
+from gavo_jax.camera_files import load_camera as load_camera
 from gavo_jax.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from gavo_jax.compiler import CompilerWarning as CompilerWarning
 from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence
 from gavo_jax.datasets.base import TimestampError as TimestampError
+from gavo_jax.datasets.files import Reading as Reading
+from gavo_jax.datasets.registry import open_source as open_source
+from gavo_jax.datasets.registry import register_dataset as register_dataset
 from gavo_jax.datasets.synthetic import SensorNoise as SensorNoise
 from gavo_jax.datasets.synthetic import SyntheticSequence as SyntheticSequence
 from gavo_jax.datasets.synthetic import write_tum as write_tum

@@ -1,11 +1,9 @@
-"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion and camera files."""
+"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion; cameras that go by a name."""
 
 import re
-import tomllib
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import jax
@@ -13,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt16
 
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError
 
 MAX_SIDE = 8192
 """Largest image width or height accepted, in pixels."""
@@ -21,16 +19,11 @@ MAX_SIDE = 8192
 RIM = 4
 """Depth that comes from within this many pixels of the raw image's border is dropped by undistortion."""
 
-MAX_CAMERA_FILE_BYTES = 65536
-
-LONGEST_LENS = 20
-"""Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
-
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["fx", "fy", "cx", "cy", "depth_scale", "readout"],
-    meta_fields=["width", "height", "distortion"],
+    meta_fields=["width", "height", "distortion", "model"],
 )
 @dataclass(frozen=True)
 class Camera:
@@ -45,9 +38,11 @@ class Camera:
         cy: principal point, row, pixels.
         width: image width, pixels.
         height: image height, pixels.
-        distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model, in OpenCV's order; of the images as recorded.
+        distortion: of the images as recorded, in OpenCV's order: k1, k2, p1, p2, k3 and, of the rational model, k4, k5,
+            k6; of a fisheye k1, k2, k3, k4.
         depth_scale: raw depth units per metre (metres = raw / depth_scale).
         readout: seconds from the exposure of the first row to that of the last (rolling shutter); 0 = all at once.
+        model: what the distortion's numbers are: "pinhole" (Brown-Conrady, also rational) or "fisheye" (equidistant).
     """
 
     fx: float
@@ -56,13 +51,14 @@ class Camera:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
     readout: float = 0.0
+    model: Literal["pinhole", "fisheye"] = "pinhole"
 
     @staticmethod
     def preset(name: str) -> "Camera":
-        """Return a camera of the TUM RGB-D benchmark by name: fr1, fr2 or fr3 (640×480, depth / 5000).
+        """Return a camera of a benchmark by name: fr1, fr2, fr3 (TUM RGB-D), bonn or icl (640×480, depth / 5000).
 
         Raises:
             GavoError: the name is none of these.
@@ -73,8 +69,13 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the images as recorded carry lens distortion."""
-        return any(self.distortion)
+        """Whether the images as recorded carry lens distortion; a fisheye's do without any number, too."""
+        return self.model == "fisheye" or any(self.distortion)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The intrinsic matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def level(self, k: int) -> "Camera":
         """Return the camera of pyramid level k, whose image is 2^k times smaller along each side.
@@ -112,7 +113,7 @@ class Camera:
 
     def rectified(self) -> "Camera":
         """Return the camera of undistorted images: the same intrinsics, no distortion."""
-        return replace(self, distortion=(0.0,) * 5)
+        return replace(self, distortion=(0.0,) * 5, model="pinhole")
 
     def undistort(
         self, grey: UInt8[np.ndarray, "height width *channels"], depth: UInt16[np.ndarray, "height width"]
@@ -173,8 +174,15 @@ PRESETS = {
     "fr1": Camera(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), readout=READOUT),
     "fr2": Camera(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), readout=READOUT),
     "fr3": Camera(535.4, 539.2, 320.1, 247.6, 640, 480, readout=READOUT),
+    "bonn": Camera(
+        *(542.822841, 542.576870, 315.593520, 237.756098, 640, 480),
+        distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+        readout=READOUT,
+    ),
+    "icl": Camera(481.2, 480.0, 319.5, 239.5, 640, 480),
 }
-"""Cameras of the TUM RGB-D benchmark (Sturm et al. 2012), as its page of file formats gives them."""
+"""Cameras of the TUM RGB-D benchmark (Sturm et al. 2012), as its page of file formats gives them; of the Bonn RGB-D
+Dynamic dataset (Palazzolo et al. 2019), like them; of the rendered ICL-NUIM (Handa et al. 2014)."""
 
 
 def _stack(*arrays: Any) -> Any:
@@ -187,10 +195,9 @@ def _stack(*arrays: Any) -> Any:
 @lru_cache(maxsize=8)
 def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return fixed-point maps for cv2.remap: coordinates and fractions (bilinear), coordinates (nearest)."""
-    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    distortion = np.array(camera.distortion)
-    size = (camera.width, camera.height)
-    u, v = cv2.initUndistortRectifyMap(matrix, distortion, np.eye(3), matrix, size, cv2.CV_32FC1)
+    matrix, distortion, size = camera.matrix, np.array(camera.distortion), (camera.width, camera.height)
+    make = cv2.fisheye.initUndistortRectifyMap if camera.model == "fisheye" else cv2.initUndistortRectifyMap
+    u, v = make(matrix, distortion, np.eye(3), matrix, size, cv2.CV_32FC1)
     coordinates, fractions = cv2.convertMaps(u, v, cv2.CV_16SC2)
     inside = (u >= RIM) & (u <= camera.width - 1 - RIM) & (v >= RIM) & (v <= camera.height - 1 - RIM)
     outside = np.float32(-1)
@@ -200,108 +207,21 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return coordinates, fractions, nearest
 
 
-def load_camera(path_or_name: str | Path) -> Camera:
-    """Return a camera from a preset's name (fr1, fr2, fr3) or from a small TOML or YAML file.
-
-    Keys: fx, fy, cx, cy, width, height; optional distortion (4 or 5 numbers: k1 k2 p1 p2 [k3]), depth_scale and readout
-    (seconds).
-    YAML is read in its flat form only: one `key: number` or `key: [number, …]` a line, `#` comments.
-
-    Raises:
-        GavoError: no such preset or file, an unreadable line, or an unknown, missing, non-finite or absurd value.
-    """
-    if str(path_or_name) in PRESETS:
-        return PRESETS[str(path_or_name)]
-    path = Path(path_or_name)
-    parsers = {".toml": _parse_toml, ".yaml": _parse_flat_yaml, ".yml": _parse_flat_yaml}
-    if path.suffix.lower() not in parsers:
-        known = ", ".join(PRESETS)
-        raise GavoError(f"unknown camera {str(path_or_name)!r}: neither one of {known} nor a .toml or .yaml file")
-    values = parsers[path.suffix.lower()](path, read_text(path, MAX_CAMERA_FILE_BYTES))
-    return _camera_from_values(path, values)
+NAMES_OF_SEQUENCES = {
+    r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)": r"fr\1",
+    r"(?<![a-z])rgbd_bonn_": "bonn",
+    r"(?<![a-z])(?:icl(?![a-z])|living_?room_?traj|office_?room_?traj)": "icl",
+}
+"""Preset by a pattern in a folder's name."""
 
 
-def camera_for_sequence(name: str) -> Camera:
-    """Return the preset that a TUM sequence's name speaks of: `…freiburg1…`, `fr1_xyz`, ….
+def preset_for_sequence(name: str) -> str:
+    """Return the name of the preset that a sequence's name speaks of: `…freiburg1…`, `fr1_xyz`, `rgbd_bonn_…`, ….
 
     Raises:
         GavoError: the name speaks of none; the message asks for a camera.
     """
-    match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", name.lower())
-    if match is None:
-        raise GavoError(f"no camera known for sequence {name!r}: say which with --camera fr1, fr2, fr3 or a file")
-    return PRESETS[f"fr{match.group(1)}"]
-
-
-def _parse_toml(path: Path, text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
-
-
-def _parse_flat_yaml(path: Path, text: str) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        line = line.split("#", 1)[0].strip()
-        if line in ("", "---"):
-            continue
-        key, colon, value = (part.strip() for part in line.partition(":"))
-        if not colon or key in values:
-            raise GavoError(
-                f"{path}:{number}: {'key given twice' if colon else 'not a `key: value` line'}: {line[:60]!r}"
-            )
-        try:
-            if value.startswith("[") and value.endswith("]"):
-                values[key] = [_number(item) for item in value[1:-1].split(",") if item.strip()]
-            else:
-                values[key] = _number(value)
-        except ValueError:
-            raise GavoError(
-                f"{path}:{number}: {key[:60]}: neither a number nor a list of numbers: {value[:60]!r}"
-            ) from None
-    return values
-
-
-def _number(text: str) -> int | float:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
-
-
-def _camera_from_values(path: Path, values: dict[str, Any]) -> Camera:
-    """Check the values of a camera file, key by key, and build the camera."""
-    names = [field.name for field in fields(Camera)]
-    required = [field.name for field in fields(Camera) if field.default is MISSING]
-    for key in values:
-        if key not in names:
-            raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(names)})")
-    for key in required:
-        if key not in values:
-            raise GavoError(f"{path}: {key}: missing")
-
-    def number(key: str, value: Any, low: float, high: float, kind: type = float) -> Any:
-        allowed = (int,) if kind is int else (int, float)
-        if isinstance(value, bool) or not isinstance(value, allowed) or not low <= value <= high:
-            what = "a whole number" if kind is int else "a number"
-            raise GavoError(f"{path}: {key}: must be {what} from {low:g} to {high:g}")
-        return kind(value)
-
-    width = number("width", values["width"], 16, MAX_SIDE, int)
-    height = number("height", values["height"], 16, MAX_SIDE, int)
-    distortion = values.get("distortion", [0.0] * 5)
-    if not isinstance(distortion, list) or len(distortion) not in (4, 5):
-        raise GavoError(f"{path}: distortion: must be a list of 4 or 5 numbers (k1 k2 p1 p2 [k3])")
-    k1, k2, p1, p2, k3 = (number("distortion", value, -100, 100) for value in [*distortion, 0.0][:5])
-    return Camera(
-        fx=number("fx", values["fx"], 1, LONGEST_LENS * width),
-        fy=number("fy", values["fy"], 1, LONGEST_LENS * height),
-        cx=number("cx", values["cx"], -width, 2 * width),
-        cy=number("cy", values["cy"], -height, 2 * height),
-        width=width,
-        height=height,
-        distortion=(k1, k2, p1, p2, k3),
-        depth_scale=number("depth_scale", values.get("depth_scale", 5000.0), 1e-3, 1e6),
-        readout=number("readout", values.get("readout", 0.0), 0, 1),
-    )
+    for pattern, preset in NAMES_OF_SEQUENCES.items():
+        if match := re.search(pattern, name.lower()):
+            return match.expand(preset)
+    raise GavoError(f"no camera known for sequence {name!r}: say which with --camera {', '.join(PRESETS)} or a file")

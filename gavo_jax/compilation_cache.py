@@ -1,13 +1,18 @@
 """Where compiled programs are kept between processes, so that only the first one on a machine waits for them."""
 
 import os
+import stat
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import jax
 
 from gavo_jax.compiler import processor_digest
+from gavo_jax.errors import GavoWarning
 from gavo_jax.program_cache import keep_programs_in
+
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def cache_folder() -> Path | None:
@@ -20,6 +25,40 @@ def cache_folder() -> Path | None:
         return None
 
 
+def why_not_private(folder: Path) -> str | None:
+    """Make a folder that is this user's alone; of one that is there, say in which way others could write to it.
+
+    Returns:
+        Words that go on from its name; None where nobody else can.
+
+    Raises:
+        OSError: it cannot be made or looked at.
+    """
+    for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+        missing.mkdir(mode=0o700, exist_ok=True)
+    if not hasattr(os, "geteuid"):  # Windows: a user's folders are closed to others, and modes tell nothing
+        return None
+    top = folder.stat()
+    if top.st_uid != os.geteuid():
+        return "belongs to another user"
+    if top.st_mode & OTHERS_WRITE:
+        return "others can write to it"
+    for parent in folder.resolve().parents:
+        mode = parent.stat().st_mode
+        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            return f"others can put something else in its place: {parent} is open to them"
+    within_reach = (stat.S_IWGRP if top.st_mode & stat.S_IXGRP else 0) | (
+        stat.S_IWOTH if top.st_mode & stat.S_IXOTH else 0
+    )
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):
+                status = entry.stat(follow_symlinks=False)
+                if status.st_uid != os.geteuid() or status.st_mode & within_reach and not entry.is_symlink():
+                    return f"others could write {entry.name} in it"
+    return None
+
+
 def enable_compilation_cache(folder: str | Path | None = None) -> None:
     """Keep programs between processes: traced ones, and compiled ones by JAX.
 
@@ -27,16 +66,35 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
     configuration is the process's, so compiled programs of other packages are kept too. Each kind of processor has a
     folder of its own: JAX would load what another one compiled, and could run into instructions that this one lacks.
 
-    An entry that cannot be read or written (torn by a kill, a full disk) costs a compilation and no word.
+    A kept program is run as it is found. So the folder has to be private: where it is another user's, or others can
+    write to it, a `GavoWarning` says so, and nothing is kept. An entry that cannot be read or written (torn by a kill,
+    a full disk) costs a compilation and no word.
 
     Args:
         folder: Where; by default `GAVO_CACHE_DIR`, else the user's cache folder for this package. JAX keeps its part
-            where `JAX_COMPILATION_CACHE_DIR` says, if that is set.
+            where `JAX_COMPILATION_CACHE_DIR` says, if that is set: who may write there is up to who sets it.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
     folder = cache_folder() if folder is None else Path(folder)
-    keep_programs_in(folder and folder / "traced")
-    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or folder is None:
+    keeps_compiled = not os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    parts = ["", "traced", "jax", f"jax/{processor_digest()}"][: 4 if keeps_compiled else 2]
+    if folder is None or not all(_is_private(folder / part) for part in parts):
+        keep_programs_in(None)
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder / "jax" / processor_digest()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    keep_programs_in(folder / "traced")
+    if keeps_compiled:
+        compiled = folder / parts[-1]
+        jax.config.update("jax_compilation_cache_dir", str(compiled))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether programs may be kept in a folder; where others could write to it, a warning says why not."""
+    try:
+        fault = why_not_private(folder)
+    except OSError:
+        return False
+    if fault:
+        words = f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others"
+        warnings.warn(words, GavoWarning, stacklevel=3)
+    return fault is None

@@ -3,6 +3,8 @@
 import contextlib
 import os
 import reprlib
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,32 @@ PARTIAL = ".partial"
 
 class GavoError(ValueError):
     """Input that cannot be used. The message is one line that names the file and says what is wrong with it."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(" ".join(str(message).split())))
+
+
+class GavoWarning(UserWarning):
+    """Something is not as it should be, and the work goes on without it."""
+
+
+def printable(text: str) -> str:
+    """Return a text without what would command a terminal: such characters are shown as code would write them.
+
+    Names of files, and of what is in archives and on servers, are other people's words.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+@contextlib.contextmanager
+def blamed(whose: str, kind: Callable[[str], Exception] = GavoError) -> Iterator[None]:
+    """Turn whatever other people's code raises in the block into one line, which begins with whose fault it is."""
+    try:
+        yield
+    except GavoError:
+        raise
+    except Exception as error:
+        raise kind(f"{whose}: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
 
 
 def shown(value: Any) -> str:
@@ -47,6 +75,27 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         if isinstance(error, GavoError):
             raise
         raise GavoError(f"{str(path)!r}: not a usable path: {error}") from None
+
+
+def parse_toml(place: str | Path, text: str) -> dict[str, Any]:
+    """Return the table that a text is in TOML.
+
+    Raises:
+        GavoError: it is none, or holds a number of thousands of digits; the message begins with `place`.
+    """
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GavoError(f"{place}: not TOML: {' '.join(str(error).split())[:200]}") from None
+
+
+def read_toml(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, Any]:
+    """Return the table of a TOML file.
+
+    Raises:
+        GavoError: as `read_text` and `parse_toml`.
+    """
+    return parse_toml(path, read_text(path, max_bytes))
 
 
 def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[str, list[str]]]:

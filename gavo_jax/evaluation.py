@@ -90,7 +90,7 @@ def relative_pose_error(
 
     Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is as
     printed in the paper: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations
-    differ by about the rotation error times the distance travelled.
+    differ by about the rotation error times the distance travelled. Neither kind pairs poses of different segments.
 
     Raises:
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
@@ -113,14 +113,18 @@ def absolute_trajectory_error(
     """Return the distances between associated positions after the best rigid alignment of the estimate (no scale).
 
     Association is `associate` by time; the alignment minimises the sum of squared distances (Horn 1987, Umeyama 1991).
+    Each segment of the estimate is aligned by itself, as nothing is known of how they lie to each other.
 
     Raises:
         GavoError: fewer than two poses associate.
     """
-    stamps, estimated, true = _associated(estimate, truth, max_difference, "absolute trajectory error")
-    positions, true_positions = estimated[:, :3, 3], true[:, :3, 3]
-    rotation, translation = align_rigidly(positions, true_positions)
-    distances = np.linalg.norm(positions @ rotation.T + translation - true_positions, axis=1)
+    estimated, true = _associated(estimate, truth, max_difference, "absolute trajectory error")
+    stamps, distances = estimated.timestamps, np.zeros(len(estimated))
+    for segment in np.unique(estimated.segments):
+        here = estimated.segments == segment
+        positions, true_positions = estimated.world_T_camera[here, :3, 3], true[here, :3, 3]
+        rotation, translation = align_rigidly(positions, true_positions)
+        distances[here] = np.linalg.norm(positions @ rotation.T + translation - true_positions, axis=1)
     definition = (
         "distance between estimated and true position after rigid (SE(3), no scale) least-squares alignment; "
         f"nearest stamps within {max_difference:g} s"
@@ -133,7 +137,7 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
 
     The paper plots it, and cites its equation without printing it. The truth is interpolated (slerp) at the estimate's
     stamps; poses it does not cover (outside it, or in a gap longer than `max_gap` seconds) are left out, and the first
-    covered one is the common origin.
+    covered one is the common origin; each segment of the estimate has one of its own.
 
     Raises:
         GavoError: the truth covers no pose of the estimate.
@@ -141,9 +145,10 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     true, valid = truth.interpolate(estimate.timestamps, max_gap)
     if not valid.any():
         raise GavoError("distance error: the ground truth covers no pose of the estimate")
-    estimated, true = estimate.world_T_camera[valid], true[valid]
-    from_first = inverse(estimated[0]) @ estimated
-    true_from_first = inverse(true[0]) @ true
+    estimated, true, segments = estimate.world_T_camera[valid], true[valid], estimate.segments[valid]
+    first = np.unique(segments, return_index=True)[1][np.unique(segments, return_inverse=True)[1]]
+    from_first = inverse(estimated[first]) @ estimated
+    true_from_first = inverse(true[first]) @ true
     distances = np.linalg.norm((from_first - true_from_first)[:, :3, 3], axis=1)
     definition = "distance between estimated and true position, both relative to the first pose; truth interpolated"
     return ErrorSeries(distances, estimate.timestamps[valid], "m", definition)
@@ -169,7 +174,7 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     end = end[start]
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
     far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
-    covered = ~far[start] & ~far[end]
+    covered = ~far[start] & ~far[end] & (estimate.segments[start] == estimate.segments[end])
     start, end = start[covered], end[covered]
     if len(start) == 0:
         raise GavoError(f"relative pose error: no poses {delta:g} s apart that the ground truth covers")
@@ -182,16 +187,18 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
 
 
 def _relative_pose_error_frames(estimate: Trajectory, truth: Trajectory, delta: int) -> RelativePoseError:
-    stamps, estimated, true = _associated(estimate, truth, MAX_DIFFERENCE, "relative pose error")
-    if len(stamps) <= delta:
+    associated, true = _associated(estimate, truth, MAX_DIFFERENCE, "relative pose error")
+    stamps, estimated, segments = associated.timestamps, associated.world_T_camera, associated.segments
+    start = np.flatnonzero(segments[:-delta] == segments[delta:])
+    if len(start) == 0:
         raise GavoError(f"relative pose error: no associated poses {delta} frames apart ({len(stamps)} associate)")
-    start_T_end = inverse(estimated[:-delta]) @ estimated[delta:]
-    true_start_T_end = inverse(true[:-delta]) @ true[delta:]
+    start_T_end = inverse(estimated[start]) @ estimated[start + delta]
+    true_start_T_end = inverse(true[start]) @ true[start + delta]
     definition = (
         f"inv(true_i_T_j) @ est_i_T_j over {delta} frames, all pairs, nearest stamps within {MAX_DIFFERENCE:g} s"
     )
     error = inverse(true_start_T_end) @ start_T_end
-    return _relative_pose_error(error, stamps[:-delta], definition, delta, "frames")
+    return _relative_pose_error(error, stamps[start], definition, delta, "frames")
 
 
 def _relative_pose_error(
@@ -222,17 +229,16 @@ def rotation_angle(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " 
 
 def _associated(
     estimate: Trajectory, truth: Trajectory, max_difference: float, what: str
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
-    """Return stamps, estimated and true `world_T_camera` of the poses that associate, in the order of their stamps."""
+) -> tuple[Trajectory, Float[np.ndarray, "n 4 4"]]:
+    """Return the estimate's poses that associate, in the order of their stamps, and the true `world_T_camera`."""
     i, j = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(i) < 2:
         raise GavoError(f"{what}: only {len(i)} poses of estimate and ground truth within {max_difference:g} s")
-    return estimate.timestamps[i], estimate.world_T_camera[i], truth.world_T_camera[j]
+    return estimate[i], truth.world_T_camera[j]
 
 
 def _sorted(trajectory: Trajectory) -> Trajectory:
-    order = np.argsort(trajectory.timestamps, kind="stable")
-    return Trajectory(trajectory.timestamps[order], trajectory.world_T_camera[order])
+    return trajectory[np.argsort(trajectory.timestamps, kind="stable")]
 
 
 def _closest_index(sorted_stamps: Float[np.ndarray, " n"], queries: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:

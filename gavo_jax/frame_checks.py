@@ -24,6 +24,8 @@ class Use(enum.Enum):
     NOTHING = "nothing"
     TARGET = "target"
     """It can be aligned with a reference, but makes a poor one itself."""
+    GREY = "grey"
+    """Its image can be aligned with a reference; its depth is worth nothing."""
     ALL = "all"
 
 
@@ -41,6 +43,11 @@ class History(NamedTuple):
     """Latest stamp, seconds."""
     checksum: int | None = None
     """Of the last readable image."""
+    thumbnail: tuple[int, ...] = ()
+    """Some of its pixels."""
+    depth_checksum: int | None = None
+    """Of the last depth image, and the stamp that came with it."""
+    depth_timestamp: float | None = None
     intervals: tuple[float, ...] = ()
     """Between the last frames, seconds."""
     clipped: tuple[float, ...] = ()
@@ -48,7 +55,8 @@ class History(NamedTuple):
     coverages: tuple[float, ...] = ()
     """Shares of pixels with depth of the last frames that had any."""
     range: float | None = None
-    """Median depth of the last good frame, metres."""
+    """Median depth of the last good frame, metres, and that frame's stamp."""
+    range_timestamp: float = 0.0
     doubts: int = 0
     """Frames in a row that were refused only for being unlike those before."""
 
@@ -72,7 +80,11 @@ MIN_COVERAGE_RATIO = 0.7
 """Depth readings, against their usual number, below which depth is partial; the TUM clips stay above 0.92."""
 MAX_RANGE_RATIO = 2.5
 """A median depth that grows or shrinks by more than this from a frame to the next is in other units; handheld motion
-stays within 1.4 a frame."""
+stays within 1.4 a frame. The limit's logarithm grows with the time between,"""
+RANGE_AGE = 0.1
+"""in seconds, beyond this."""
+MAX_DUPLICATE_DIFFERENCE = 2
+"""Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
 DEPTH_RANGE = (0.4, 15.0)
 """Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer). Millimetres that are
 read as fifths of one put a scene nearer than 2 m there."""
@@ -114,10 +126,17 @@ def check_frame(
     status = _check_image(grey, clipped)
     if status is not AlignmentStatus.OK:
         return _refused(status), history
-    if checksum == repeated:
+    thumbnail = grey[::ROW_STEP, :: ROW_STEP**2].astype(int)
+    before = np.array(history.thumbnail)
+    history = history._replace(thumbnail=tuple(thumbnail.ravel().tolist()))
+    near = before.size == thumbnail.size and np.abs(thumbnail.ravel() - before).max() <= MAX_DUPLICATE_DIFFERENCE
+    if checksum == repeated or near:
         return _refused(AlignmentStatus.FROZEN), history
     if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
         return _doubt(_refused(AlignmentStatus.BLANK), history)
+    frozen, history = _is_depth_frozen(frame, history)
+    if frozen:
+        return Finding(AlignmentStatus.FROZEN, Use.GREY), history
     depth, history = _check_depth(np.asarray(frame.depth)[::ROW_STEP], camera.depth_scale, history)
     if depth.use is Use.NOTHING:
         return _doubt(depth, history)
@@ -169,6 +188,16 @@ def _check_image(grey: np.ndarray, clipped: float) -> AlignmentStatus:
     return AlignmentStatus.OK
 
 
+def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
+    """Whether depth is the last frame's once more, though it claims to be of another moment."""
+    checksum, stamp = (
+        zlib.crc32(np.asarray(frame.depth)[:: ROW_STEP**2].tobytes()),
+        frame.depth_timestamp,
+    )
+    repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
+    return repeated, history._replace(depth_checksum=checksum, depth_timestamp=stamp)
+
+
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:
     """Coverage and range of depth against what was usual."""
     readings = depth[(depth > 0) & _is_finite(depth)]
@@ -179,10 +208,10 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     history = history._replace(coverages=_remember(history.coverages, coverage))
     range_m = float(np.median(readings[::ROW_STEP])) / depth_scale
     if history.range is not None:
-        ratio = range_m / history.range
-        if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
+        age = (history.timestamp or 0.0) - history.range_timestamp
+        if abs(math.log(range_m / history.range)) > math.log(MAX_RANGE_RATIO) * max(age / RANGE_AGE, 1.0):
             return _refused(AlignmentStatus.DEPTH_UNITS), history
-    history = history._replace(range=range_m)
+    history = history._replace(range=range_m, range_timestamp=history.timestamp or 0.0)
     if not DEPTH_RANGE[0] < range_m < DEPTH_RANGE[1]:
         return Finding(AlignmentStatus.DEPTH_UNITS, Use.ALL), history
     if coverage < MIN_COVERAGE_RATIO * usual:

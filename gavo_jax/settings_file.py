@@ -7,7 +7,6 @@ A settings file is TOML: `method` and `preset` at the top say what it starts fro
 import dataclasses
 import difflib
 import json
-import tomllib
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ import optax
 import tomli_w
 
 from gavo_jax import presets
-from gavo_jax.errors import GavoError, read_text, shown, write_bytes
+from gavo_jax.errors import GavoError, parse_toml, read_text, read_toml, shown, write_bytes
 from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
@@ -103,16 +102,18 @@ def assignments(texts: Iterable[str], place: str = "--set") -> dict[str, Any]:
         if not (name and sign and value):
             raise GavoError(f"{place}: {shown(text)} is not NAME=VALUE")
         try:
-            values[name] = tomllib.loads(f"value = {value}")["value"]
-        except (tomllib.TOMLDecodeError, RecursionError):
+            values[name] = parse_toml(place, f"value = {value}")["value"]
+        except GavoError:
             values[name] = value
     return values
 
 
 def _read_table(path: Path) -> dict[str, Any]:
+    if path.suffix != ".json":
+        return read_toml(path, MAX_FILE_BYTES)
     text = read_text(path, MAX_FILE_BYTES)
     try:
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        table = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise GavoError(f"{path}: cannot be read: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(table, dict):

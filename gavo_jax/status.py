@@ -1,6 +1,10 @@
 """What can be said of a frame or of a pair, each with a sentence for people."""
 
 import enum
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
 
 
 class AlignmentStatus(enum.IntEnum):
@@ -23,6 +27,8 @@ class AlignmentStatus(enum.IntEnum):
     GAP = 14
     NO_REFERENCE = 15
     NOT_RIGID = 16
+    IMPLAUSIBLE_MOTION = 17
+    DEPTH_MISMATCH = 18
 
     @property
     def sentence(self) -> str:
@@ -41,11 +47,47 @@ _SENTENCES = {
     AlignmentStatus.UNREADABLE: "The frame could not be read.",
     AlignmentStatus.BLANK: "The image is black, white or saturated.",
     AlignmentStatus.NOISE: "The image is noise.",
-    AlignmentStatus.FROZEN: "The image is the last one once more.",
+    AlignmentStatus.FROZEN: "The image, or its depth, is the last one once more.",
     AlignmentStatus.DEPTH_UNITS: "The depth's range is unlikely: its units may not be the camera's.",
     AlignmentStatus.PARTIAL_DEPTH: "Much of the usual depth is missing.",
     AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
     AlignmentStatus.GAP: "Frames are missing before this one.",
     AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
     AlignmentStatus.NOT_RIGID: "The result is no rigid motion: this machine computes wrong numbers (see gavo doctor).",
+    AlignmentStatus.IMPLAUSIBLE_MOTION: "A camera can hardly move like that: the image may not belong to its stamp.",
+    AlignmentStatus.DEPTH_MISMATCH: "Depth does not agree with the motion that the images show.",
 }
+
+GRAVITY = (
+    AlignmentStatus.AMBIGUOUS,
+    AlignmentStatus.LOW_TEXTURE,
+    AlignmentStatus.IMPLAUSIBLE_MOTION,
+    AlignmentStatus.DEPTH_MISMATCH,
+    AlignmentStatus.HIGH_ERROR,
+    AlignmentStatus.LOW_OVERLAP,
+    AlignmentStatus.NOT_FINITE,
+    AlignmentStatus.NO_DEPTH,
+    AlignmentStatus.NOT_RIGID,
+)
+"""What can be found of a motion, the gravest last: of several findings that one is the status."""
+
+
+def bit(status: AlignmentStatus) -> int:
+    """A status as one of several findings: an integer of one bit."""
+    return 1 << status
+
+
+def as_findings(criteria: Mapping[AlignmentStatus, Any]) -> Any:
+    """All statuses of which the criterion holds, as the bits of an integer; 0 where none does."""
+    found = jnp.int32(0)
+    for status, holds in criteria.items():
+        found |= jnp.where(holds, bit(status), 0)
+    return found
+
+
+def gravest(findings: Any) -> Any:
+    """The status that several findings make, as an integer."""
+    status = jnp.int32(AlignmentStatus.OK)
+    for candidate in GRAVITY:
+        status = jnp.where(findings & bit(candidate), jnp.int32(candidate), status)
+    return status

@@ -5,11 +5,12 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, data_rows, write_bytes
+from gavo_jax.errors import GavoError, data_rows, read_text, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -21,6 +22,21 @@ MAX_MAGNITUDE = 1e9
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
 
+SEGMENT_COMMENT = "# segment "
+"""Start of the comment line before the first pose of a segment, except the first."""
+
+
+def segment_comment(segment: int, before: float, after: float) -> str:
+    """The comment line before a segment's first pose.
+
+    Args:
+        segment: its number, from 0.
+        before: stamp of the last pose of the segment before, seconds.
+        after: stamp of its first pose.
+    """
+    return f"{SEGMENT_COMMENT}{segment + 1}: the motion from {before:.6f} to {after:.6f} is unknown"
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Where a camera was, when.
@@ -28,38 +44,52 @@ class Trajectory:
     Attributes:
         timestamps: seconds.
         world_T_camera: rigid transforms from the camera's frame (x right, y down, z forward) into the world, metres.
+        segments: number of the stretch that each pose belongs to; between two stretches the motion is unknown, so that
+            their worlds are not one. All 0 where nothing is said.
     """
 
     timestamps: Float[np.ndarray, " n"]
     world_T_camera: Float[np.ndarray, "n 4 4"]
+    segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Hold both as float64 arrays; raise ValueError where their shapes do not belong together."""
+        """Hold all as arrays; raise ValueError where their shapes do not belong together."""
         timestamps = np.asarray(self.timestamps, np.float64)
         world_T_camera = np.asarray(self.world_T_camera, np.float64)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
             raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_camera", world_T_camera)
+        segments = np.zeros(len(timestamps), int) if self.segments is None else np.asarray(self.segments, int)
+        if segments.shape != timestamps.shape:
+            raise ValueError(f"one segment a pose expected, got {segments.shape} for {timestamps.shape}")
+        object.__setattr__(self, "segments", segments)
 
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.timestamps)
 
+    def __getitem__(self, which: Any) -> "Trajectory":
+        """Return some of the poses: a slice, a mask or a list of places."""
+        return Trajectory(self.timestamps[which], self.world_T_camera[which], self.segments[which])
+
     @staticmethod
     def read_tum(path: str | Path) -> "Trajectory":
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
-        Rows come back in the order of their stamps; of rows with equal stamps the first is kept. Quaternions are
-        normalised.
+        A comment of `segment_comment` starts a new segment. Rows come back in the order of their stamps; of rows with
+        equal stamps the first is kept. Quaternions are normalised.
 
         Raises:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, not finite, absurdly
                 large or without a rotation (zero quaternion).
         """
-        rows = [_parse_tum_row(place, fields) for place, fields in data_rows(path)]
+        places = list(data_rows(path))
+        rows = [_parse_tum_row(place, fields) for place, fields in places]
         if not rows:
             raise GavoError(f"{path}: holds no trajectory (no rows)")
+        breaks = [n for n, line in enumerate(read_text(path).splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
+        segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
         _, first = np.unique(table[:, 0], return_index=True)
         table = table[first]
@@ -67,7 +97,7 @@ class Trajectory:
         world_T_camera[:, :3, :3] = rotation_from_quaternion(table[:, 4:])
         world_T_camera[:, :3, 3] = table[:, 1:4]
         world_T_camera[:, 3, 3] = 1.0
-        return Trajectory(table[:, 0], world_T_camera)
+        return Trajectory(table[:, 0], world_T_camera, segments[first])
 
     def write_tum(self, path: str | Path) -> None:
         """Write rows of `timestamp tx ty tz qx qy qz qw` that read back to the last digit.
@@ -75,8 +105,12 @@ class Trajectory:
         Raises:
             GavoError: the file cannot be written; nothing is left under its name then.
         """
-        rows = map(format_tum_row, self.timestamps, self.world_T_camera)
-        write_lines(path, [TRAJECTORY_HEADER, *rows])
+        lines = [TRAJECTORY_HEADER]
+        for i, row in enumerate(map(format_tum_row, self.timestamps, self.world_T_camera)):
+            if i and self.segments[i] != self.segments[i - 1]:
+                lines.append(segment_comment(self.segments[i], self.timestamps[i - 1], self.timestamps[i]))
+            lines.append(row)
+        write_lines(path, lines)
 
     def write_kitti(self, path: str | Path) -> None:
         """Write the upper 3×4 of each matrix, row by row, twelve numbers a line (KITTI odometry format, no stamps).

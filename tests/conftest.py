@@ -8,6 +8,7 @@ from pathlib import Path
 
 # JAX reads this when it is imported, so it comes first
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the package sets it where it is the first to import JAX
 
 # XLA's older way to write out a program takes little more than half the time, and the program runs a quarter slower:
 # the right choice where most time goes into compilation. `XLA_FLAGS= python -m pytest` tests what users run.
@@ -29,17 +30,31 @@ KEPT = Path.home() / ".cache" / "gavo-jax"
 os.environ.setdefault("GAVO_CACHE_DIR", str(KEPT / "test"))
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "test-jax" / processor_digest()))
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+TRACED = Path(os.environ["GAVO_CACHE_DIR"]) / "traced"
+
+MOST_MAPS = 20_000
+"""Maps of memory: a process has 65,530 by default, and each compiled program holds some."""
 
 settings.register_profile("gavo", deadline=None, derandomize=True)
 settings.load_profile("gavo")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_programs_at_a_time() -> Iterator[None]:
-    """Let go of a module's compiled programs: each holds maps of memory, of which a process has only so many."""
+def _programs_are_shared() -> Iterator[None]:
+    """Have modules use the same programs, as long as a process can hold them all."""
+    keep_programs_in(TRACED)
     yield
-    jax.clear_caches()
-    keep_programs_in(None)
+    if maps_of_memory() > MOST_MAPS:
+        jax.clear_caches()
+        keep_programs_in(None)
+
+
+def maps_of_memory() -> int:
+    """How many this process has; 0 where the system does not say."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return 0
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small import CAMERA
 
-from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 
@@ -110,8 +110,10 @@ def test_optimality_is_judged_from_below(load, tmp_path: Path) -> None:
     assert np.all(np.array(pairs["minimum_from_genetic"]) <= np.array(pairs["genetic"]) * (1 + 1e-4))
 
 
-def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path) -> None:
-    load("kernel").main(levels="3,4", population=8, rounds=1, json=tmp_path / "kernel.json")
+def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel: ModuleType = load("kernel")
+    monkeypatch.setattr(kernel, "LEAST_SECONDS", 0.01)
+    kernel.main(levels="3,4", population=8, rounds=1, json=tmp_path / "kernel.json")
     record = read(tmp_path / "kernel.json")
     assert list(record["nanoseconds"]) == ["80x60", "40x30"]
     for times in record["nanoseconds"].values():
@@ -123,10 +125,10 @@ def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path) -> None:
 
 def test_faults_are_counted(load, tmp_path: Path) -> None:
     faults: ModuleType = load("faults")
-    monkey = SyntheticSequence(20, rate=10.0, speed=0.2)
-    faults.common.open_clip = lambda _: monkey
+    slow = SyntheticSequence(20, camera=CAMERA, rate=10.0, speed=0.2)
+    faults.common.open_clip = lambda _: slow
     chosen = "black,truncated PNG,equal stamps"
-    faults.main(clip=CLIP, clips=CLIP, method="gauss-newton", faults=chosen, json=tmp_path / "faults.json")
+    faults.main(clips=CLIP, method="gauss-newton", faults=chosen, json=tmp_path / "faults.json")
     record = read(tmp_path / "faults.json")
     assert [row["fault"] for row in record["faults"]] == chosen.split(",")
     for row, status in zip(record["faults"], ("blank", "unreadable", "bad_timestamp"), strict=True):
@@ -135,7 +137,7 @@ def test_faults_are_counted(load, tmp_path: Path) -> None:
     [clean] = record["clean"]
     assert clean["pairs"] == 19 and clean["false_alarms"] == 1 - clean["statuses"].get("ok", 0) / 19
     with pytest.raises(GavoError, match="nonsense"):
-        faults.main(clip=CLIP, faults="nonsense")
+        faults.main(clips=CLIP, faults="nonsense")
 
 
 def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
@@ -233,8 +235,7 @@ def test_footprint_tells_a_process_that_grows(load, tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_footprint_times_and_weighs_processes(load, tmp_path: Path) -> None:
     footprint: ModuleType = load("footprint")
-    camera = Camera(fx=130.0, fy=130.0, cx=79.5, cy=59.5, width=160, height=120)
-    footprint.common.open_clip = lambda _: SyntheticSequence(4, camera=camera, speed=0.2)
+    footprint.common.open_clip = lambda _: SyntheticSequence(4, camera=CAMERA, speed=0.2)
     footprint.main(clip=CLIP, methods="gauss-newton", starts=1, lengths="3,9", json=tmp_path / "footprint.json")
     figures = read(tmp_path / "footprint.json")["methods"]["gauss-newton"]
     [empty], [filled] = figures["start"].values()
@@ -280,8 +281,26 @@ def test_depth_weight_compares_the_channels(load, tmp_path: Path) -> None:
 
 
 def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
-    load("viewer").main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
+    viewer: ModuleType = load("viewer")
+    viewer.common.open_clip = lambda _: SyntheticSequence(8, camera=CAMERA, rate=5.0, speed=0.2)
+    viewer.main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
     figures = read(tmp_path / "viewer.json")["methods"]["gauss-newton"]
     [without], [saved] = figures["runs"]["none"], figures["runs"]["save"]
     assert figures["ratio"] == pytest.approx(saved["milliseconds"] / without["milliseconds"])
     assert without["megabytes"] == 0 < figures["megabytes"] < 1
+
+
+def test_surfaces_that_tell_little_are_told(load, tmp_path: Path) -> None:
+    texture: ModuleType = load("texture")
+    texture.main(methods="gauss-newton", scenes="upright bands; textured wall", noise="1", json=tmp_path / "t.json")
+    cases = read(tmp_path / "t.json")["cases"]
+    assert [case["status"] for case in cases] == ["low_texture"] * 2 + ["ok"] * 2
+    assert all(case["fine"] for case in cases) and cases[0]["undetermined"].startswith("translation along y")
+
+
+def test_accelerations_are_those_of_the_path(load, tmp_path: Path) -> None:
+    acceleration: ModuleType = load("acceleration")
+    acceleration.common.open_clip = lambda _: SyntheticSequence(20)
+    acceleration.main(clips=CLIP, json=tmp_path / "a.json")
+    rows = read(tmp_path / "a.json")["rows"]
+    assert len(rows) == 3 and all(0 < row["m/s"] < 5 and 0 < row["m/s²"] < 15 for row in rows)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import RIM, Camera, camera_for_sequence, load_camera
+from gavo_jax.camera import RIM, Camera, preset_for_sequence
+from gavo_jax.camera_files import load_camera
 from gavo_jax.errors import GavoError
 
 SMALL = Camera(50.0, 52.0, 31.2, 23.9, 64, 48)
@@ -153,16 +154,19 @@ def test_undistortion_agrees_with_opencv():
         ("FR2_desk", "fr2"),
         ("rgbd_dataset_freiburg3_long_office_household", "fr3"),
         ("clip-fr3", "fr3"),
+        ("rgbd_bonn_balloon", "bonn"),
+        ("living_room_traj2_frei_png", "icl"),
+        ("icl-office", "icl"),
     ],
 )
 def test_sequence_names_pick_the_preset(name, preset):
-    assert camera_for_sequence(name) == Camera.preset(preset)
+    assert preset_for_sequence(name) == preset
 
 
-@pytest.mark.parametrize("name", ["office", "fr4_x", "fr12", "afr1_x", ""])
+@pytest.mark.parametrize("name", ["office", "fr4_x", "fr12", "afr1_x", "bonn", "icloud", "vehicle", ""])
 def test_other_sequence_names_ask_for_a_camera(name):
     with pytest.raises(GavoError, match="--camera"):
-        camera_for_sequence(name)
+        preset_for_sequence(name)
 
 
 def test_camera_files(tmp_path):

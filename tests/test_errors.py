@@ -1,8 +1,10 @@
 """Files that are written whole or not at all."""
 
+import pickle
+
 import pytest
 
-from gavo_jax.errors import PARTIAL, GavoError, write_bytes
+from gavo_jax.errors import PARTIAL, GavoError, printable, write_bytes
 
 
 def test_a_planted_link_is_not_followed(tmp_path):
@@ -26,3 +28,22 @@ def test_a_folder_in_the_way_is_one_line(tmp_path):
     with pytest.raises(GavoError, match="rows.txt: cannot be written: ") as fault:
         write_bytes(tmp_path / "rows.txt", b"whole")
     assert "\n" not in str(fault.value) and not (tmp_path / "rows.txt").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["\x1b[31m", "\x9b31m", "\x07", "a\nb", "\u202eevil", "\udcff", "\x7f", "\u2028", "\x00"]
+)
+def test_what_would_command_a_terminal_is_shown_as_code(text):
+    shown = printable(text)
+    assert shown.isprintable() and "\\" in shown
+    assert str(GavoError(f"{text}: not a file")).isprintable()
+
+
+def test_words_of_any_language_stay_as_they_are():
+    for text in ("Bäume/日本語/πλάτος", "C:\\new\\x1b", "a b", ""):
+        assert printable(text) == text
+
+
+def test_the_message_outlives_a_process_border():
+    fault = GavoError("a\x1bb:  twice\nas long")
+    assert str(fault) == "a\\x1bb: twice as long" == str(pickle.loads(pickle.dumps(fault)))

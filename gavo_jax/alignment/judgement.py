@@ -5,17 +5,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Integer
+from jaxtyping import Array, Bool, Float
 
+from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.visits import Level, Search
-from gavo_jax.objective.derivatives import Linearization
+from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
-from gavo_jax.objective.estimates import estimate_scales, explained_share
+from gavo_jax.objective.estimates import ExplainedShare, estimate_scales, explained_share
 from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import departure_from_rigid, exp, log
 from gavo_jax.settings import AlignmentOptions
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.status import AlignmentStatus, as_findings, bit, gravest
 
 MIN_DEPTH_SHARE = 0.05
 """Share of the reference's points with a reading below which a pair is `NO_DEPTH`."""
@@ -58,10 +59,22 @@ def conclude(
     if options.last_step and not options.symmetric:
         problem = replace(problem, origin=_refine(problem, residuals))
         residuals = objective.residuals(problem.origin)
-    model, scatter = problem.examine(residuals)
     motion = problem.origin
-    covariance, status = _judge(Evidence(motion, residuals, model, scatter), objective, search.rival)
-    return Alignment(motion, log(motion), model.error, model.overlap, covariance, status, history)
+    evidence = _examine(problem, residuals)
+    covariance = _covariance(evidence, objective)
+    findings = as_findings(find_against(evidence, covariance, objective, search.rival))
+    known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
+    return Alignment(
+        motion,
+        log(motion),
+        evidence.model.error,
+        evidence.model.overlap,
+        jnp.where(known, covariance, jnp.nan),
+        gravest(findings),
+        history,
+        findings,
+        evidence.explained,
+    )
 
 
 def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
@@ -80,11 +93,28 @@ class Evidence(NamedTuple):
     """What the images say of one motion at the finest level."""
 
     motion: Float[Array, "4 4"]
-    residuals: Residuals
+    inside: Float[Array, ""]
+    """Points that both frames see."""
     model: Linearization
     """E and its derivatives by a step on the reference's side."""
     scatter: Float[Array, "6 6"]
     """Covariance of E's gradient."""
+    information: Information
+    explained: ExplainedShare
+
+
+def _examine(problem: Problem, r: Residuals) -> Evidence:
+    """What the images say of the problem's origin, of which these are the residuals."""
+    # held back, or XLA would compute them anew for each that uses them
+    terms = jax.lax.optimization_barrier(weighted_terms(problem.objective, problem.objective.reference, r))
+    return Evidence(
+        motion=problem.origin,
+        inside=jnp.sum(r.inside),
+        model=problem.linearize_terms(r, terms),
+        scatter=problem.scatter(r, terms),
+        information=measure_information(problem, r, terms),
+        explained=explained_share(r),
+    )
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
@@ -92,39 +122,45 @@ def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
-def _judge(
-    evidence: Evidence, objective: Objective, rival: Float[Array, ""]
-) -> tuple[Float[Array, "6 6"], Integer[Array, ""]]:
-    """Covariance and status of a motion."""
-    motion, model = evidence.motion, evidence.model
-    inverse = jnp.linalg.inv(_regular(model.hessian))
-    # the scatter tells nothing of a direction in which the images happen to agree, or say nothing: what independent
-    # residuals would leave of it stays
-    least = 2.0 * objective.scales.grey**2 / jnp.maximum(jnp.sum(evidence.residuals.inside), 1.0) * inverse
+def _covariance(evidence: Evidence, objective: Objective) -> Float[Array, "6 6"]:
+    """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
+    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree); a direction
+    that is not determined has `UNDETERMINED`.
+    """
+    inverse = evidence.information.inverse()
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
     covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
-    covariance = 0.5 * (covariance + covariance.T)
+    open_ways = jnp.where(evidence.information.determined, 0.0, evidence.information.directions)
+    open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
+    covariance += open_ways @ open_ways.T
+    return 0.5 * (covariance + covariance.T)
+
+
+def find_against(
+    evidence: Evidence, covariance: Float[Array, "6 6"], objective: Objective, rival: Float[Array, ""]
+) -> dict[AlignmentStatus, Bool[Array, ""]]:
+    """All that can be said against a motion, by its status; docs/status.md gives the reasons."""
+    motion, model, explained = evidence.motion, evidence.model, evidence.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
-    explained = explained_share(evidence.residuals)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
     contrast = jnp.std(objective.reference.grey, where=has_reading)
-    status = jnp.int32(AlignmentStatus.OK)
-    for found, value in (
-        (rival < MAX_RIVAL, AlignmentStatus.AMBIGUOUS),
-        (wide | (contrast < MIN_CONTRAST), AlignmentStatus.LOW_TEXTURE),
-        (unexplained, AlignmentStatus.HIGH_ERROR),
-        (model.overlap < MIN_FINAL_OVERLAP, AlignmentStatus.LOW_OVERLAP),
-        (~finite, AlignmentStatus.NOT_FINITE),
-        (jnp.mean(has_reading) < MIN_DEPTH_SHARE, AlignmentStatus.NO_DEPTH),
-        (departure_from_rigid(motion) > MAX_DEPARTURE, AlignmentStatus.NOT_RIGID),
-    ):
-        status = jnp.where(found, jnp.int32(value), status)
-    return covariance, status
+    return {
+        AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,
+        AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(evidence.information.determined),
+        AlignmentStatus.HIGH_ERROR: unexplained,
+        AlignmentStatus.LOW_OVERLAP: model.overlap < MIN_FINAL_OVERLAP,
+        AlignmentStatus.NOT_FINITE: ~finite,
+        AlignmentStatus.NO_DEPTH: jnp.mean(has_reading) < MIN_DEPTH_SHARE,
+        AlignmentStatus.NOT_RIGID: departure_from_rigid(motion) > MAX_DEPARTURE,
+    }
 
 
+UNDETERMINED = 0.5
+"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
 LARGEST_STEP = 0.01
 """Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
 images leave open; it is not taken."""

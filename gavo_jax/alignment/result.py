@@ -6,8 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.se3 import rigid
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.status import AlignmentStatus, bit
 
 
 class Alignment(NamedTuple):
@@ -26,25 +27,39 @@ class Alignment(NamedTuple):
     overlap: Float[Array, ""]
     """Share of the reference's points that land inside the target."""
     covariance: Float[Array, "6 6"]
-    """Covariance of δ in target_T_reference · exp(δ), δ = (v, w) in metres and radians."""
+    """Covariance of δ in target_T_reference · exp(δ), δ = (v, w) in metres and radians; not-a-number where nothing is
+    known."""
     status: Any
-    """`AlignmentStatus`."""
+    """`AlignmentStatus`: the gravest of what was found."""
     history: Float[Array, " iterations"]
     """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
+    findings: Any = 0
+    """Every status that holds, `OK` apart: the bits of an integer; see `statuses`."""
+    explained: ExplainedShare = ExplainedShare(np.float32(np.nan), np.float32(np.nan))  # pyright: ignore
+    """Share of the grey and of the depth residuals that are not large."""
+
+    @property
+    def statuses(self) -> tuple[AlignmentStatus, ...]:
+        """Every status that holds, the one that counts first; `OK` alone where nothing speaks against the motion."""
+        others = (other for other in AlignmentStatus if int(self.findings) & bit(other) and other != self.status)
+        return (self.status, *others)
 
     @property
     def undetermined(self) -> str:
-        """Of a pair that is `LOW_TEXTURE` the direction of motion that the images constrain least, in the axes of the
-        reference camera: one or two of ξ's six, as words. Else empty.
+        """Of a pair that is `LOW_TEXTURE` the directions of motion that the images leave open, in the axes of the
+        reference camera: some of ξ's six, as words, joined by "with" where only their mixture is open. Else empty.
         """
         covariance = np.asarray(self.covariance, np.float64)
-        if self.status != AlignmentStatus.LOW_TEXTURE or not np.isfinite(covariance).all():
+        if AlignmentStatus.LOW_TEXTURE not in self.statuses or not np.isfinite(covariance).all():
             return ""
         tolerable = np.repeat([MAX_TRANSLATION_DEVIATION, MAX_ROTATION_DEVIATION], 3)
-        _, vectors = np.linalg.eigh(covariance / np.outer(tolerable, tolerable))
-        share = vectors[:, -1] ** 2
-        main = [axis for axis in np.argsort(-share)[:2] if share[axis] > share.max() / 4]
-        return " with ".join(f"{('translation along', 'rotation about')[axis // 3]} {'xyz'[axis % 3]}" for axis in main)
+        values, vectors = np.linalg.eigh(covariance / np.outer(tolerable, tolerable))
+        is_open = values > min(1.0, values[-1])
+        is_open[-1] = True
+        share = np.sum(vectors[:, is_open] ** 2, axis=1)
+        main = [axis for axis in np.argsort(-share, kind="stable") if share[axis] > share.max() / 16]
+        words = (f"{('translation along', 'rotation about')[axis // 3]} {'xyz'[axis % 3]}" for axis in main)
+        return (" with " if np.sum(is_open) == 1 else ", ").join(words)
 
     @property
     def sentence(self) -> str:
@@ -68,6 +83,14 @@ def on_host(alignment: Alignment) -> Alignment:
     return host._replace(target_T_reference=rigid(host.target_T_reference), status=status)
 
 
+def with_finding(result: Alignment, status: AlignmentStatus) -> Alignment:
+    """A result with one more finding; it is the status where nothing else was found."""
+    if status is AlignmentStatus.OK:
+        return result
+    first = status if result.status == AlignmentStatus.OK else result.status
+    return result._replace(status=first, findings=int(result.findings) | bit(status))
+
+
 def no_alignment(status: AlignmentStatus) -> Alignment:
     """The result of a pair that could not be aligned at all: no motion, nothing known."""
     nothing: dict[str, Any] = {
@@ -78,4 +101,4 @@ def no_alignment(status: AlignmentStatus) -> Alignment:
         "covariance": np.full((6, 6), np.nan, np.float32),
         "history": np.zeros(0, np.float32),
     }
-    return Alignment(**nothing, status=status)
+    return Alignment(**nothing, status=status, findings=bit(status) if status else 0)

@@ -6,17 +6,32 @@ import io
 import itertools
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import tyro
 
-from gavo_jax import compiler
-from gavo_jax.cli.options import Align, Command, Compare, Doctor, Download, Evaluate, Experiment, Run, Tune, View
-from gavo_jax.errors import GavoError
+from gavo_jax import compiler, interrupts
+from gavo_jax.cli.options import (
+    Align,
+    Command,
+    Compare,
+    Doctor,
+    Download,
+    Evaluate,
+    Experiment,
+    Inspect,
+    Run,
+    Tune,
+    View,
+)
+from gavo_jax.early import INTERRUPTED
+from gavo_jax.errors import GavoError, GavoWarning, printable
 from gavo_jax.version import __version__
 
-BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-"""Exit statuses; 0 is done, 3 is `cli.run.LOST` (`--strict`)."""
+BAD_INPUT, BROKEN_PIPE = 2, 141
+"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `cli.run.LOST` (`--strict`)."""
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""
@@ -34,6 +49,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with interrupts.raised(), _told_warnings():
+        try:
+            status = _run(arguments)
+        except KeyboardInterrupt as interrupt:
+            status = _stop(str(interrupt))
+        except Exception:
+            if not interrupts.came():  # else it is what a library made of the interrupt
+                raise
+            status = _stop("")
+    interrupts.leave(status)
+    return status
+
+
+def _stop(words: str) -> int:
+    interrupts.ignore()
+    _tell(f"interrupted{words}")
+    return INTERRUPTED
+
+
+def _run(arguments: list[str]) -> int:
+    """Parse and execute; return the exit status."""
     if arguments == ["--version"]:
         print(f"gavo-jax {__version__}")
         return 0
@@ -44,9 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except GavoError as error:
         return _refuse(str(error))
-    except KeyboardInterrupt as interrupt:
-        print(f"gavo: interrupted{interrupt}", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         _silence_output()
         return BROKEN_PIPE
@@ -55,6 +88,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _silence_output()
         return _refuse(f"{error.filename or 'output'}: cannot be written to: {error.strerror}")
+
+
+@contextlib.contextmanager
+def _told_warnings() -> Iterator[None]:
+    """Print this package's warnings as one line each; others as they always are."""
+    show = warnings.showwarning
+
+    def tell(message: Any, category: type[Warning], *where: Any) -> None:
+        if issubclass(category, GavoWarning):
+            _tell(f"warning: {message}")
+        else:
+            show(message, category, *where)
+
+    warnings.showwarning = tell
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 def _open_streams() -> None:
@@ -115,6 +166,10 @@ def _execute(command: Command) -> int:
             from gavo_jax.cli.doctor import doctor
 
             return doctor(command)
+        case Inspect():
+            from gavo_jax.cli.inspect import inspect
+
+            return inspect(command)
 
 
 def _parse(arguments: list[str]) -> Command | None:
@@ -147,7 +202,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor")
+    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor", "inspect")
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 
@@ -157,5 +212,10 @@ def _silence_output() -> None:
 
 
 def _refuse(message: str) -> int:
-    print(f"gavo: {' '.join(message.split())}", file=sys.stderr)
+    _tell(message)
     return BAD_INPUT
+
+
+def _tell(message: str) -> None:
+    """Print one line on standard error, whatever the words are."""
+    print(f"gavo: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)

@@ -1,5 +1,6 @@
 """`gavo compare`: the same frames through several methods, other libraries' too."""
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -7,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax import presets
-from gavo_jax.cli import INTERRUPTED
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
+from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import (
     ABSOLUTE_ERROR,
@@ -27,7 +29,7 @@ from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.output.report import REPORT, Table, write_report
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
@@ -70,10 +72,30 @@ def compare(options: Compare) -> int:
     enable_compilation_cache()
     peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
-    remove_files(folder, COMPARISON, REPORT)
-    remove_figures(folder)
+    with hold(folder):
+        remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
+        remove_figures(folder)
+        entries, status = _run_methods(options, methods, sequence, peers, folder)
+        _write(options, sequence, entries, folder)
+    say(f"files in {folder}")
+    return status
+
+
+def _earlier_trajectories(folder: Path) -> list[str]:
+    """Names of the trajectories that an earlier comparison left, of whatever methods and seeds."""
+    methods = "|".join(map(re.escape, (*presets.methods(), *PEERS)))
+    return [path.name for path in folder.iterdir() if re.fullmatch(rf"({methods})(-seed\d+)?\.txt", path.name)]
+
+
+def _run_methods(
+    options: Compare, methods: list[str], sequence: Sequence, peers: dict[str, Odometry], folder: Path
+) -> tuple[list[Entry], int]:
+    """Run the methods one after the other, each with its seeds; return what came of them, and the exit status.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it before the first run was done.
+    """
     entries: list[Entry] = []
-    status = 0
     try:
         for method in methods:
             for seed in range(options.seeds) if method not in PEERS else (None,):
@@ -82,19 +104,24 @@ def compare(options: Compare) -> int:
                 entry.trajectory.write_tum(folder / f"{method}{suffix}.txt")
                 entries.append(entry)
     except KeyboardInterrupt:
-        status = INTERRUPTED
         if not entries:
             raise
+        return entries, INTERRUPTED
+    return entries, 0
+
+
+def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: Path) -> None:
+    """Write comparison.json, then print the table, then write figures and report."""
     typical = _typical_runs(entries)
+    write_json(folder / COMPARISON, [entry.metrics for entry in entries])
+    title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
+    rows = _rows(entries, typical)
+    print_table(title, HEADINGS, rows)
     pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
     drifts = _drifts(entries)
     if plots.available() and drifts:
         figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
         pictures.append(save_figure(figure, folder, "drift"))
-    write_json(folder / COMPARISON, [entry.metrics for entry in entries])
-    title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
-    rows = _rows(entries, typical)
-    print_table(title, HEADINGS, rows)
     write_report(
         folder / REPORT,
         f"gavo compare: {title}",
@@ -105,8 +132,6 @@ def compare(options: Compare) -> int:
         f"First frame at {sequence.timestamps[0]:.6f} s, last at {sequence.timestamps[-1]:.6f} s; "
         f"device {entries[0].metrics['device']}.",
     )
-    print(f"files in {folder}")
-    return status
 
 
 def _parse_methods(text: str) -> list[str]:

@@ -12,7 +12,9 @@ from packaging.requirements import Requirement
 
 from gavo_jax import compiler
 from gavo_jax.cli.options import Doctor
-from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache
+from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache, why_not_private
+from gavo_jax.interrupts import interruptible
+from gavo_jax.output.screen import say
 from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
@@ -27,27 +29,27 @@ def doctor(command: Doctor) -> int:
     del command
     enable_compilation_cache()
     faults = []
-    print(f"gavo-jax: {__version__}")
+    say(f"gavo-jax: {__version__}")
     for name in PACKAGES:
-        print(f"{name}: {_version(name) or NOT_INSTALLED}")
-    print(f"python: {platform.python_version()} ({platform.python_implementation()})")
-    print(f"system: {platform.platform()}")
-    print(f"processor: {compiler.processor()}, {os.cpu_count()} cores, {_usable_cores()} of them for this process")
-    print(f"devices: {', '.join(f'{device.platform} {device.device_kind}' for device in jax.devices())}")
+        say(f"{name}: {_version(name) or NOT_INSTALLED}")
+    say(f"python: {platform.python_version()} ({platform.python_implementation()})")
+    say(f"system: {platform.platform()}")
+    say(f"processor: {compiler.processor()}, {os.cpu_count()} cores, {_usable_cores()} of them for this process")
+    say(f"devices: {', '.join(f'{device.platform} {device.device_kind}' for device in jax.devices())}")
     fault = compiler.unfit_compiler()
     if fault:
-        print(f"compiler: WRONG: {fault}")
+        say(f"compiler: WRONG: {fault}")
         faults.append("the version of JAX")
     described, is_writable = _cache()
-    print(f"cache: {described}")
+    say(f"cache: {described}")
     if elsewhere := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        print(f"cache of compiled programs: {_without_home(Path(elsewhere))}")
+        say(f"cache of compiled programs: {_without_home(Path(elsewhere))}")
     if not is_writable:
         faults.append("the cache folder")
     for line in _extras():
-        print(f"extra {line}")
-    faults += _print_checks()
-    print("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
+        say(f"extra {line}")
+    faults += interruptible(_print_checks)
+    say("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
     return OFF if faults else 0
 
 
@@ -56,14 +58,11 @@ def _print_checks() -> list[str]:
     wrong = []
     for outcome in checks.full_size():
         verdict = "ok" if outcome.is_right else "WRONG"
-        print(
-            f"check {verdict}: {outcome.name}: off by {outcome.deviation:.1e}, at most {outcome.tolerance:.0e}",
-            flush=True,
-        )
+        say(f"check {verdict}: {outcome.name}: off by {outcome.deviation:.1e}, at most {outcome.tolerance:.0e}")
         if not outcome.is_right:
             wrong.append(outcome.name)
     recorded = ", ".join(f"{time} on an {name}" for name, time in checks.RECORDED_NANOSECONDS.items())
-    print(f"speed: {checks.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
+    say(f"speed: {checks.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
     return wrong
 
 
@@ -84,11 +83,15 @@ def _cache() -> tuple[str, bool]:
     folder = cache_folder()
     if folder is None:
         return "none: there is no home folder, and GAVO_CACHE_DIR is not set", False
+    try:
+        if fault := why_not_private(folder):
+            return f"{_without_home(folder)}, NOT private, so NOT in use: {fault}", False
+    except OSError as error:
+        return f"{_without_home(folder)}, NOT writable: {error.strerror}", False
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-atime")]
     megabytes = sum(path.stat().st_size for path in files) / 2**20
     words = f"{_without_home(folder)}, {len(files)} programs, {megabytes:.1f} MiB"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder):
             return f"{words}, writable", True
     except OSError as error:

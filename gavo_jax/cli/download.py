@@ -9,6 +9,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from gavo_jax.cli.options import Download
 from gavo_jax.datasets.download import SERVER
 from gavo_jax.datasets.download import download as download_sequence
+from gavo_jax.errors import printable
+from gavo_jax.output.screen import say
 
 SERVER_VARIABLE = "GAVO_TUM_SERVER"
 """Environment variable that names a mirror of the benchmark."""
@@ -18,14 +20,20 @@ def download(options: Download) -> int:
     """Get the sequence under a progress bar on standard error; print its folder."""
     to = options.to or Path(os.environ.get("GAVO_DATA") or "data")
     console = Console(stderr=True)
-    columns = (TextColumn(options.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=None)
+        task = bar.add_task(printable(options.name), total=None)
 
         def show(have: int, total: int | None) -> None:
             bar.update(task, completed=have, total=total)
 
         server = os.environ.get(SERVER_VARIABLE) or SERVER
         folder = download_sequence(options.name, to, server, show)
-    print(folder)
+    say(str(folder))
     return 0

@@ -3,7 +3,7 @@
 from gavo_jax.cli.options import Evaluate
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error, distance_error, relative_pose_error
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.trajectory import Trajectory
 
 
@@ -30,7 +30,7 @@ def evaluate(options: Evaluate) -> int:
     title = f"{options.estimate} against {options.groundtruth}"
     print_table(title, ("", "RMSE", "mean", "median", "max", "count"), rows)
     for name, errors in series.items():
-        print(f"{name}: {errors.definition}.")
+        say(f"{name}: {errors.definition}.")
     return 0
 
 

@@ -4,26 +4,28 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Experiment
 from gavo_jax.compilation_cache import enable_compilation_cache
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, printable, read_text
+from gavo_jax.experiments.distinction import tell_apart
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.summary import DRIFT, ROTATION_DRIFT, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
+from gavo_jax.locks import hold
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import save_figure
 from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.report import REPORT as PAGE
 from gavo_jax.output.report import Picture, write_report
 from gavo_jax.output.report import Table as ReportTable
-from gavo_jax.output.screen import markdown_table, number, pair_progress, print_table
+from gavo_jax.output.screen import markdown_table, number, pair_progress, print_table, say
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"
@@ -38,6 +40,18 @@ TEST = (
     "signed-rank test, not corrected for the number of comparisons"
 )
 Printed = Mapping[tuple[str, str], float]
+
+
+class Record(NamedTuple):
+    """What a report needs of an experiment beside the table."""
+
+    name: str
+    printed: Printed
+    """Drift that a publication gives, by sequence and label, m/s."""
+    order: Mapping[tuple[str, str], int]
+    """Of sequence and label."""
+    runs: frozenset[str]
+    """Hashes of the experiment's runs as its file was last."""
 
 
 def experiment(options: Experiment) -> int:
@@ -55,7 +69,19 @@ def experiment(options: Experiment) -> int:
         return 0
     prepare_folder(plan.folder)
     enable_compilation_cache()
-    with closing(RayExecutor(plan.ray)) if options.executor == "ray" else nullcontext(LocalExecutor()) as executor:
+    with hold(plan.folder):
+        _run_missing(plan, table, options.executor)
+        return _report(plan.folder, options.markdown)
+
+
+def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:
+    """Say what will be run, and run it.
+
+    Raises:
+        GavoError: a batch failed, or the table cannot be written.
+        KeyboardInterrupt: it says how far the runs have come.
+    """
+    with closing(RayExecutor(plan.ray)) if executor_name == "ray" else nullcontext(LocalExecutor()) as executor:
         runs = missing(plan, table)
         _print_plan(plan, table, runs, executor.slots())
         write_json(plan.folder / PLAN, _record(plan))
@@ -69,7 +95,6 @@ def experiment(options: Experiment) -> int:
                 ) from None
     if finished.faults:
         raise GavoError(f"{len(finished.faults)} batches of runs failed: {'; '.join(finished.faults)}")
-    return report(plan.folder, options.markdown)
 
 
 def _news(outcome: Outcome) -> str:
@@ -80,10 +105,20 @@ def _news(outcome: Outcome) -> str:
 
 def report(folder: Path, markdown: bool = False) -> int:
     """Print the tables of an experiment's folder, as Markdown if so asked; write report.html and the figure there."""
-    rows = Table(folder).read()
-    printed, order = _read_record(folder)
+    if not folder.is_dir():
+        raise GavoError(f"{folder}: no results of an experiment: no such folder")
+    with hold(prepare_folder(folder)):
+        return _report(folder, markdown)
+
+
+def _report(folder: Path, markdown: bool) -> int:
+    record = _read_record(folder)
+    printed, order = record.printed, record.order
+    rows = tell_apart(Table(folder).read(), record.runs)
     rows.sort(key=lambda row: (order.get((row["sequence"], row["label"]), len(order)), row["seed"] or 0))
-    summaries, comparisons = summarise(rows), compare(rows)
+    others = [row for row in rows if record.runs and row["run"] not in record.runs]
+    earlier = {row["sequence"] for row in others} - {row["sequence"] for row in rows if row["run"] in record.runs}
+    summaries, comparisons = summarise(rows), compare(rows, earlier)
     sequences = list(dict.fromkeys(summary.sequence for summary in summaries))
     tables = []
     for name in sequences:
@@ -95,20 +130,32 @@ def report(folder: Path, markdown: bool = False) -> int:
         tables.append(ReportTable(f"{name}. {TEST}.", COMPARISON_COLUMNS, cells))
         _show(f"{name}: first / second", COMPARISON_COLUMNS, cells, markdown)
     states = {_state(row) for row in rows}
-    note = "" if len(states) == 1 else f"The rows come from {len(states)} versions of the software or of what it uses."
-    print(f"{DEFINITION}\n{TEST}.{' ' if note else ''}{note}")
+    notes = []
+    if len(states) > 1:
+        notes.append(f"The rows come from {len(states)} versions of the software or of what it uses.")
+    if others:
+        notes.append(f"{len(others)} of {len(rows)} runs are none of the experiment's as its file is now.")
+    note = " ".join(notes)
+    say(DEFINITION)
+    say(f"{TEST}.{' ' if note else ''}{note}")
     configurations = {row["run"]: json.loads(row["configuration"]) for row in rows}
     page = folder / PAGE
     write_report(
-        page, f"Experiment {rows[0]['experiment']}", tables, _figures(folder, rows), configurations, environment(), note
+        page,
+        f"Experiment {record.name or rows[0]['experiment']}",
+        tables,
+        _figures(folder, rows),
+        configurations,
+        environment(),
+        note,
     )
-    print(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
+    say(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
     return 0
 
 
 def _show(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]], markdown: bool) -> None:
     if markdown:
-        print(f"{title}\n\n{markdown_table(columns, cells)}\n")
+        print(f"{printable(title)}\n\n{markdown_table(columns, cells)}\n")
     else:
         print_table(title, columns, cells)
 
@@ -129,9 +176,9 @@ def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
         rows.append((f"{name}: {label}", len(group), sum(run.id in ours for run in group), group[0].pairs))
     print_table(f"experiment {plan.name}", ("", "runs", "to do", "pairs"), rows)
     for line in plan.skipped:
-        print(line)
+        say(line)
     seconds = estimate_seconds(runs, table.read() if table.done() else [], slots)
-    print(
+    say(
         f"{len(plan.runs)} runs, {len(plan.runs) - len(runs)} of them done; {len(runs)} to do in {len(todo)} batches, "
         f"{programs(runs)} compiled programs, about {_duration(seconds)}; results in {plan.folder}"
     )
@@ -144,21 +191,22 @@ def _duration(seconds: float) -> str:
 
 
 def _record(plan: Plan) -> dict[str, Any]:
-    """What a report needs beside the table: the order of the rows, and what is printed elsewhere."""
+    """`Record` as it is written."""
     order = list(dict.fromkeys((run.part.name, run.label) for run in plan.runs))
     printed = [{"sequence": name, "label": label, "drift": value} for (name, label), value in plan.printed.items()]
-    return {"name": plan.name, "order": order, "printed": printed}
+    return {"name": plan.name, "order": order, "printed": printed, "runs": [run.id for run in plan.runs]}
 
 
-def _read_record(folder: Path) -> tuple[Printed, dict[tuple[str, str], int]]:
+def _read_record(folder: Path) -> Record:
     path = folder / PLAN
     if not path.is_file():
-        return {}, {}
+        return Record("", {}, {}, frozenset())
     try:
         record = json.loads(read_text(path))
         printed = {(entry["sequence"], entry["label"]): float(entry["drift"]) for entry in record["printed"]}
-        return printed, {(name, label): i for i, (name, label) in enumerate(record["order"])}
-    except (ValueError, KeyError, TypeError) as error:
+        order = {(name, label): i for i, (name, label) in enumerate(record["order"])}
+        return Record(str(record["name"]), printed, order, frozenset(record.get("runs", ())))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise GavoError(f"{path}: not the record of an experiment: {error}") from None
 
 

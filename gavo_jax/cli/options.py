@@ -16,15 +16,26 @@ class Source:
     """Which frames."""
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
-    """A folder in the layout of the TUM RGB-D benchmark, or the word synthetic: a room rendered by the package."""
+    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """The camera: by the sequence's name, a camera of the TUM benchmark, or a .toml or .yaml file."""
+    """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML, ROS, Kalibr,
+    OpenCV or Open3D."""
     start: Annotated[int, arg(metavar="K")] = 0
     """First frame."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Number of frames, at least 2."""
     stride: Annotated[int, arg(metavar="S")] = 1
     """Take every S-th frame."""
+    depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
+    """Raw depth units per metre: 5000 for TUM, 1000 for millimetres."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: by the stamps, else 30)")] = None
+    """Frames per second, where frames have numbers and no stamps."""
+    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
+    """Of the colour images of a recording."""
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
+    """Of the depth images of a recording."""
+    force: bool = False
+    """Go on although the depth looks as if its scale were wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,6 +189,14 @@ class Doctor:
     """Versions, machine and settings for an issue report; whether this JAX computes right numbers, and how fast."""
 
 
+@dataclass(frozen=True)
+class Inspect(Source):
+    """Say what a source is: frames, rates, sizes, depth, camera, truth, and which frames cannot be used, and why."""
+
+    json: bool = False
+    """Print it as JSON."""
+
+
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
@@ -188,4 +207,5 @@ Command = (
     | Annotated[Download, subcommand("download")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Inspect, subcommand("inspect")]
 )

@@ -1,37 +1,28 @@
 """`gavo run`: a sequence to a trajectory, its errors and figures."""
 
-import sys
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from gavo_jax.cli import INTERRUPTED
 from gavo_jax.cli.options import Run
+from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.early import INTERRUPTED
+from gavo_jax.inspection import summary
+from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.metrics import (
-    ABSOLUTE_ERROR,
-    COMPILE_SECONDS,
-    DRIFT,
-    DRIFT_PER_FRAME,
-    FINAL_DISTANCE,
-    FRAMES_PER_SECOND,
-    MILLISECONDS,
-    ROTATION_DRIFT,
-    compute_metrics,
-)
+from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, environment
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import say, tell
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.settings import Settings
 from gavo_jax.viewer.base import Viewer
@@ -42,20 +33,6 @@ LOST = 3
 
 CHECKPOINT_SECONDS = 2.0
 """Between two checkpoints; each takes some 20 ms."""
-
-FIGURES_OF_MERIT = (
-    ("drift: RPE over 1 s, translation, RMSE", DRIFT, 6, "m/s"),
-    ("drift: RPE over 1 s, rotation, RMSE", ROTATION_DRIFT, 6, "deg/s"),
-    ("RPE over 1 frame, translation, RMSE", DRIFT_PER_FRAME, 6, "m/frame"),
-    ("absolute error after alignment, RMSE", ABSOLUTE_ERROR, 6, "m"),
-    ("distance error at the end", FINAL_DISTANCE, 6, "m"),
-    ("frames", "frames", 0, ""),
-    ("lost pairs", "lost_pairs", 0, ""),
-    ("compilation", COMPILE_SECONDS, 1, "s"),
-    ("time a pair, median", MILLISECONDS, 1, "ms"),
-    ("speed, decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
-)
-"""Rows of the table: what, key in metrics.json, decimals, unit."""
 
 
 def run(options: Run) -> int:
@@ -68,22 +45,23 @@ def run(options: Run) -> int:
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
-    with RunFolder(path) as folder, viewer:
+    with RunFolder(path, getattr(sequence, "files", ())) as folder, viewer:
         odometry = Odometry(sequence.camera, settings, seed=options.seed, record=viewer.wants_populations)
         config = _config(options, settings, sequence)
         blank = blank_state(sequence.camera, settings.solver, settings.alignment)
         progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
-            print(f"gavo: {folder.path}: the run came to its end before: nothing to resume", file=sys.stderr)
+            tell(f"{folder.path}: the run came to its end before: nothing to resume")
         else:
             if progress is None:
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
+            say(summary(sequence))
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
-    _report(name, metrics, folder.path)
+    print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if interrupted:
         return INTERRUPTED
     viewer.stay()
@@ -122,9 +100,13 @@ def _track(
         **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics[COMPILE_SECONDS]),
         FRAMES_PER_SECOND: tracked.metrics[FRAMES_PER_SECOND],
     }
-    draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
-    draw_search(folder.path, sequence, odometry, tracked.steps)
     folder.finish(metrics, complete=not tracked.interrupted)
+
+    def draw_figures() -> None:
+        draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
+        draw_search(folder.path, sequence, odometry, tracked.steps)
+
+    interruptible(draw_figures)
     return metrics, tracked.interrupted
 
 
@@ -160,12 +142,3 @@ def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, A
         "device": jax.devices()[0].device_kind,
         "versions": environment(),
     }
-
-
-def _report(name: str, metrics: Mapping[str, Any], folder: Path) -> None:
-    rows = [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in FIGURES_OF_MERIT]
-    rows += [
-        (f"pairs: {status}", str(count), "") for status, count in metrics.get("statuses", {}).items() if status != "ok"
-    ]
-    print_table(name, ("", "", "unit"), rows)
-    print(f"files in {folder}")

@@ -3,6 +3,7 @@
 from gavo_jax import presets
 from gavo_jax.cli.options import Search, Source
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
@@ -10,8 +11,12 @@ from gavo_jax.settings_file import NamedSettings, assignments, load_settings, ov
 MAX_SEED = 2**32 - 1
 
 
-def open_sequence(source: Source) -> Sequence:
+def open_sequence(source: Source, force: bool = False) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
+
+    Args:
+        source: the options.
+        force: as their own `force`.
 
     Raises:
         GavoError: what is wrong with the options, the sequence or its camera; fewer than two frames.
@@ -20,7 +25,28 @@ def open_sequence(source: Source) -> Sequence:
     _check_at_least("--stride", source.stride, 1)
     if source.frames is not None:
         _check_at_least("--frames", source.frames, 2)
-    return open_part(source.sequence, source.camera, source.start, source.frames, source.stride)
+    return open_part(
+        *(source.sequence, source.camera, source.start, source.frames, source.stride),
+        reading=reading_of(source),
+        force=force or source.force,
+    )
+
+
+def reading_of(source: Source) -> Reading:
+    """How the options say the source is to be read.
+
+    Raises:
+        GavoError: a number that cannot be.
+    """
+    for option, value, most in (("--depth-scale", source.depth_scale, 1e6), ("--rate", source.rate, 1e4)):
+        if value is not None and not 1e-3 <= value <= most:
+            raise GavoError(f"{option}: must be a number from 0.001 to {most:g}, not {value:g}")
+    return Reading(
+        depth_scale=source.depth_scale,
+        rate=source.rate,
+        color_topic=source.colour_topic,
+        depth_topic=source.depth_topic,
+    )
 
 
 def choose_settings(search: Search) -> NamedSettings:

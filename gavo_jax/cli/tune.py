@@ -1,15 +1,17 @@
 """`gavo tune`: settings of small drift and little time, as a Pareto front."""
 
+from pathlib import Path
 from typing import Any
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Tune
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.tuning import Choice, read_tuning
+from gavo_jax.experiments.tuning import Choice, Tuning, read_tuning, without_password
 from gavo_jax.experiments.tuning import tune as search
-from gavo_jax.output.files import prepare_folder, write_json
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.locks import hold
+from gavo_jax.output.files import prepare_folder, remove_files, write_json
+from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"
@@ -22,22 +24,29 @@ def tune(options: Tune) -> int:
     if trials < 1:
         raise GavoError(f"--trials: must be at least 1, not {trials}")
     folder = prepare_folder(tuning.folder)
+    with hold(folder):
+        return _search(tuning, options, trials, folder)
+
+
+def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     storage = options.storage or f"sqlite:///{(folder / STUDY).resolve()}"
     enable_compilation_cache()
-    print(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {storage}")
+    say(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {without_password(storage)}")
 
     def show(trial: int, drift: float, milliseconds: float) -> None:
-        print(f"trial {trial}: {number(drift, 5)} m/s, {number(milliseconds, 1)} ms/pair", flush=True)
+        say(f"trial {trial}: {number(drift, 5)} m/s, {number(milliseconds, 1)} ms/pair")
 
     front = search(tuning, storage, trials, show)
     names = list(tuning.space)
     rows = [_row(choice, names) for choice in front]
     print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)
+    for path in folder.glob("trial-*.toml"):
+        remove_files(folder, path.name)
     write_json(folder / FRONT, [choice._asdict() for choice in front])
     for choice in front:
         values = override(presets.preset(tuning.method, tuning.preset), choice.settings)
         save_settings(folder / f"trial-{choice.trial}.toml", values, tuning.method, tuning.preset)
-    print(f"front in {folder / FRONT}; its settings: gavo run --settings {folder}/trial-{front[0].trial}.toml")
+    say(f"front in {folder / FRONT}; its settings: gavo run --settings {folder}/trial-{front[0].trial}.toml")
     return 0
 
 

@@ -1,6 +1,7 @@
 """`gavo view`: a finished run in the viewer."""
 
-import sys
+from contextlib import nullcontext
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
+from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.files import CONFIG, VIEW
 from gavo_jax.output.frames import RecordedRun, read_run
+from gavo_jax.output.screen import say, tell
 from gavo_jax.viewer.live import make_viewer
 
 
@@ -24,13 +27,13 @@ def view(options: View) -> int:
         camera, stamps, truth = _recorded_camera(run, options.folder), run.trajectory.timestamps, None
     else:
         camera, stamps, truth = sequence.camera, sequence.timestamps, sequence.ground_truth
-    with viewer:
+    with hold(options.folder) if options.viewer == "save" else nullcontext(), viewer:
         viewer.open(options.folder.resolve().name, camera, stamps, truth)
         viewer.watch(_read(sequence, 0), None)
         for step in run.steps:
             viewer.watch(_read(sequence, step.index), step)
     if options.viewer == "save":
-        print(f"written {options.folder / VIEW}")
+        say(f"written {options.folder / VIEW}")
     viewer.stay()
     return 0
 
@@ -41,9 +44,8 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
     try:
         if not isinstance(settings, dict):
             raise GavoError(f"{folder / CONFIG}: does not name the sequence")
-        names = ("sequence", "camera", "start", "frames", "stride")
         try:
-            source = Source(**{name: settings[name] for name in names})
+            source = Source(**{field.name: settings[field.name] for field in fields(Source) if field.name in settings})
             sequence = open_sequence(source)
         except (KeyError, TypeError) as error:
             raise GavoError(f"{folder / CONFIG}: does not name the sequence: {error}") from None
@@ -51,7 +53,7 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
             raise GavoError(f"{source.sequence}: holds other frames than those of the run")
         return sequence
     except GavoError as error:
-        print(f"gavo: without images and truth: {error}", file=sys.stderr)
+        tell(f"without images and truth: {error}")
         return None
 
 

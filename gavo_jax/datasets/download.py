@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import tarfile
-import tempfile
 import time
 import zlib
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax.errors import GavoError
+from gavo_jax.locks import hold
 
 SERVER = "https://cvg.cit.tum.de/rgbd/dataset"
 SEQUENCES = {
@@ -31,6 +31,8 @@ ATTEMPTS, PAUSE = 5, 1.0
 TIMEOUT = (10.0, 30.0)
 """Seconds without a connection, and without a byte, after which a try has failed."""
 CHUNK = 2**18
+SIZE = "[0-9]{1,18}"
+"""A number of bytes in a server's words; what is none tells nothing."""
 
 Progress = Callable[[int, int | None], None]
 """Called with the bytes that are there and the bytes that there will be, where the server says."""
@@ -73,9 +75,11 @@ def download(name: str, to: str | Path, server: str = SERVER, progress: Progress
     url = f"{server.rstrip('/')}/freiburg{folder.removeprefix('rgbd_dataset_freiburg')[0]}/{folder}.tgz"
     try:
         Path(to).mkdir(parents=True, exist_ok=True)
-        archive = _retrieve(url, Path(to), progress)
-        _unpack(archive, target)
-        archive.unlink()
+        with hold(to, f".{folder}.lock"):
+            if not target.is_dir():
+                archive = _retrieve(url, Path(to), progress)
+                _unpack(archive, target)
+                archive.unlink()
     except OSError as error:
         raise GavoError(f"{to}: cannot be written to: {error.strerror or error}") from None
     return target
@@ -118,6 +122,10 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
     except requests.RequestException as error:
         there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
         raise GavoError(f"{url}: broke off {ATTEMPTS} times: {' '.join(str(error).split())[:200]}{there}") from None
+    except ValueError as error:
+        if isinstance(error, GavoError):
+            raise
+        raise GavoError(f"{url[:200]}: not an address to download from: {' '.join(str(error).split())[:200]}") from None
 
 
 def _fetch(url: str, partial: Path, progress: Progress) -> None:
@@ -131,15 +139,15 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
             partial.unlink()
             raise requests.ConnectionError("what was there is no part of the server's file")
         response.raise_for_status()
-        span = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", response.headers.get("Content-Range", ""))
+        span = re.fullmatch(rf"bytes ({SIZE})-{SIZE}/({SIZE}|\*)", response.headers.get("Content-Range", ""))
         goes_on = response.status_code == requests.codes.partial_content and span is not None
         if goes_on and span is not None and int(span[1]) != have:
             partial.unlink(missing_ok=True)
             raise requests.ConnectionError("the server goes on at another place")
         if not goes_on:
             have = 0
-        length = response.headers.get("Content-Length")
-        total = None if length is None else have + int(length)
+        length = response.headers.get("Content-Length", "")
+        total = have + int(length) if re.fullmatch(SIZE, length) else None
         with partial.open("ab" if goes_on else "wb") as file:
             for chunk in response.iter_content(CHUNK):
                 file.write(chunk)
@@ -151,7 +159,9 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
 
 def _unpack(archive: Path, target: Path) -> None:
     """Unpack beside the target and rename: its folder is there whole or not at all."""
-    scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=".unpacking-"))
+    scratch = target.with_name(f".unpacking-{target.name}")
+    shutil.rmtree(scratch, ignore_errors=True)  # left by a kill
+    scratch.mkdir()
     try:
         with tarfile.open(archive, "r:gz") as tar:
             for member in tar:

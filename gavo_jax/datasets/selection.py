@@ -1,9 +1,13 @@
-"""Which frames of which sequence, by name."""
+"""Which frames of which source, by name."""
 
-from gavo_jax.camera import load_camera
+from dataclasses import replace
+
+from gavo_jax.camera_files import load_camera
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.depth_unit import fault_of_scale
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 
 SYNTHETIC = "synthetic"
@@ -13,29 +17,41 @@ MAX_SYNTHETIC_FRAMES = 1_000_000
 
 
 def open_part(
-    sequence: str, camera: str = "auto", start: int = 0, frames: int | None = None, stride: int = 1
+    source: str,
+    camera: str = "auto",
+    start: int = 0,
+    frames: int | None = None,
+    stride: int = 1,
+    reading: Reading | None = None,
+    force: bool = False,
 ) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
 
     Args:
-        sequence: A folder in TUM layout, or the word synthetic.
+        source: A folder or file that `open_source` knows, or the word synthetic.
         camera: "auto", or what `load_camera` takes.
         start: First frame, from 0.
         frames: How many, at least 2; all that there are if left out.
         stride: Take every so-manieth frame, from 1.
+        reading: What else is to be known of the source; its own camera does not count.
+        force: Whether depth that looks as if its scale were wrong is taken all the same.
 
     Raises:
-        GavoError: what is wrong with the sequence or its camera; fewer than two frames.
+        GavoError: what is wrong with the source or its camera; fewer than two frames; a depth scale that is wrong by 5
+            or 1000, as the first frames look.
     """
     stop = None if frames is None else start + (frames - 1) * stride + 1
-    whole = _synthetic(camera, stop) if sequence == SYNTHETIC else TumSequence(sequence, camera)
+    reading = replace(reading or Reading(), camera=camera)
+    whole = _synthetic(camera, stop) if source == SYNTHETIC else open_source(source, reading)
     chosen = whole[start:stop:stride]
     if len(chosen) < 2:
         raise GavoError(
-            f"{sequence}: {len(chosen)} of its {len(whole)} frames chosen by start, frames and stride: "
+            f"{source}: {len(chosen)} of its {len(whole)} frames chosen by start, frames and stride: "
             "at least 2 are needed"
         )
     chosen.check()
+    if source != SYNTHETIC and not force and (fault := fault_of_scale(chosen)):
+        raise GavoError(f"{source}: {fault}, or go on with --force")
     return chosen
 
 

@@ -1,4 +1,7 @@
-"""A synthetic RGB-D sequence: a camera moves through the rendered room; exact poses, optional sensor noise."""
+"""A synthetic RGB-D sequence, long because its path, its sensor's noise and its files describe one and the same camera.
+
+It moves through the rendered room; poses are exact, the noise is optional.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from jaxtyping import Float, UInt8, UInt16
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.rendering import render
 from gavo_jax.datasets.room import (
     HIGHEST_VIEW,
     LOWEST_VIEW,
@@ -24,7 +28,6 @@ from gavo_jax.datasets.room import (
     Room,
     build_room,
     free_space,
-    render,
 )
 from gavo_jax.errors import GavoError
 from gavo_jax.image.shutter import row_time

@@ -1,24 +1,27 @@
-"""Sequences in the folder layout of the TUM RGB-D benchmark (Sturm et al. 2012)."""
+"""Sequences in the folder layout of the TUM RGB-D benchmark (Sturm et al. 2012): lists of stamps and images."""
 
 import bisect
 import itertools
 import math
-import os
-import struct
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from copy import copy
-from dataclasses import replace
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import ClassVar, NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import Float
 
-from gavo_jax.camera import Camera, camera_for_sequence, load_camera
-from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.datasets.files import (
+    Entry,
+    FileSequence,
+    Reading,
+    own_camera_file,
+    preset_by_name,
+    resolve_folder,
+    size_of_first,
+)
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate
 
@@ -34,16 +37,19 @@ MAX_PATH = 1000
 MAX_STAMP = 1e15
 """Seconds; beyond, microseconds are lost in double precision anyway."""
 
+COLOR_LIST, DEPTH_LIST, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+ASSOCIATIONS = "associations.txt"
+"""Both lists in one, as ICL-NUIM has it: `stamp path stamp path`."""
+
+INDEX_RATE = 30.0
+"""Frames per second where the stamps are nothing but the numbers of the frames."""
+
 MAX_MISPLACED = 0.25
 """Share of a list's rows whose stamps may be out of order; a list with more is merely unsorted."""
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-GREYSCALE = 0
-"""PNG colour type of images with one channel and no palette."""
 
-
-class TumSequence:
-    """A folder with `rgb.txt`, `depth.txt`, the PNG images they list and, where known, `groundtruth.txt`.
+class TumSequence(FileSequence):
+    """A folder with `rgb.txt`, `depth.txt`, the images they list and, where known, `groundtruth.txt`.
 
     Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`); frames come in the
     order of their colour stamps and carry them. Images are decoded one by one when asked for, and nothing of them is
@@ -59,140 +65,91 @@ class TumSequence:
         ground_truth: `groundtruth.txt` as it stands, or None where there is no such file.
     """
 
+    kind: ClassVar[str] = "TUM RGB-D folder"
+
     def __init__(
         self,
         folder: str | Path,
-        camera: Camera | str | None = "auto",
+        camera: Camera | Calibration | str | None = "auto",
         color: bool = False,
         undistort: bool = True,
         max_difference: float = MAX_DIFFERENCE,
         name: str | None = None,
+        depth_scale: float | None = None,
+        rate: float | None = None,
     ) -> None:
         """Read the lists and the ground truth; no image yet (see `check`).
 
         Args:
             folder: holds the lists.
-            camera: a camera, what `load_camera` takes, or "auto" (or None): the preset the folder's name speaks of.
+            camera: a camera, what `load_camera` takes, or "auto" (or None): the camera file in the folder, else the
+                preset that the folder's name speaks of.
             color: whether frames carry RGB beside grey.
             undistort: whether lens distortion is taken out of the frames.
             max_difference: seconds.
             name: overrides the folder's name.
+            depth_scale: raw depth units per metre; the camera's if left out.
+            rate: frames per second, where stamps are the numbers of the frames.
 
         Raises:
             GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder (through a link,
                 too), no pair of stamps near enough, unusable ground truth, unknown camera.
         """
         self.folder = Path(folder)
-        try:
-            resolved = self.folder.resolve()
-            if not resolved.is_dir():
-                raise GavoError(f"{self.folder}: no such folder")
-        except (OSError, RuntimeError, ValueError) as error:
-            raise error if isinstance(error, GavoError) else GavoError(f"{str(folder)!r}: unusable: {error}") from None
-        self.name = name or resolved.name
-        if camera is None or camera == "auto":
-            camera = camera_for_sequence(resolved.name)
-        self._recorded = camera if isinstance(camera, Camera) else load_camera(camera)
-        self._undistort, self._color = undistort, color
-        self.camera = self._recorded.rectified() if undistort else self._recorded
-        color_rows, depth_rows = (_read_list(resolved, self.folder / name) for name in ("rgb.txt", "depth.txt"))
+        resolved = resolve_folder(self.folder)
+        reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
+        color_rows, depth_rows = _read_lists(resolved, self.folder, rate)
         entries = _associate_lists(color_rows, depth_rows, max_difference)
         if not entries:
-            raise GavoError(
-                f"{self.folder}: no stamps of rgb.txt and depth.txt within {max_difference:g} s of each other"
-            )
-        self._timestamps = np.array([entry.color.stamp for entry in entries])
-        self._entries = entries
-        truth = self.folder / "groundtruth.txt"
-        self.ground_truth = Trajectory.read_tum(truth) if truth.exists() else None
+            names = f"{COLOR_LIST} and {DEPTH_LIST}"
+            raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
+        files = [_files(entry) for entry in entries]
+        if reading.is_auto:
+            calibration = _own_calibration(self.folder, files)
+        else:
+            calibration = reading.calibration(partial(size_of_first, files))
+        truth = self.folder / TRUTH
+        super().__init__(
+            name or resolved.name,
+            files,
+            calibration,
+            Trajectory.read_tum(truth) if truth.exists() else None,
+            reading,
+            _left_out(len(color_rows), len(depth_rows), len(entries), max_difference),
+        )
 
-    @property
-    def timestamps(self) -> Float[np.ndarray, " frames"]:
-        """Colour stamp of each frame, seconds."""
-        return self._timestamps
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a list lies in the folder."""
+        return any((path / name).exists() for name in (COLOR_LIST, DEPTH_LIST, ASSOCIATIONS))
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._entries)
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-    @overload
-    def __getitem__(self, index: slice) -> "TumSequence": ...
-    def __getitem__(self, index: int | slice) -> "Frame | TumSequence":
-        """Decode frame `index`, or return the sequence of a slice.
-
-        Raises:
-            IndexError: no such frame.
-            FrameError: one of its two images is missing, torn, or of the wrong size or kind, or its stamp is in doubt.
-        """
-        if isinstance(index, slice):
-            part = copy(self)
-            part._timestamps, part._entries = self._timestamps[index], self._entries[index]
-            return part
-        color, depth = self._entries[index]
-        for row in (color, depth):
-            if row is not None and row.misplaced:
-                raise TimestampError(f"{row.place}: stamp {row.stamp:.6f} is out of order or given twice")
-        assert depth is not None
-        frame = read_frame(color.path, depth.path, self._recorded, color.stamp, self._color, self._undistort)
-        return replace(frame, depth_timestamp=depth.stamp)
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Decode frame after frame; raises `FrameError` at one that cannot be read."""
-        return (self[index] for index in range(len(self)))
-
-    def check(self) -> None:
-        """Refuse what can be known before a run: a missing image among these frames, an unusable first frame.
-
-        Raises:
-            GavoError: names the image and the fault.
-        """
-        if len(self) == 0:
-            raise GavoError(f"{self.folder}: no frames in the chosen range")
-        for entry in self._entries:
-            for row in entry:
-                if row is not None and not os.path.isfile(row.path):
-                    raise GavoError(f"{row.path}: listed image is missing")
-        self[0]
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> "TumSequence":
+        """Read the folder as told."""
+        return cls(
+            path,
+            reading.camera,
+            reading.color,
+            reading.undistort,
+            reading.max_difference,
+            depth_scale=reading.depth_scale,
+            rate=reading.rate,
+        )
 
 
-def read_frame(
-    color_path: str | Path,
-    depth_path: str | Path,
-    camera: Camera,
-    timestamp: float = 0.0,
-    color: bool = False,
-    undistort: bool = True,
-) -> Frame:
-    """Read one RGB-D frame from two PNG files: 8-bit colour (or grey) and 16-bit single-channel depth.
-
-    Args:
-        color_path: the colour image.
-        depth_path: the depth image, registered to it.
-        camera: as recorded; both images must have its size.
-        timestamp: seconds.
-        color: whether the frame carries RGB beside grey. Grey is the same either way.
-        undistort: whether the camera's distortion is taken out; the frame is then of `camera.rectified()`.
-
-    Raises:
-        FrameError: an image is missing, torn, or of the wrong size or kind; the message names it.
-    """
-    bgr = _decode(Path(color_path), camera, depth=False)
-    depth = _decode(Path(depth_path), camera, depth=True)
-    grey = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
-    rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB) if color else None
-    if undistort:
-        grey, depth = camera.undistort(grey, depth)
-        rgb = None if rgb is None else camera.undistort_image(rgb)
-    return Frame(grey=grey, depth=depth, timestamp=timestamp, color=rgb)
+def _own_calibration(folder: Path, entries: list[Entry]) -> Calibration:
+    """The camera file in the folder, else the preset that its name speaks of."""
+    file = own_camera_file(folder)
+    return preset_by_name(folder) if file is None else load_calibration(file, partial(size_of_first, entries))
 
 
-class _PngHeader(NamedTuple):
-    width: int
-    height: int
-    bits: int
-    color_type: int
+def _left_out(colors: int, depths: int, frames: int, max_difference: float) -> list[str]:
+    """What of the lists makes no frame, a line each."""
+    lines = []
+    for count, one, other in ((colors - frames, "colour", "depth"), (depths - frames, "depth", "colour")):
+        if count > 0:
+            lines.append(f"{count} {one} images: no {other} image within {max_difference:g} s that is not another's")
+    return lines
 
 
 class _Row(NamedTuple):
@@ -212,27 +169,66 @@ class _Entry(NamedTuple):
     depth: _Row | None
 
 
+def _files(entry: _Entry) -> Entry:
+    """Paths, stamps and doubts of a frame."""
+    misplaced = next((row for row in entry if row is not None and row.misplaced), None)
+    doubt = f"{misplaced.place}: stamp {misplaced.stamp:.6f} is out of order or given twice" if misplaced else ""
+    color, depth = entry
+    return Entry(color.stamp, color.path, depth and depth.path, depth and depth.stamp, doubt)
+
+
+def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row]]:
+    """Rows of colour and of depth, from two lists or from one of pairs."""
+    if (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists() or not (folder / ASSOCIATIONS).exists():
+        color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
+        return color, depth
+    path = folder / ASSOCIATIONS
+    pairs = []
+    for place, fields in data_rows(path, MAX_LIST_BYTES):
+        if len(fields) != 4:
+            raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields")
+        pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
+        pairs.append(pair[::-1] if "depth" in fields[1] else pair)
+    stamps = np.array([row.stamp for pair in pairs for row in pair])
+    if len(stamps) and rate is None and np.all(stamps == np.round(stamps)):
+        rate = INDEX_RATE
+    if rate is not None:
+        pairs = [[row._replace(stamp=row.stamp / rate) for row in pair] for pair in pairs]
+    color, depth = (_in_time(path, [pair[at] for pair in pairs]) for at in (0, 1))
+    return color, depth
+
+
 def _read_list(root: Path, path: Path) -> list[_Row]:
     """Read `timestamp path` rows, in the order of their stamps; the images' paths stay below `root`."""
     rows: list[_Row] = []
     for place, fields in data_rows(path, MAX_LIST_BYTES):
         if len(fields) != 2:
             raise GavoError(f"{place}: expected `timestamp path`, found {len(fields)} fields")
-        try:
-            stamp = float(fields[0])
-        except ValueError:
-            stamp = math.nan
-        if not abs(stamp) < MAX_STAMP:
-            raise GavoError(f"{place}: not a time stamp: {fields[0][:60]!r}")
-        try:
-            image = (root / fields[1]).resolve()
-            if len(fields[1]) > MAX_PATH:
-                raise ValueError("too long")
-        except (OSError, RuntimeError, ValueError):
-            raise GavoError(f"{place}: not a usable path: {fields[1][:60]!r}") from None
-        if not image.is_relative_to(root):
-            raise GavoError(f"{place}: path leaves the sequence's folder: {fields[1][:200]!r}")
-        rows.append(_Row(stamp, path.parent / fields[1], place))
+        rows.append(_row(root, path, place, *fields))
+    return _in_time(path, rows)
+
+
+def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
+    """Check a stamp and a path, which stays below `root`."""
+    try:
+        stamp = float(time)
+    except ValueError:
+        stamp = math.nan
+    if not abs(stamp) < MAX_STAMP:
+        raise GavoError(f"{place}: not a time stamp: {time[:60]!r}")
+    try:
+        resolved = (root / image).resolve()
+        if len(image) > MAX_PATH:
+            raise ValueError("too long")
+    except (OSError, RuntimeError, ValueError):
+        raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
+    if not resolved.is_relative_to(root):
+        raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}")
+    return _Row(stamp, path.parent / image, place)
+
+
+def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
+    """Rows in the order of their stamps, marked where that is in doubt."""
     if not rows:
         raise GavoError(f"{path}: lists no images")
     trusted = _in_order([row.stamp for row in rows])
@@ -282,62 +278,3 @@ def _associate_lists(color: list[_Row], depth: list[_Row], max_difference: float
         return entry.depth is None or entry.depth.misplaced
 
     return list(itertools.dropwhile(in_doubt, entries))
-
-
-def _decode(path: Path, camera: Camera, depth: bool) -> np.ndarray:
-    """Return depth as uint16 [height, width] or colour as uint8 BGR [height, width, 3] of a file that is whole."""
-    data = _read_bytes(path, limit=2**20 + 16 * camera.width * camera.height)
-    header = _png_header(path, data)
-    if (header.width, header.height) != (camera.width, camera.height):
-        size = f"{header.width}x{header.height}"
-        raise FrameError(f"{path}: is {size} pixels, the camera's images are {camera.width}x{camera.height}")
-    if depth and (header.bits, header.color_type) != (16, GREYSCALE):
-        raise FrameError(f"{path}: not a depth image: expected one channel of 16 bits")
-    if not depth and header.bits > 8:
-        raise FrameError(f"{path}: not a colour image of 8 bits but of {header.bits}")
-    flags = cv2.IMREAD_UNCHANGED if depth else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
-    shape = (camera.height, camera.width) if depth else (camera.height, camera.width, 3)
-    if image is None or image.shape != shape or image.dtype != (np.uint16 if depth else np.uint8):
-        raise FrameError(f"{path}: cannot be decoded")
-    return image
-
-
-def _read_bytes(path: Path, limit: int) -> bytes:
-    try:
-        if path.exists() and not path.is_file():
-            raise FrameError(f"{path}: not a file")
-        if path.stat().st_size > limit:
-            raise FrameError(f"{path}: too large for an image of this camera")
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise FrameError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        if isinstance(error, FrameError):
-            raise
-        raise FrameError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-
-
-def _png_header(path: Path, data: bytes) -> _PngHeader:
-    """Return the header of a PNG whose chunks are all whole (OpenCV decodes a torn one in part, silently)."""
-    if not data.startswith(PNG_SIGNATURE):
-        raise FrameError(f"{path}: not a PNG image")
-    header, at = None, len(PNG_SIGNATURE)
-    while at + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise FrameError(f"{path}: damaged PNG image (checksum)")
-        if header is None:
-            if kind != b"IHDR" or length != 13:
-                break
-            header = _PngHeader(*struct.unpack_from(">IIBB", data, at + 8))
-        if kind == b"IEND":
-            return header
-        at = end + 4
-    raise FrameError(f"{path}: torn PNG image (no end)")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +18,7 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
+from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
@@ -58,7 +59,7 @@ class LocalExecutor:
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
         """Run them in their order."""
         for batch in batches:
-            yield run_batch(experiment, batch, on_pairs)
+            yield interruptible(partial(run_batch, experiment, batch, on_pairs))
 
 
 class RayExecutor:

@@ -5,7 +5,6 @@ import hashlib
 import itertools
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,16 +13,27 @@ from typing import Any
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.camera import load_camera
+from gavo_jax.camera_files import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
-from gavo_jax.errors import GavoError, read_text, shown
+from gavo_jax.errors import GavoError, read_toml
 from gavo_jax.experiments.together import program_of
+from gavo_jax.experiments.values import (
+    MAX_RUNS,
+    flag_of,
+    one_line,
+    real_of,
+    refuse_repeated,
+    seeds_of,
+    tables_of,
+    text_of,
+    whole_of,
+)
 from gavo_jax.output.files import describe
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
-from gavo_jax.settings_file import MAX_REAL, flatten, override, refuse_unknown
+from gavo_jax.settings_file import flatten, override, refuse_unknown
 
 KEYS = ("name", "output", "seeds", "batch", "sequences", "methods", "ray")
 SEQUENCE_KEYS = ("path", "name", "camera", "start", "frames", "stride", "optional")
@@ -32,8 +42,6 @@ RAY_KEYS = ("cpus", "gpus")
 DATA = "GAVO_DATA"
 BATCH = 32
 """Runs that are tracked together unless the file says otherwise."""
-MAX_SEED = 2**32 - 1
-MAX_RUNS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -146,11 +154,12 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
         GavoError: names the file, the key and the fault; an unknown key comes with the nearest known one.
     """
     path = Path(path)
-    table = read_toml(path, KEYS)
+    table = read_toml(path)
+    refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, skipped = parts_of(path, table)
     default_seeds = seeds_of(f"{path}: seeds", table.get("seeds", [0]))
-    methods = _tables(f"{path}: methods", table.get("methods", []))
+    methods = tables_of(f"{path}: methods", table.get("methods", []))
     if not methods:
         raise GavoError(f"{path}: methods: no [[methods]] given")
     variants: list[_Variant] = []
@@ -161,7 +170,7 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
             variants += _variants(place, entry, default_seeds)
         else:
             skipped[str(entry["name"])] = lacking
-    _refuse_repeated(f"{path}: methods", [variant.label for variant in variants])
+    refuse_repeated(f"{path}: methods", [variant.label for variant in variants])
     runs: list[Run] = []
     if len(parts) * sum(len(variant.seeds) for variant in variants) > MAX_RUNS:
         raise GavoError(f"{path}: more than {MAX_RUNS} runs")
@@ -169,7 +178,7 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
         try:
             sequence = part.open()
         except GavoError as error:
-            raise GavoError(f"{path}: {_line(error)}") from None
+            raise GavoError(f"{path}: {one_line(error)}") from None
         for variant in variants:
             runs += _runs(part, sequence, variant)
     names = [part.name for part in parts]
@@ -181,20 +190,6 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     folder = Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}")))
     batch = whole_of(f"{path}: batch", table.get("batch", BATCH), 1)
     return Plan(name, folder, tuple(runs), tuple(skipped.values()), printed, batch, _ray(path, table))
-
-
-def read_toml(path: Path, keys: Sequence[str]) -> dict[str, Any]:
-    """Return a TOML file's table, whose keys are all known.
-
-    Raises:
-        GavoError: not readable, not TOML, an unknown key.
-    """
-    try:
-        table = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise GavoError(f"{path}: not TOML: {_line(error)}") from None
-    refuse_unknown(str(path), table, keys)
-    return table
 
 
 def batches(runs: Iterable[Run], size: int) -> list[Batch]:
@@ -217,17 +212,9 @@ def programs(runs: Iterable[Run]) -> int:
 
 def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
     """The full configuration of a run, without what belongs to a machine: equal ones are one run."""
-    stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
     return describe(
         {
-            "sequence": {
-                "name": run.part.name,
-                "frames": len(sequence),
-                "first_timestamp": float(stamps[0]),
-                "last_timestamp": float(stamps[-1]),
-                "timestamps_sha256": hashlib.sha256(stamps.tobytes()).hexdigest(),
-                "camera": sequence.camera,
-            },
+            "sequence": frames_of(run.part.name, sequence),
             "method": run.method,
             "preset": run.preset,
             "variant": run.variant,
@@ -237,13 +224,26 @@ def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
     )
 
 
+def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
+    """Which frames a sequence has, and by which camera, without where they lie."""
+    stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
+    return {
+        "name": name,
+        "frames": len(sequence),
+        "first_timestamp": float(stamps[0]),
+        "last_timestamp": float(stamps[-1]),
+        "timestamps_sha256": hashlib.sha256(stamps.tobytes()).hexdigest(),
+        "camera": sequence.camera,
+    }
+
+
 def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str, str]]:
     """The parts of all [[sequences]] of a file, and by name a line for each optional one that is not here.
 
     Raises:
         GavoError: a wrong key or value, a sequence that is nowhere, two of one name, none at all.
     """
-    entries = _tables(f"{path}: sequences", table.get("sequences", []))
+    entries = tables_of(f"{path}: sequences", table.get("sequences", []))
     parts: list[Part] = []
     skipped: dict[str, str] = {}
     for number, entry in enumerate(entries, 1):
@@ -253,15 +253,15 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
         patterns = [text_of(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
         found = _find(path.parent, patterns)
         if not found:
-            line = f"{_line(', '.join(patterns))}: no such folder here, beside {path.name}, or in {DATA}"
-            if not _flag(f"{place}: optional", entry.get("optional", False)):
+            line = f"{one_line(', '.join(patterns))}: no such folder here, beside {path.name}, or in {DATA}"
+            if not flag_of(f"{place}: optional", entry.get("optional", False)):
                 raise GavoError(f"{place}: {line}")
             name = text_of(f"{place}: name", entry.get("name", patterns[0]))
             skipped[name] = f"skipped {name}: {line} (gavo download gets TUM's sequences)"
         if len(found) > 1 and "name" in entry:
             raise GavoError(f"{place}: name: {len(found)} sequences cannot have one name")
         parts += [_part(place, path.parent, folder, entry) for folder in found]
-    _refuse_repeated(f"{path}: sequences", [part.name for part in parts])
+    refuse_repeated(f"{path}: sequences", [part.name for part in parts])
     if not parts:
         raise GavoError(f"{path}: sequences: {'; '.join(skipped.values()) or 'no [[sequences]] given'}")
     return parts, skipped
@@ -291,7 +291,7 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
         if camera != "auto":
             load_camera(camera)
     except GavoError as error:
-        raise GavoError(f"{place}: camera: {_line(error)}") from None
+        raise GavoError(f"{place}: camera: {one_line(error)}") from None
     name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
     if "name" not in entry and (start, frames, stride) != (0, None, 1):
         name = f"{name}[{start}:{'' if frames is None else start + frames * stride}:{stride}]"
@@ -324,7 +324,7 @@ def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
     if info is None or info.installed:
         return None
     line = f"{info.name}: needs {info.module}: pip install 'gavo-jax[peers]'"
-    if not _flag(f"{place}: optional", entry.get("optional", False)):
+    if not flag_of(f"{place}: optional", entry.get("optional", False)):
         raise GavoError(f"{place}: {line}")
     return f"skipped {line}"
 
@@ -334,7 +334,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     method = str(entry.get("name"))
     refuse_unknown(f"{place}: name", [method], (*presets.methods(), *PEERS))
     printed = {
-        text_of(place, name): _real(f"{place}: printed.{name}", value)
+        text_of(place, name): real_of(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()
     }
     if method in PEERS:
@@ -350,7 +350,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     swept = flatten(f"{place}: sweep", entry.get("sweep", {}))
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
-            raise GavoError(f"{place}: sweep.{_line(name)}: not a list of values")
+            raise GavoError(f"{place}: sweep.{one_line(name)}: not a list of values")
     variants = []
     for preset in names:
         for choice in itertools.product(*swept.values()):
@@ -377,62 +377,7 @@ def _ray(path: Path, table: Mapping[str, Any]) -> RayOptions:
     values = table.get("ray", {})
     place = f"{path}: ray"
     refuse_unknown(place, flatten(place, values), RAY_KEYS)
-    return RayOptions(**{key: _real(f"{place}.{key}", value) for key, value in values.items()})
-
-
-def seeds_of(place: str, value: Any) -> tuple[int, ...]:
-    """A list of seeds; a number N stands for 0 to N - 1."""
-    if isinstance(value, list):
-        seeds = tuple(whole_of(place, seed, 0) for seed in value)
-        _refuse_repeated(place, seeds)
-    else:
-        seeds = tuple(range(whole_of(place, value, 1))) if whole_of(place, value, 1) <= MAX_RUNS else ()
-    if not seeds or max(seeds) > MAX_SEED:
-        raise GavoError(f"{place}: must be a number of seeds, or a list of seeds from 0 to {MAX_SEED}")
-    return seeds
-
-
-def _tables(place: str, value: Any) -> list[dict[str, Any]]:
-    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise GavoError(f"{place}: must be given as [[{place.rpartition(' ')[2]}]] tables")
-    return value
-
-
-def text_of(place: str, value: Any) -> str:
-    """Return a text that is not empty, or raise GavoError."""
-    if not isinstance(value, str) or not value:
-        raise GavoError(f"{place}: must be text, not {shown(value)}")
-    return value
-
-
-def _flag(place: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise GavoError(f"{place}: must be true or false, not {shown(value)}")
-    return value
-
-
-def whole_of(place: str, value: Any, least: int) -> int:
-    """Return a whole number of at least so much, or raise GavoError."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise GavoError(f"{place}: must be a whole number of at least {least}, not {shown(value)}")
-    return value
-
-
-def _real(place: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= MAX_REAL:
-        raise GavoError(f"{place}: must be a number of at least 0, not {shown(value)}")
-    return float(value)
-
-
-def _refuse_repeated(place: str, values: Sequence[Any]) -> None:
-    for value in values:
-        if values.count(value) > 1:
-            raise GavoError(f"{place}: {shown(value)} is given twice")
-
-
-def _line(words: Any) -> str:
-    """What fits into a line of a message."""
-    return " ".join(str(words).split())[:400]
+    return RayOptions(**{key: real_of(f"{place}.{key}", value) for key, value in values.items()})
 
 
 def _short(value: Any) -> str:

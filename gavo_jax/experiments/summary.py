@@ -1,7 +1,7 @@
 """What a results table says: median and spread of each method, and whether two of them differ."""
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,10 +68,14 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
     )
 
 
-def compare(rows: Sequence[Row]) -> list[Comparison]:
+def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparison]:
     """Each two labels on each sequence, and over all where there are several; a single pair is no comparison.
 
     A method that ran once on a sequence (it has no randomness) stands against every seed of the other.
+
+    Args:
+        rows: Of which a sequence's name stands for the same frames everywhere, and a label for the same settings.
+        earlier: Sequences that do not count among all: other frames of those that do.
     """
     drifts: dict[str, dict[str, dict[Any, float]]] = {}
     for row in rows:
@@ -81,8 +85,8 @@ def compare(rows: Sequence[Row]) -> list[Comparison]:
     found = []
     for first, second in itertools.combinations(drifts, 2):
         matched = {name: _matched(drifts[first].get(name, {}), drifts[second].get(name, {})) for name in sequences}
-        if len(sequences) > 1:
-            matched[ALL] = list(itertools.chain(*matched.values()))
+        if len(sequences) - len(earlier) > 1:
+            matched[ALL] = list(itertools.chain(*(pairs for name, pairs in matched.items() if name not in earlier)))
         found += [_test(name, first, second, pairs) for name, pairs in matched.items() if len(pairs) > 1]
     return sorted(found, key=lambda comparison: [*sequences, ALL].index(comparison.sequence))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.metrics import Metrics
+from gavo_jax.odometry.metrics import FRAMES_PER_SECOND, Metrics
 from gavo_jax.output.files import prepare_folder
 
 SUFFIX = ".parquet"
@@ -43,6 +43,11 @@ COLUMNS = {
 }
 """Columns and their types: the keys of metrics.json; `runs_together`, the runs that shared the machine while the times
 were taken; `configuration` and `versions` as JSON; the commit of the package's own checkout, where it is one; UTC."""
+
+
+MAPPINGS = ("configuration", "versions")
+NEEDED = ("sequence", "method", "label", "lost_pairs", FRAMES_PER_SECOND, "runs_together", "pixels", *MAPPINGS)
+"""What no row is without."""
 
 
 class Table:
@@ -91,10 +96,35 @@ class Table:
         for run in sorted(self.done()):
             path = self.folder / f"{run}{SUFFIX}"
             try:
-                rows += parquet.read_table(path, schema=_schema(), partitioning=None).to_pylist()
-            except (OSError, _arrow().ArrowException) as error:
-                raise GavoError(f"{path}: not a row of results: {' '.join(str(error).split())}") from None
+                found = parquet.read_table(path, schema=_schema(), partitioning=None).to_pylist()
+            except (OSError, KeyError, TypeError, ValueError, _arrow().ArrowException) as error:
+                raise GavoError(f"{path}: not a row of results: {' '.join(str(error).split())[:300]}") from None
+            if fault := _fault(found, run):
+                raise GavoError(f"{path}: not a row of results: {fault}")
+            rows += found
         return rows
+
+
+def _fault(rows: list[dict[str, Any]], run: str) -> str:
+    """What is wrong with the rows of a run's file; empty where nothing is."""
+    if len(rows) != 1:
+        return f"{len(rows)} rows"
+    (row,) = rows
+    if row["run"] != run:
+        return "of another run than its name says"
+    for name in NEEDED:
+        if row[name] is None:
+            return f"without {name}"
+    if not row[FRAMES_PER_SECOND] > 0:
+        return f"{FRAMES_PER_SECOND} of {row[FRAMES_PER_SECOND]}"
+    for name in MAPPINGS:
+        try:
+            value = json.loads(row[name])
+        except (ValueError, RecursionError):
+            value = None
+        if not isinstance(value, dict):
+            return f"{name} is no JSON object"
+    return ""
 
 
 def _arrow() -> Any:

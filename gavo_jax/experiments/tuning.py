@@ -1,7 +1,11 @@
 """Settings searched by Optuna for small drift and little time at once."""
 
-from collections.abc import Callable, Mapping
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,10 +13,13 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError, shown
-from gavo_jax.experiments.plan import Part, parts_of, read_toml, seeds_of, text_of, whole_of
+from gavo_jax.errors import GavoError, read_toml, shown
+from gavo_jax.experiments.plan import Part, frames_of, parts_of
+from gavo_jax.experiments.values import seeds_of, text_of, whole_of
+from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.output.files import describe, differences
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import flatten, override, refuse_unknown
@@ -20,6 +27,8 @@ from gavo_jax.settings_file import flatten, override, refuse_unknown
 KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
 RANGE_KEYS = ("low", "high", "step", "log")
 TRIALS = 50
+CONFIGURATION = "configuration"
+"""Attribute of a study: what it is of, as JSON."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,8 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
         GavoError: names the file, the key and the fault.
     """
     path = Path(path)
-    table = read_toml(path, KEYS)
+    table = read_toml(path)
+    refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, _ = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
@@ -103,35 +113,87 @@ def tune(
         on_trial: Hears of each finished trial: number, drift, milliseconds.
 
     Raises:
-        GavoError: no ground truth over a second of a sequence, the storage cannot be used, Optuna is missing.
+        GavoError: no ground truth over a second of a sequence, the storage cannot be used, or its study of that name is
+            of other frames or settings; Optuna is missing.
     """
     try:
         import optuna
-        import sqlalchemy.exc
     except ImportError:
         raise GavoError("tuning needs Optuna: pip install 'gavo-jax[tune]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sequences = [part.open() for part in tuning.parts]
     start = presets.preset(tuning.method, tuning.preset)
-    try:
+    told = without_password(storage)
+    with _storage_faults(told):
         study = optuna.create_study(
             storage=storage, study_name=tuning.name, directions=["minimize", "minimize"], load_if_exists=True
         )
-    except (ValueError, ImportError, OSError, RuntimeError, sqlalchemy.exc.SQLAlchemyError) as error:
-        raise GavoError(f"{storage}: cannot be used as storage: {' '.join(str(error).split())[:300]}") from None
-    while len(_finished(optuna, study)) < trials:
-        trial = study.ask()
+        _refuse_another(study, _configuration(tuning, sequences, start), told)
+    while True:
+        with _storage_faults(told):
+            if len(_finished(optuna, study)) >= trials:
+                front = [Choice(t.number, t.values[0], t.values[1], dict(t.params)) for t in study.best_trials]
+                return sorted(front, key=lambda choice: choice.milliseconds)
+            trial = study.ask()
         try:
-            values = {key: _suggest(trial, key, spec) for key, spec in tuning.space.items()}
+            with _storage_faults(told):
+                values = {key: _suggest(trial, key, spec) for key, spec in tuning.space.items()}
             settings = override(start, values, f"trial {trial.number}")
-            drift, milliseconds = measure(sequences, settings, tuning.seeds)
+            drift, milliseconds = interruptible(partial(measure, sequences, settings, tuning.seeds))
         except BaseException:
-            study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            with suppress(Exception):  # a storage that fails has been told of, or will be
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
             raise
-        study.tell(trial, [drift, milliseconds])
+        with _storage_faults(told):
+            study.tell(trial, [drift, milliseconds])
         on_trial(trial.number, drift, milliseconds)
-    front = [Choice(t.number, t.values[0], t.values[1], dict(t.params)) for t in study.best_trials]
-    return sorted(front, key=lambda choice: choice.milliseconds)
+
+
+def without_password(storage: str) -> str:
+    """A storage's address as it may be shown."""
+    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:…@", storage)
+
+
+@contextmanager
+def _storage_faults(storage: str) -> Iterator[None]:
+    """Refuse a storage that cannot be used: what a damaged or altered one makes Optuna raise has no end."""
+    try:
+        yield
+    except GavoError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise GavoError(f"{storage}: cannot be used as storage: {reason}") from None
+
+
+def _configuration(tuning: Tuning, sequences: Sequence[FrameSequence], start: Settings) -> dict[str, Any]:
+    """All that decides what a trial of a study is: which settings are tried, from where, on which frames."""
+    parts = [frames_of(part.name, sequence) for part, sequence in zip(tuning.parts, sequences, strict=True)]
+    return describe(
+        {
+            "method": tuning.method,
+            "preset": tuning.preset,
+            "settings": start,
+            "space": tuning.space,
+            "seeds": tuning.seeds,
+            "sequences": {part["name"]: part for part in parts},
+        }
+    )
+
+
+def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> None:
+    """Write down what a new study is of; of another one, raise GavoError that names the first difference."""
+    kept = study.user_attrs.get(CONFIGURATION)
+    if kept is None and not study.get_trials(deepcopy=False):
+        study.set_user_attr(CONFIGURATION, json.dumps(configuration))
+        return
+    advice = "give this one another name or another --output"
+    if kept is None:
+        raise GavoError(f"{storage}: the study {study.study_name!r} does not tell what it is of: {advice}")
+    for name, before, after in differences(json.loads(kept), json.loads(json.dumps(configuration))):
+        raise GavoError(
+            f"{storage}: the study {study.study_name!r} is another one: {name} {before} there, {after} now: {advice}"
+        )
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:

@@ -115,7 +115,7 @@ def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
         moments /= jnp.maximum(moments[:, :1, :1], 1e-6)
         mean_source, mean_sample = moments[:, 0, 1], moments[:, 0, 2]
         spread, covariance = moments[:, 1, 1] - mean_source**2, moments[:, 1, 2] - mean_source * mean_sample
-        gain = jnp.clip((covariance + GAIN_PRIOR) / (spread + GAIN_PRIOR), 0.7, 1.4)
+        gain = jnp.clip((covariance + GAIN_PRIOR) / (spread + GAIN_PRIOR), 1.0 / LARGEST_GAIN, LARGEST_GAIN)
         bias = mean_sample + MIDDLE_GREY - gain * (mean_source + MIDDLE_GREY)
         return Brightness(gain, bias), variance
 
@@ -125,6 +125,9 @@ def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
 
 MIDDLE_GREY = 128.0
 """Grey levels that moments are taken about, so that they lose no digits."""
+LARGEST_GAIN = 1.8
+"""Estimates of the gain, and of its reciprocal, end here: a regression of one image on another that it does not match
+would have it at 0, which hides contrast."""
 GAIN_PRIOR = 100.0
 """Squared grey levels: the image contrast at which the estimated gain is half-way between 1 and the regression's."""
 LARGE_GREY_RESIDUAL = 12.0
@@ -141,11 +144,13 @@ class ExplainedShare(NamedTuple):
 
 
 def explained_share(residuals: Residuals) -> ExplainedShare:
-    """How much of what both frames see a motion explains, 1 at best; points in view, with a reading, only."""
+    """How much of what both frames see a motion explains, 1 at best; points in view, with a reading, only. Not-a-number
+    where both see nothing.
+    """
     r = residuals
 
     def share(residual: jax.Array, mask: jax.Array, large: float) -> jax.Array:
-        return jnp.sum(mask * (jnp.abs(residual) < large)) / jnp.maximum(jnp.sum(mask), 1.0)
+        return jnp.sum(mask * (jnp.abs(residual) < large)) / jnp.sum(mask)
 
     return ExplainedShare(
         share(r.grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)

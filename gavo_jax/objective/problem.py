@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.objective.derivatives import Linearization, linearization, linearize, normal_equations, weighted_terms
+from gavo_jax.objective.derivatives import (
+    Linearization,
+    Term,
+    linearization,
+    linearize,
+    normal_equations,
+    weighted_terms,
+)
 from gavo_jax.objective.error import Objective, Residuals, both_directions
 from gavo_jax.se3 import adjoint, exp, log, right_jacobian, rigid_inverse
 
@@ -75,35 +82,40 @@ class Problem:
 
     def linearize_residuals(self, r: Residuals) -> Linearization:
         """E and its derivatives at x = 0, of which these are the residuals; from the reference to the target alone."""
-        objective = self.objective
-        sums = objective.sums(objective.cost(r))
-        tangent = adjoint(self.origin) @ self.basis
-        return linearization(
-            objective, tangent, sums, *normal_equations(weighted_terms(objective, objective.reference, r))
-        )
+        return self.linearize_terms(r, weighted_terms(self.objective, self.objective.reference, r))
 
-    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
-        """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient; from the
-        reference to the target alone.
+    def linearize_terms(self, r: Residuals, terms: list[Term]) -> Linearization:
+        """The same with each channel's Jacobian, residuals and weights known already."""
+        sums = self.objective.sums(self.objective.cost(r))
+        return linearization(self.objective, self.tangent, sums, *normal_equations(terms))
 
-        The covariance comes from the gradient's spread over tiles of the target image: residuals of neighbouring
-        pixels are correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both
-        sides this is the cluster-robust ("sandwich") covariance of an M-estimate.
+    def scatter(self, r: Residuals, terms: list[Term]) -> Float[Array, "6 6"]:
+        """Covariance of E's gradient at x = 0; from the reference to the target alone.
+
+        It comes from the gradient's spread over tiles of the target image: residuals of neighbouring pixels are
+        correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both sides this is the
+        cluster-robust ("sandwich") covariance of an M-estimate.
         """
         objective, plane = self.objective, self.objective.plane
-        tangent = adjoint(self.origin) @ self.basis
-        terms = weighted_terms(objective, objective.reference, r)
-        sums = objective.sums(objective.cost(r))
         column = jnp.clip(r.warped.u * (TILES[0] / plane.width), 0, TILES[0] - 1).astype(jnp.int32)
         row = jnp.clip(r.warped.v * (TILES[1] / plane.height), 0, TILES[1] - 1).astype(jnp.int32)
         tile = (row * TILES[0] + column).reshape(-1)
         pull = jnp.asarray(sum(jacobian * (weight * residual) for jacobian, residual, weight in terms))
         sum_by_tile = partial(jax.ops.segment_sum, segment_ids=tile, num_segments=TILES[0] * TILES[1])
-        by_tile = tangent.T @ jax.vmap(sum_by_tile)(pull)
-        by_tile *= 2.0 / objective.divisor(sums[1])
+        by_tile = self.tangent.T @ jax.vmap(sum_by_tile)(pull)
+        by_tile *= 2.0 / objective.divisor(jnp.sum(r.inside))
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
-        scatter = (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
-        return linearization(objective, tangent, sums, *normal_equations(terms)), scatter
+        return (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
+
+    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
+        """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient."""
+        terms = weighted_terms(self.objective, self.objective.reference, r)
+        return self.linearize_terms(r, terms), self.scatter(r, terms)
+
+    @property
+    def tangent(self) -> Float[Array, "6 6"]:
+        """J with transform(dx) ≈ exp(J dx) · origin."""
+        return adjoint(self.origin) @ self.basis
 
     def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
         """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
@@ -112,4 +124,4 @@ class Problem:
 
 
 TILES = (8, 6)
-"""Tiles across and down the image, for `Problem.examine`."""
+"""Tiles across and down the image, for `Problem.scatter`."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
@@ -34,7 +34,9 @@ class Attempt(NamedTuple):
     result: Alignment
     """On the host."""
     usable: bool
-    """Whether the motion can be used."""
+    """Whether the motion can be used,"""
+    fit: bool = True
+    """and whether the frame may then become the reference."""
     candidates: tuple[Population, ...] = ()
     """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
 
@@ -111,7 +113,7 @@ class Search:
             record=self.record,
         )
         result = on_host(result)
-        return Attempt(state, result, result.status == AlignmentStatus.OK, _by_level(populations))
+        return Attempt(state, result, result.status == AlignmentStatus.OK, candidates=_by_level(populations))
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
@@ -171,6 +173,50 @@ class Recovering:
         return self.first.predict(state, elapsed)
 
 
+@dataclass(frozen=True)
+class DoubtingDepth:
+    """An aligner that doubts a frame's depth before it doubts the motion.
+
+    Where depth does not agree with the image, the frame is aligned once more by its image alone; the motion can be used
+    then, but a frame of such depth is no reference.
+
+    Attributes:
+        first: What aligns.
+        alone: What aligns an image alone.
+    """
+
+    first: Aligner
+    alone: Aligner
+
+    def warm_up(self) -> float:
+        """That of the first one."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> Any:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        """With depth, or without where it does not agree."""
+        attempt = self.first.align(state, frame, clock)
+        if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
+            return attempt
+        again = self.alone.align(state, without_depth(frame), clock)
+        if not again.usable:
+            return attempt
+        result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
+        return again._replace(result=result, fit=False)
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+def without_depth(frame: Frame) -> Frame:
+    """A frame of which only the image counts."""
+    return replace(frame, depth=np.zeros_like(frame.depth))
+
+
 AGREEMENT = (0.02, 0.02)
 """Metres and radians within which two searches ended at the same motion."""
 
@@ -201,7 +247,9 @@ def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: 
 
 
 def with_recovery(aligner: Aligner, search: Search) -> Aligner:
-    """An aligner with the wide search behind it, where the search's settings ask for that."""
+    """An aligner with second thoughts, where the search's settings ask for that: without a depth that does not agree,
+    and with the wide search behind it.
+    """
     if not search.settings.odometry.recover:
         return aligner
-    return Recovering(aligner, lambda: wide_search(search))
+    return Recovering(DoubtingDepth(aligner, search), lambda: wide_search(search))

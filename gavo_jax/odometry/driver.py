@@ -14,12 +14,12 @@ import jax
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment.result import Alignment, no_alignment
+from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
-from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner
+from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -47,10 +47,14 @@ class Step:
     """Whether there is no usable motion."""
     policy: Literal["", "hold", "predict", "stop"] = ""
     """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
+    segment: int = 0
+    """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
 
 
 MAX_HELD = 3
 """Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
+MAX_DOUBTED = 15
+"""The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
 
 
 class Progress(NamedTuple):
@@ -67,6 +71,8 @@ class Progress(NamedTuple):
     held: int = 0
     """Frames since the reference was renewed."""
     history: History = History()
+    segment: int = 0
+    """Of the reference."""
 
 
 class Odometry:
@@ -125,6 +131,8 @@ class Odometry:
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
         usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
+        if usable is not None and finding.use is Use.GREY:
+            usable = without_depth(usable)
         candidates: tuple[Population, ...] = ()
         if before.tracker is None:
             fit = usable if finding.use is Use.ALL else None
@@ -149,11 +157,15 @@ class Odometry:
             milliseconds,
             lost,
             self.settings.odometry.on_lost if lost else "",
+            after.segment,
         )
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
-        """Make a frame the only reference, standing where the camera is recorded to be."""
+        """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new
+        segment.
+        """
         return before._replace(
+            segment=before.segment + (before.last_index > 0),
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
             world_T_reference=before.world_T_camera,
@@ -170,14 +182,14 @@ class Odometry:
         """
         result = attempt.result
         if not attempt.usable:
-            fit = frame if finding.use is Use.ALL else None
-            return self._lose(before, fit, frame.timestamp), result, True
-        if result.status == AlignmentStatus.OK:
-            result = result._replace(status=finding.status)
+            doubted = result.status is AlignmentStatus.DEPTH_MISMATCH and before.held + 1 < MAX_DOUBTED
+            fit = frame if finding.use is Use.ALL and not doubted else None
+            return self._lose(before, fit, frame.timestamp), with_finding(result, finding.status), True
+        result = with_finding(result, finding.status)
         world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
-        if finding.use is Use.ALL or overdue:
+        if attempt.fit and (finding.use is Use.ALL or overdue):
             after = after._replace(
                 tracker=attempt.state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0
             )

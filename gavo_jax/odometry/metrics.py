@@ -23,6 +23,10 @@ class Metrics(TypedDict):
     lost_pairs: int
     statuses: dict[str, int]
     """Pairs of each status."""
+    segments: int
+    """Stretches of the trajectory between which the motion is unknown; every error is computed within them."""
+    unknown_motions: int
+    """Places where one ends and the next begins."""
     rpe_translation_rmse_m_per_s: float | None
     """Drift, as by TUM's tool: relative pose error over 1 s."""
     rpe_rotation_rmse_deg_per_s: float | None
@@ -86,6 +90,8 @@ def compute_metrics(
         "pairs": len(steps),
         "lost_pairs": sum(step.lost for step in steps),
         "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
+        "segments": 1 + (breaks := steps[-1].segment if steps else 0),
+        "unknown_motions": breaks,
         "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
         "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
         "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),

@@ -78,4 +78,5 @@ def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
     """Trajectory of a run: the first camera at the origin, then a pose a step; none where the stamp is in doubt."""
     steps = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     stamps = np.array([first_timestamp] + [step.timestamp for step in steps])
-    return Trajectory(stamps, np.stack([np.eye(4)] + [step.world_T_camera for step in steps]))
+    poses = np.stack([np.eye(4)] + [step.world_T_camera for step in steps])
+    return Trajectory(stamps, poses, np.array([0] + [step.segment for step in steps]))

@@ -19,10 +19,38 @@ from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid,
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, synchronise_depth, warp
 from gavo_jax.objective.points import Reference, make_references, move_reference, settle_reference
+from gavo_jax.odometry.plausibility import Usual, judge_by_history
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
+
+
+class Exposure(NamedTuple):
+    """How bright an image is, and how rich in contrast: mean and standard deviation, grey levels."""
+
+    mean: Float[Array, ""]
+    spread: Float[Array, ""]
+
+    @classmethod
+    def of(cls, pyramid: Pyramid) -> "Exposure":
+        """Of the coarsest level, where noise adds nothing to the contrast."""
+        grey = pyramid[-1].grey
+        return cls(jnp.mean(grey), jnp.maximum(jnp.std(grey), 0.1))
+
+
+LARGEST_GAIN = 1.6
+"""Ratio of two images' contrasts beyond which the camera must have changed its gain; below, views may differ by that
+much, and the search estimates the gain itself."""
+
+
+def relight(reference: Reference, before: Exposure, after: Exposure) -> Reference:
+    """Points as they would be with another exposure, where it differs so much that a search would not find it."""
+    gain = after.spread / jnp.maximum(before.spread, 0.1)
+    differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
+    gain = jnp.where(differs, gain, 1.0)
+    grey = jnp.where(differs, gain * (reference.grey - before.mean) + after.mean, reference.grey)
+    return reference._replace(grey=grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v)
 
 
 class TrackerState(NamedTuple):
@@ -37,6 +65,9 @@ class TrackerState(NamedTuple):
     """Twist of the last motion, from the frame before the previous one to the previous one."""
     seconds: Float[Array, ""]
     """Time that motion took."""
+    exposure: Exposure
+    """Of the previous frame; the keyframe's points are as if taken with it."""
+    usual: Usual
 
 
 class Clock(NamedTuple):
@@ -119,10 +150,12 @@ def track_frame(
     finest = levels.numbers[-1]
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
-    readout = camera.readout / clock.elapsed if options.rolling_shutter else None
-    views = (state.previous,)
-    if options.reference == "keyframe":
-        views += (state.keyframe,)
+    readout = None
+    if options.rolling_shutter:  # a readout that is longer than the time between two frames cannot be
+        readout = jnp.where(camera.readout > clock.elapsed, 0.0, camera.readout / clock.elapsed)
+    exposure = Exposure.of(raw)
+    previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
+    views = (previous, keyframe) if options.reference == "keyframe" else (previous,)
     guesses = jnp.eye(4)[None]
     if options.prior:
         guesses = jnp.concatenate([exp(predicted)[None], guesses])
@@ -134,17 +167,21 @@ def track_frame(
     result, populations = align_views(
         views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout
     )
+    result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
     motion = jnp.where(is_first, 0.0, result.xi)
     if options.synchronise:
         target = _synchronised(raw, camera, delay * motion, finest)
-    newest, keyframe = make_references(target, camera, levels), state.keyframe
+    newest = make_references(target, camera, levels)
     if readout is not None:
         unsettled = newest.row_time
         newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
         newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
     keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
     keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
-    return TrackerState(newest, keyframe, packed, motion, clock.elapsed), result, populations
+    usual = jax.tree.map(
+        lambda new, old: jnp.where(is_first, old, new), state.usual.after(result, exposure.spread), state.usual
+    )
+    return TrackerState(newest, keyframe, packed, motion, clock.elapsed, exposure, usual), result, populations
 
 
 @jax.jit
@@ -153,7 +190,15 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     levels = levels_of(camera, solver, alignment)
     reference, packed = make_references(pyramid, camera, levels), prepare_target(pyramid, levels)
-    return TrackerState(reference, reference, packed, jnp.zeros(6), jnp.float32(1.0))
+    return TrackerState(
+        previous=reference,
+        keyframe=reference,
+        previous_image=packed,
+        motion=jnp.zeros(6),
+        seconds=jnp.float32(1.0),
+        exposure=Exposure.of(pyramid),
+        usual=Usual.unknown(),
+    )
 
 
 def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
@@ -162,5 +207,13 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
     row: Any = np.zeros((len(levels.numbers), levels.most_points), np.float32)
     words: Any = np.zeros((levels.layout.height, levels.layout.width), np.uint32)
     reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
-    still: Any = np.zeros(6, np.float32), np.float32(1.0)
-    return TrackerState(reference, reference, Target(words, words), *still)
+    zero: Any = np.float32(0.0)
+    return TrackerState(
+        previous=reference,
+        keyframe=reference,
+        previous_image=Target(words, words),
+        motion=jnp.zeros(6),
+        seconds=jnp.float32(1.0),
+        exposure=Exposure(zero, zero),
+        usual=Usual.unknown(),
+    )

@@ -1,10 +1,14 @@
-"""A driver's progress as one file, so that a run that was cut short can go on: arrays and numbers, no code."""
+"""A driver's progress as one file, so that a run that was cut short can go on: arrays and numbers, no code.
 
+A digest seals it: what was altered by accident or by hand is not gone on with.
+"""
+
+import hashlib
 import io
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,35 +18,59 @@ from gavo_jax.frame_checks import History
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.tracking import TrackerState
 
-NUMBERS, POSES = "numbers", ("world_T_reference", "world_T_camera")
+NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 
 
-def save_checkpoint(path: Path, progress: Progress, sizes: dict[str, int]) -> None:
-    """Write a driver's progress, whole or not at all.
+class Mark(NamedTuple):
+    """How far a growing file was."""
+
+    size: int
+    """Bytes."""
+    sha256: str
+    """Of these bytes."""
+
+
+class Checkpoint(NamedTuple):
+    """Where a run stood."""
+
+    progress: Progress
+    """After a usable frame, so that it has a tracker."""
+    files: dict[str, Mark]
+    """By name, the files that grow with the run."""
+    images: str = ""
+    """Digest of the images that were seen; see `SeenImages`."""
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write where a run stands, whole or not at all.
 
     Args:
         path: An .npz file.
-        progress: After a usable frame, so that it has a tracker.
-        sizes: Bytes that the growing files had by then.
+        checkpoint: What it holds.
 
     Raises:
         GavoError: The file cannot be written.
     """
+    progress = checkpoint.progress
     numbers = {
         "last_index": progress.last_index,
         "reference_timestamp": progress.reference_timestamp,
         "held": progress.held,
+        "segment": progress.segment,
         "history": progress.history._asdict(),
-        "sizes": sizes,
+        "files": checkpoint.files,
+        "images": checkpoint.images,
     }
-    arrays = {name: getattr(progress, name) for name in POSES}
     leaves = [] if progress.tracker is None else jax.device_get(jax.tree.leaves(progress.tracker))
+    arrays = {NUMBERS: np.array(json.dumps(numbers))}
+    arrays |= {name: np.asarray(getattr(progress, name)) for name in POSES}
+    arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
     data = io.BytesIO()
-    np.savez(data, **{NUMBERS: np.array(json.dumps(numbers))}, **arrays, **{_leaf(i): a for i, a in enumerate(leaves)})
+    np.savez(data, allow_pickle=False, **arrays, **{SEAL: np.array(_seal(arrays))})
     write_bytes(path, data.getvalue())
 
 
-def load_checkpoint(path: Path, blank: TrackerState) -> tuple[Progress, dict[str, int]]:
+def load_checkpoint(path: Path, blank: TrackerState) -> Checkpoint:
     """Read what `save_checkpoint` wrote.
 
     Args:
@@ -50,38 +78,42 @@ def load_checkpoint(path: Path, blank: TrackerState) -> tuple[Progress, dict[str
         blank: A state of the shapes and types to expect.
 
     Raises:
-        GavoError: The file cannot be read, is damaged, or is of another camera.
+        GavoError: The file cannot be read, is damaged or altered, or is of another camera.
     """
     expected, structure = jax.tree.flatten(blank)
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > 2**20 + sum(leaf.nbytes for leaf in expected):
                 raise GavoError(f"{path}: larger than a checkpoint of this camera")
-        with np.load(path, allow_pickle=False) as arrays:
-            numbers = json.loads(str(arrays[NUMBERS]))
-            poses = {name: arrays[name] for name in POSES}
-            leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = dict(stored)
+        if str(arrays.pop(SEAL)) != _seal(arrays):
+            raise ValueError("altered")
+        numbers = json.loads(str(arrays[NUMBERS]))
         history: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in numbers["history"].items()}
-        sizes: dict[str, int] = numbers.pop("sizes")
+        files = {name: Mark(*mark) for name, mark in numbers.pop("files").items()}
+        images = numbers.pop("images")
+        poses = {name: arrays[name] for name in POSES}
+        leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
         progress = Progress(**{**numbers, "history": History(**history)}, **poses)
-    except (
-        OSError,
-        EOFError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        MemoryError,
-        zipfile.BadZipFile,
-    ) as error:
-        if isinstance(error, GavoError):
-            raise
+    except GavoError:
+        raise
+    except Exception:  # what the readers of damaged archives, arrays and numbers raise has no end
         raise GavoError(f"{path}: not a whole checkpoint: run again without --resume") from None
     if leaves is None:
-        return progress, sizes
+        return Checkpoint(progress, files, images)
     if any((a.shape, a.dtype) != (b.shape, b.dtype) for a, b in zip(leaves, expected, strict=True)):
         raise GavoError(f"{path}: of another camera")
-    return progress._replace(tracker=jax.tree.unflatten(structure, map(jax.numpy.asarray, leaves))), sizes
+    progress = progress._replace(tracker=jax.tree.unflatten(structure, map(jax.numpy.asarray, leaves)))
+    return Checkpoint(progress, files, images)
+
+
+def _seal(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}\0".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def _leaf(i: int) -> str:

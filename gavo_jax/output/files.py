@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,15 @@ def describe(value: Any) -> Any:
     if value is None or isinstance(value, str | int):
         return value
     return name_of(value) or getattr(value, "__name__", str(value))
+
+
+def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
+    """The places where two JSON values differ: dotted name, one value, the other."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*after, *before]):
+            yield from differences(before.get(key), after.get(key), f"{name}.{key}".lstrip("."))
+    elif before != after:
+        yield name, json.dumps(before)[:60], json.dumps(after)[:60]
 
 
 def prepare_folder(folder: str | Path) -> Path:

@@ -11,18 +11,19 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.files import CONFIG, FRAMES, TRAJECTORY, read_json
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse
 
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
     ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "undetermined", "lost", "on_lost")
     + DEVIATIONS
-    + ("milliseconds",)
+    + ("milliseconds", "segment", "statuses")
 )
 """Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction that
 a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations of
-the motion's translation (m) and rotation (rad) along the axes of the reference camera."""
+the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from 0,
+every status that holds, with blanks between."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
@@ -60,7 +61,9 @@ def _read_step(
     row: Mapping[str, str], timestamp: float, world_T_camera: np.ndarray, target_T_reference: np.ndarray
 ) -> Step:
     deviations = np.array([float(row[name]) for name in DEVIATIONS])
+    statuses = (row.get("statuses") or row["status"]).upper().split()
     alignment = no_alignment(AlignmentStatus[row["status"].upper()])._replace(
+        findings=sum({bit(AlignmentStatus[name]) for name in statuses} - {bit(AlignmentStatus.OK)}),
         target_T_reference=target_T_reference,
         error=np.float32(row["error"]),
         overlap=np.float32(row["overlap"]),
@@ -75,6 +78,7 @@ def _read_step(
         float(row["milliseconds"]),
         row["lost"] == "1",
         row["on_lost"],  # pyright: ignore[reportArgumentType]
+        int(row.get("segment") or 0),
     )
 
 
@@ -94,6 +98,8 @@ def frame_row(step: Step) -> list[Any]:
         step.policy,
         *map(_digits, deviations),
         f"{step.milliseconds:.3f}",
+        step.segment,
+        " ".join(status.name.lower() for status in alignment.statuses),
     ]
 
 

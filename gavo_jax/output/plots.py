@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import importlib.util
 import textwrap
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from io import BytesIO
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import printable, write_bytes
 from gavo_jax.evaluation import ErrorSeries
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -89,7 +91,7 @@ def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | N
     """
     figure = _figure(10.0, 5.2, "trajectory")
     above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
-    paths = {name: (inverse(t.world_T_camera[0]) @ t.world_T_camera)[:, :3, 3] for name, t in estimates.items()}
+    paths = {name: _path(estimate) for name, estimate in estimates.items()}
     styles = dict(zip(paths, _styles(), strict=False))
     true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
     if true_path is not None:
@@ -106,6 +108,12 @@ def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | N
     space.set(xlabel="x, right (m)", ylabel="z, forward (m)", zlabel="−y, up (m)", title="In space")
     _limit_to_cube(space, [*paths.values(), *([] if true_path is None else [true_path])])
     return figure
+
+
+def _path(trajectory: Trajectory) -> Float[np.ndarray, "m 3"]:
+    """Positions seen from the first camera, with a row of not-a-number between two segments: the line breaks there."""
+    positions = (inverse(trajectory.world_T_camera[0]) @ trajectory.world_T_camera)[:, :3, 3]
+    return np.insert(positions, np.flatnonzero(np.diff(trajectory.segments)) + 1, np.nan, axis=0)
 
 
 def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations"]]) -> Figure:
@@ -203,18 +211,18 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
                 spread = [[middle - values.min()], [values.max() - middle]] if len(values) > 1 else None
                 axes.barh(place, middle, xerr=spread, edgecolor="black", linewidth=0.5, capsize=2, **style)
                 axes.annotate(f" {middle:#.3g}", (values.max(), place), va="center", fontsize=7)
-            names = list(methods) if column == 0 else [""] * len(methods)
+            names = [_words(name) for name in methods] if column == 0 else [""] * len(methods)
             axes.set_yticks(range(len(methods)), names, fontsize="small")
             axes.invert_yaxis()
             axes.margins(x=0.15)
-            axes.set(xlabel=label, title=clip)
+            axes.set(xlabel=label, title=_words(clip))
             axes.grid(alpha=0.3, axis="x")
             axes.set_axisbelow(True)
     return figure
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
-    """Write a figure as NAME.png and NAME.svg (`FORMATS`) into a folder and return their paths.
+    """Write a figure as NAME.png and NAME.svg (`FORMATS`), each whole, into a folder and return their paths.
 
     Raises:
         GavoError: a file cannot be written.
@@ -222,24 +230,29 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    def write_png(path: Path) -> None:
-        FigureCanvasAgg(figure).print_png(path, pil_kwargs={"optimize": True})
+    def draw_png(data: BytesIO) -> None:
+        FigureCanvasAgg(figure).print_png(data, pil_kwargs={"optimize": True})
 
-    def write_svg(path: Path) -> None:
-        FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None})
+    def draw_svg(data: BytesIO) -> None:
+        FigureCanvasSVG(figure).print_svg(data, metadata={"Date": None})
 
     # not by `savefig`, which draws twice for each file and lays out anew: that takes the most time
     figure.set_dpi(120)
     paths = []
-    for suffix, write in zip(FORMATS, (write_png, write_svg), strict=True):
-        path = Path(folder) / f"{name}.{suffix}"
-        try:
-            write(path)
-        except OSError as error:
-            raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+    for suffix, draw in zip(FORMATS, (draw_png, draw_svg), strict=True):
+        path, data = Path(folder) / f"{name}.{suffix}", BytesIO()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph .* missing")  # a name in a script that the font lacks
+            draw(data)
+        write_bytes(path, data.getvalue())
         figure.set_layout_engine("none")
         paths.append(path)
     return paths
+
+
+def _words(name: str) -> str:
+    """A name of other people's as a figure shows it: no formula, and no command."""
+    return printable(name).replace("$", r"\$")
 
 
 def _figure(width: float, height: float, name: str) -> Figure:
@@ -289,7 +302,7 @@ def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarra
 def _limit_to_cube(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
     """Give the three axes of a drawing in space the same scale and a few ticks each."""
     points = np.concatenate(paths)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     half = max(0.55 * float(np.max(high - low)), 1e-3)
     for axis, middle in zip("xyz", (low + high) / 2, strict=True):
         getattr(space, f"set_{axis}lim")(middle - half, middle + half)

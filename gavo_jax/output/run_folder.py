@@ -3,20 +3,23 @@
 A checkpoint beside them lets a run that was cut short go on where it was.
 """
 
+import contextlib
 import csv
+import hashlib
 import io
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from gavo_jax.errors import GavoError
+from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Progress, Step
 from gavo_jax.odometry.tracking import TrackerState
-from gavo_jax.output.checkpoint import load_checkpoint, save_checkpoint
+from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (
     CHECKPOINT,
     CONFIG,
@@ -26,6 +29,7 @@ from gavo_jax.output.files import (
     TRAJECTORY,
     VIEW,
     describe,
+    differences,
     prepare_folder,
     read_json,
     remove_figures,
@@ -33,8 +37,9 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_steps
+from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row
+from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row, segment_comment
 
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
 IDENTITY_OPTIONS = ("method", "preset", "seed")
@@ -42,62 +47,85 @@ IDENTITY_VERSIONS = ("gavo-jax", "jax", "numpy", "opencv")
 """What has to be the same in config.json for a run to go on to the same end."""
 
 
+CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+
+
 class _GrowingFile:
     """A text file that grows by whole lines: each is in the file, or the file ends where it did before."""
 
-    def __init__(self, path: Path, size: int) -> None:
-        """Open it and cut it to `size` bytes; raise GavoError where that cannot be, or where it is shorter."""
+    def __init__(self, path: Path, mark: Mark | None = None) -> None:
+        """Make it, or open it and cut it to where it was; raise GavoError where that cannot be.
+
+        No link is followed: what it leads to is not this run's.
+        """
         self.path = path
+        kind = os.O_CREAT | os.O_EXCL if mark is None else 0
         try:
-            self._file = path.open("r+b" if size else "wb", buffering=0)
-            short = self._file.seek(0, os.SEEK_END) < size
-            self.cut(size)
+            self._file = os.open(path, os.O_RDWR | kind | CAREFUL, 0o666)
+            self.cut(0 if mark is None else mark.size)
         except OSError as error:
             raise self._fault(error) from None
-        if short:
-            self._file.close()
-            raise GavoError(f"{path}: shorter than it was at the checkpoint: run again without --resume")
+        if mark is not None and self.mark() != mark:
+            self.close()
+            raise GavoError(f"{path}: not what it was at the checkpoint: run again without --resume")
 
     def append(self, line: str) -> None:
         data = (line + "\n").encode("utf-8")
         try:
-            written = self._file.write(data)
+            written = 0
             while written < len(data):
-                written += self._file.write(data[written:])
+                written += os.write(self._file, data[written:])
         except OSError as error:
             self.cut(self.size)
             raise self._fault(error) from None
+        self._sha256.update(data)
         self.size += len(data)
 
+    def mark(self) -> Mark:
+        """Where it ends, and a digest of all before."""
+        return Mark(self.size, self._sha256.hexdigest())
+
     def cut(self, size: int) -> None:
-        self._file.truncate(size)
-        self._file.seek(size)
-        self.size = size
+        """Take away what comes after so many bytes."""
+        if os.fstat(self._file).st_size > size:
+            os.ftruncate(self._file, size)
+        os.lseek(self._file, 0, os.SEEK_SET)
+        kept = b""
+        while len(kept) < size and (more := os.read(self._file, size - len(kept))):
+            kept += more
+        self.size, self._sha256 = len(kept), hashlib.sha256(kept)
 
     def close(self) -> None:
-        self._file.close()
+        os.close(self._file)
 
     def _fault(self, error: OSError) -> GavoError:
         return GavoError(f"{self.path}: cannot be written to: {error.strerror or error}")
 
 
 class RunFolder:
-    """A folder that receives the files of one run; use it in a `with` block.
+    """A folder that receives the files of one run; use it in a `with` block, for which no other process has it.
 
     Every frame's row is on disk as soon as it is added, so that a run that is cut short leaves what it had; only a run
     that came to its end has a metrics.json and no checkpoint.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, images: Sequence[Sequence[Path]] = ()) -> None:
         """Make the folder where it is missing.
+
+        Args:
+            folder: what becomes of its files is up to `start` and `resume`.
+            images: of each frame, where they are files: a run does not go on where those it saw have changed.
 
         Raises:
             GavoError: it is no folder or cannot be written to.
         """
         self.path = prepare_folder(folder)
+        self._held = contextlib.ExitStack()
+        self._seen = SeenImages(images)
         self._files: dict[str, _GrowingFile] = {}
-        self._whole: tuple[dict[str, int], Progress | None] = ({}, None)
-        """Sizes of the growing files after the last frame that is in both, and the driver's progress then."""
+        self._segment = 0
+        self._whole: tuple[dict[str, Mark], str, Progress | None] = ({}, "", None)
+        """The growing files after the last frame that is in both, the images seen and the driver's progress then."""
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
@@ -112,11 +140,11 @@ class RunFolder:
         remove_files(self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
-        self._open({TRAJECTORY: 0, FRAMES: 0})
+        self._open({TRAJECTORY: None, FRAMES: None})
         self._files[FRAMES].append(",".join(FRAME_COLUMNS))
         self._files[TRAJECTORY].append(TRAJECTORY_HEADER)
         self._files[TRAJECTORY].append(format_tum_row(timestamp, np.eye(4)))
-        self._whole = (self._sizes(), None)
+        self._whole = (self._marks(), self._seen.up_to(0), None)
 
     def resume(self, config: Mapping[str, Any], blank: TrackerState) -> Progress | None:
         """Open the files of a run that was cut short, without what came after its last checkpoint.
@@ -131,17 +159,27 @@ class RunFolder:
         Raises:
             GavoError: the earlier run is another one, or its files are damaged.
         """
+        kept = self.path / CHECKPOINT
         if (self.path / CONFIG).exists():
             _refuse_another(self.path / CONFIG, config)
-        if not (self.path / CHECKPOINT).exists():
+        elif kept.exists() or (self.path / METRICS).exists():
+            raise GavoError(
+                f"{self.path / CONFIG}: no such file, so that nothing tells of which run the others are: run again "
+                "without --resume"
+            )
+        if not kept.exists():
             return None
-        progress, sizes = load_checkpoint(self.path / CHECKPOINT, blank)
-        if set(sizes) != {TRAJECTORY, FRAMES} or not all(isinstance(size, int) and size > 0 for size in sizes.values()):
-            raise GavoError(f"{self.path / CHECKPOINT}: not a whole checkpoint: run again without --resume")
+        progress, files, images = load_checkpoint(kept, blank)
+        if set(files) != {TRAJECTORY, FRAMES}:
+            raise GavoError(f"{kept}: not a whole checkpoint: run again without --resume")
+        if self._seen.up_to(progress.last_index) != images:
+            raise GavoError(
+                f"{kept}: the images are not those that the run has seen before: run again without --resume"
+            )
+        self._open(files)
         remove_files(self.path, METRICS)
         remove_figures(self.path)
-        self._open(sizes)
-        self._whole = (sizes, progress)
+        self._whole, self._segment = (files, images, progress), progress.segment
         return progress
 
     def finished(self) -> dict[str, Any] | None:
@@ -169,8 +207,13 @@ class RunFolder:
         csv.writer(row, lineterminator="").writerow(frame_row(step))
         self._files[FRAMES].append(row.getvalue())
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
+            if step.segment != self._segment:
+                comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
+                self._files[TRAJECTORY].append(comment)
+                self._segment = step.segment
             self._files[TRAJECTORY].append(format_tum_row(step.timestamp, step.world_T_camera))
-        self._whole = (self._sizes(), progress)
+        images = self._whole[1] if progress is None else self._seen.up_to(progress.last_index)
+        self._whole = (self._marks(), images, progress)
 
     def save_checkpoint(self) -> None:
         """Write where the run stands, so that it can be resumed from here.
@@ -178,9 +221,9 @@ class RunFolder:
         Raises:
             GavoError: it cannot be written.
         """
-        sizes, progress = self._whole
+        files, images, progress = self._whole
         if progress is not None:
-            save_checkpoint(self.path / CHECKPOINT, progress, sizes)
+            save_checkpoint(self.path / CHECKPOINT, Checkpoint(progress, files, images))
 
     def steps(self) -> list[Step]:
         """The steps of the run so far, as the files tell them; see `read_steps`."""
@@ -197,33 +240,39 @@ class RunFolder:
         if complete:
             remove_files(self.path, CHECKPOINT)
 
-    def _open(self, sizes: Mapping[str, int]) -> None:
-        for name, size in sizes.items():
-            self._files[name] = _GrowingFile(self.path / name, size)
+    def _open(self, files: Mapping[str, Mark | None]) -> None:
+        for name, mark in files.items():
+            self._files[name] = _GrowingFile(self.path / name, mark)
 
-    def _sizes(self) -> dict[str, int]:
-        return {name: file.size for name, file in self._files.items()}
+    def _marks(self) -> dict[str, Mark]:
+        return {name: file.mark() for name, file in self._files.items()}
 
     def _cut(self) -> None:
         """Take away the part of a frame that an interruption left."""
-        for name, size in self._whole[0].items():
-            if self._files[name].size != size:
-                self._files[name].cut(size)
+        for name, mark in self._whole[0].items():
+            self._files[name].cut(mark.size)
 
     def __enter__(self) -> Self:
+        """Hold the folder.
+
+        Raises:
+            GavoError: another process writes to it.
+        """
+        self._held.enter_context(hold(self.path))
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._cut()
-        for file in self._files.values():
-            file.close()
+        with self._held:
+            self._cut()
+            for file in self._files.values():
+                file.close()
 
 
 def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:
     """Raise GavoError where a config.json is not of the run that `config` describes; it names the first difference."""
     earlier = read_json(path)
     now = json.loads(json.dumps(describe(config), allow_nan=False))
-    for name, before, after in _differences(_identity(earlier), _identity(now), ""):
+    for name, before, after in differences(_identity(earlier), _identity(now)):
         raise GavoError(
             f"{path}: is of another run, which --resume cannot go on with: {name} {before} there, {after} now"
         )
@@ -236,12 +285,3 @@ def _identity(config: dict[str, Any]) -> dict[str, Any]:
 
     whole = {key: config.get(key) for key in IDENTITY_KEYS}
     return {**whole, **part("options", IDENTITY_OPTIONS), **part("versions", IDENTITY_VERSIONS)}
-
-
-def _differences(before: Any, after: Any, name: str) -> Iterator[tuple[str, str, str]]:
-    """The places where two JSON values differ: name, one value, the other."""
-    if isinstance(before, dict) and isinstance(after, dict):
-        for key in dict.fromkeys([*after, *before]):
-            yield from _differences(before.get(key), after.get(key), f"{name}.{key}".lstrip("."))
-    elif before != after:
-        yield name, json.dumps(before)[:60], json.dumps(after)[:60]

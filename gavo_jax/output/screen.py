@@ -1,5 +1,9 @@
-"""What people see: tables on standard output, progress on standard error."""
+"""What people see: lines and tables on standard output, progress and warnings on standard error.
 
+All of it passes through `printable`: names of files and sequences are other people's.
+"""
+
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -9,6 +13,18 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
+
+from gavo_jax.errors import printable
+
+
+def say(line: str) -> None:
+    """Print a line on standard output."""
+    print(printable(line), flush=True)
+
+
+def tell(line: str) -> None:
+    """Print a line of the command's own on standard error."""
+    print(f"gavo: {printable(line)}", file=sys.stderr, flush=True)
 
 
 class PairProgress:
@@ -23,7 +39,7 @@ class PairProgress:
 
     def say(self, line: str) -> None:
         """Print a line above the bar; also where there is no bar."""
-        self._progress.console.print(Text(line), soft_wrap=True)
+        self._progress.console.print(Text(printable(line)), soft_wrap=True)
 
 
 @contextmanager
@@ -31,12 +47,13 @@ def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgres
     """Show a bar on standard error while the block runs; nothing where that is no terminal."""
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("pairs"),
         TimeRemainingColumn(),
     )
+    label = printable(label)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         yield PairProgress(progress, progress.add_task(f"{label}: compiling …", total=pairs, completed=done), label)
 
@@ -56,19 +73,20 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     """Print a table whose first column is text and whose others are numbers; it is never cut to the screen's width."""
     table = Table()
     for i, name in enumerate(columns):
-        table.add_column(Text(name), justify="right" if i else "left", no_wrap=True)
+        table.add_column(Text(printable(name)), justify="right" if i else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(str(cell)) for cell in row))
+        table.add_row(*(Text(printable(str(cell))) for cell in row))
     unlimited = Console(width=10_000)
     needed = Measurement.get(unlimited, unlimited.options, table).maximum
-    print(title)
+    say(title)
     Console(width=max(Console().width, needed)).print(table)
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a Markdown table whose first column is text and whose others are numbers."""
     rule = ["---", *["---:"] * (len(columns) - 1)]
-    return "\n".join("| " + " | ".join(map(str, cells)) + " |" for cells in (columns, rule, *rows))
+    lines = ([printable(str(cell)) for cell in cells] for cells in (columns, rule, *rows))
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def number(value: float | None, digits: int = 4) -> str:

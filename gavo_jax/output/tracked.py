@@ -1,15 +1,15 @@
 """A sequence through a driver under the eyes of a user, who may stop it with Ctrl-C."""
 
-import sys
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
-from gavo_jax.output.screen import pair_progress
+from gavo_jax.output.screen import pair_progress, tell
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
 
@@ -43,7 +43,7 @@ def track_visibly(
         viewer.watch(frame, step, odometry.candidates)
 
     with pair_progress(label, pairs, done) as bar:
-        compile_seconds = odometry.warm_up()
+        compile_seconds = interruptible(odometry.warm_up)
         start = time.perf_counter()
         try:
             for step in track(sequence, odometry=odometry, watch=watch):
@@ -57,7 +57,7 @@ def track_visibly(
             interrupted = True
         seconds = time.perf_counter() - start
     if interrupted:
-        print(f"gavo: {label}: interrupted after {done + len(steps)} of {pairs} pairs", file=sys.stderr)
+        tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
     return Tracked(trajectory, steps, metrics, interrupted)

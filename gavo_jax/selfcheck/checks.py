@@ -1,7 +1,8 @@
-"""Compiled kernels at the sizes that are used, against `equations`: does JAX compute right numbers on this machine?
+"""Compiled kernels at the sizes in use against `equations`: a list of checks, one per kernel, and long as such.
 
-A compiler may be right for small arrays and wrong for large ones, or right for one operation and wrong where it fuses
-two. So each check compiles a kernel as the presets call it, for as many rows, and compares with float64.
+Does JAX compute right numbers on this machine? A compiler may be right for small arrays and wrong for large ones, or
+right for one operation and wrong where it fuses two. So each check compiles a kernel as the presets call it, for as
+many rows, and compares with float64.
 """
 
 import time

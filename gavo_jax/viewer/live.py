@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
@@ -48,15 +49,20 @@ WINDOW_SECONDS = 1.0
 """After which a window that found no screen would have ended."""
 PATIENCE = 60.0
 """Seconds for the server to start, and for the last frames to arrive."""
+NOT_STARTED = "Rerun does not start"
 NOTHING_NEW: Any = ()
 """In place of a frame, where none came for a while."""
 GUARD = """
-import os, signal, subprocess, sys
-subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
+import os, signal, subprocess, sys, threading
+server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
+threading.Thread(target=lambda: os._exit(server.wait() or 1), daemon=True).start()
 sys.stdin.read()
 os.killpg(0, signal.SIGTERM)
 """
-"""Serves until its standard input closes, which it does however the run ends; Ctrl-C does not reach it."""
+"""Serves until its standard input closes, which it does however the run ends, or until its server ends; Ctrl-C does not
+reach it."""
+ATTEMPTS = 4
+"""Pairs of ports that are tried: one that is free may be somebody else's before the server has it."""
 
 
 def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
@@ -159,11 +165,11 @@ class RerunViewer(Viewer):
 
     def _open_window(self, stream: RecordingStream) -> None:
         """Start Rerun's own program, which stays when the run ends; unlike Rerun's call, for this machine alone."""
-        port, quiet = _free_port(GRPC_PORT), subprocess.DEVNULL
+        port, quiet = _free_port(0), subprocess.DEVNULL
         command = [sys.executable, "-m", "rerun", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
         self._process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
         try:
-            _await_port(port, self._process)
+            _await_own(self._process, {port})
             self._process.wait(timeout=WINDOW_SECONDS)
         except subprocess.TimeoutExpired:
             stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
@@ -174,16 +180,7 @@ class RerunViewer(Viewer):
 
     def _serve(self, stream: RecordingStream) -> None:
         """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
-        port, page = _free_port(GRPC_PORT), _free_port(WEB_PORT)
-        options = {"bind": HOST, "port": port, "web-viewer-port": page, "server-memory-limit": MEMORY}
-        command = [sys.executable, "-c", GUARD]
-        command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        quiet = subprocess.DEVNULL
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
-        )
-        for served in (port, page):
-            _await_port(served, self._process)
+        self._process, port, page = _serve_alone()
         address = f"rerun+http://{HOST}:{port}/proxy"
         stream.connect_grpc(address)
         self.url = f"http://{HOST}:{page}/?url={quote(address, safe='')}"
@@ -217,19 +214,65 @@ def _has_screen() -> bool:
     return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
 
 
-def _await_port(port: int, process: subprocess.Popen[bytes]) -> None:
-    """Wait until a process that was started answers at a port.
+def _serve_alone() -> tuple[subprocess.Popen[bytes], int, int]:
+    """Start a server and see that it has its two ports to itself: for data and for the page.
 
     Raises:
-        RuntimeError: it has ended, or does not answer for `PATIENCE` seconds.
+        RuntimeError: it does not start.
+    """
+    wanted = [(GRPC_PORT, WEB_PORT), *[(0, 0)] * (ATTEMPTS - 1)]
+    for data, site in wanted:
+        port, page = _free_port(data), _free_port(site)
+        process = _start_server(port, page)
+        try:
+            _await_own(process, {port, page})
+            return process, port, page
+        except RuntimeError:
+            _end(process)
+    raise RuntimeError(NOT_STARTED)
+
+
+def _start_server(port: int, page: int) -> subprocess.Popen[bytes]:
+    options = {"bind": HOST, "port": port, "web-viewer-port": page, "server-memory-limit": MEMORY}
+    command = [sys.executable, "-c", GUARD]
+    command += [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a server by its guard."""
+    if process.stdin is not None:
+        process.stdin.close()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(PATIENCE)
+
+
+def _await_own(process: subprocess.Popen[bytes], ports: set[int]) -> None:
+    """Wait until it is this process, or one that it started, that listens at ports, and not somebody else's.
+
+    Raises:
+        RuntimeError: it has ended, or does not listen for `PATIENCE` seconds.
     """
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
-        with socket.socket() as probe:
-            if probe.connect_ex((HOST, port)) == 0:
-                return
+        if ports <= _listening(process.pid):
+            return
         time.sleep(0.05)
-    raise RuntimeError("Rerun does not start")
+    raise RuntimeError(NOT_STARTED)
+
+
+def _listening(pid: int) -> set[int]:
+    """Ports at which a process and those that it started listen."""
+    import psutil  # Rerun needs it too
+
+    ports: set[int] = set()
+    with suppress(psutil.Error):
+        first = psutil.Process(pid)
+        for process in (first, *first.children(recursive=True)):
+            listeners = (c for c in process.net_connections(kind="tcp") if c.status == psutil.CONN_LISTEN)
+            ports.update(c.laddr.port for c in listeners)
+    return ports
 
 
 def _free_port(wanted: int) -> int:

@@ -12,8 +12,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from command import Done, runner
+from small import CAMERA
 
-from gavo_jax.camera import Camera
 from gavo_jax.cli import options
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
@@ -22,7 +22,6 @@ from gavo_jax.output.frames import FRAME_COLUMNS
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.trajectory import Trajectory
 
-CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_translation_rmse_m_per_s
 rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
 compile_seconds milliseconds_per_pair_median frames_per_second""".split()
@@ -273,7 +272,8 @@ BAD_OPTIONS = {
 @pytest.mark.parametrize("name", BAD_OPTIONS)
 def test_bad_option_is_refused(gavo, clip, name):
     bad, words = BAD_OPTIONS[name]
-    camera = [] if "--camera" in bad else ["--camera", clip / "camera.toml"]
+    (clip / "camera.toml").rename("camera.toml")
+    camera = [] if "--camera" in bad else ["--camera", "camera.toml"]
     assert is_refused(gavo("run", "clip", *camera, *bad), *words)
 
 

@@ -14,6 +14,7 @@ from gavo_jax.cli import main
 from gavo_jax.datasets import download as module
 from gavo_jax.datasets.download import download, folder_of
 from gavo_jax.errors import GavoError
+from gavo_jax.locks import hold
 
 FOLDER = "rgbd_dataset_freiburg1_xyz"
 LIST = b"# color images\n" + b"".join(b"%d.0 rgb/%d.png\n" % (i, i * 7919) for i in range(9000))
@@ -42,6 +43,7 @@ class Server(ThreadingHTTPServer):
     content = archive()
     faults: list[str]
     ranges = True
+    length = ""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -74,7 +76,7 @@ class Handler(BaseHTTPRequestHandler):
         self.send_response(206 if asked and server.ranges else 200)
         if asked and server.ranges:
             self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
-        self.send_header("Content-Length", str(len(content) - start))
+        self.send_header("Content-Length", server.length or str(len(content) - start))
         self.end_headers()
         body = content[start:]
         self.wfile.write(body[: len(body) // 2] if fault else body)
@@ -156,6 +158,44 @@ def test_a_second_call_goes_on(server: Server, tmp_path: Path):
 
 def test_a_part_longer_than_the_file_is_dropped(server: Server, tmp_path: Path):
     (tmp_path / f"{FOLDER}.tgz.part").write_bytes(b"z" * (len(server.content) + 5))
+    assert is_whole(download("fr1_xyz", tmp_path, server.url), tmp_path)
+
+
+@pytest.mark.parametrize("length", ["abc", "-5", "²", "9" * 5000])
+def test_a_size_that_is_no_number_tells_nothing(server: Server, tmp_path: Path, length: str):
+    server.length = length
+    assert is_whole(download("fr1_xyz", tmp_path, server.url), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "address", ["foo", "ftp://x/", "http://[", "http://h:abc", f"http://{'a' * 300}/", "http://a b/"]
+)
+def test_an_address_that_is_none_is_one_line(server: Server, tmp_path: Path, monkeypatch, capsys, address: str):
+    monkeypatch.setenv("GAVO_TUM_SERVER", address)
+    assert main(["download", "fr1_xyz", "--to", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_names_in_an_archive_do_not_command_the_terminal(server: Server, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setenv("GAVO_TUM_SERVER", server.url)
+    server.content = archive(member("\x1b]0;gotcha\x07\x1b[31m\x9b31m\u202eevil.txt"))
+    assert main(["download", "fr1_xyz", "--to", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "\\x1b]0;gotcha\\x07" in error and error[:-1].isprintable()
+
+
+def test_two_downloads_at_once(server: Server, tmp_path: Path):
+    """The second does not write into the first one's file."""
+    with hold(tmp_path, f".{FOLDER}.lock"):
+        with pytest.raises(GavoError, match="in use"):
+            download("fr1_xyz", tmp_path, server.url)
+        assert not server.requests
+    assert is_whole(download("fr1_xyz", tmp_path, server.url), tmp_path)
+
+
+def test_what_a_kill_left_half_unpacked_is_removed(server: Server, tmp_path: Path):
+    (tmp_path / f".unpacking-{FOLDER}" / FOLDER).mkdir(parents=True)
+    (tmp_path / f".unpacking-{FOLDER}" / FOLDER / "rgb.txt").write_text("half")
     assert is_whole(download("fr1_xyz", tmp_path, server.url), tmp_path)
 
 

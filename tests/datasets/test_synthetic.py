@@ -9,7 +9,8 @@ import pytest
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.room import build_room, free_space, render
+from gavo_jax.datasets.rendering import render
+from gavo_jax.datasets.room import build_room, free_space
 from gavo_jax.datasets.synthetic import (
     DEFAULT_CAMERA,
     KINECT,

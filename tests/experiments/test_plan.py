@@ -4,14 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from small import CAMERA
 
-from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import batches, read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
-CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 GRID = """
 [[methods]]
 name = "ga"
@@ -103,6 +102,7 @@ REFUSED = {
     "one frame": ("[[sequences]]\nframes = 1", METHOD, ["sequences[1]: frames", "at least 2"]),
     "no such sequence": ("[[sequences]]\npath = 'nowhere'", METHOD, ["sequences[1]", "nowhere"]),
     "no TOML": ("seeds = ", METHOD, ["not TOML"]),
+    "a number of 5000 digits": ("seeds = 1" + 5000 * "0", METHOD, ["not TOML"]),
     "ray": ("[ray]\ncpu = 2", METHOD, ["ray", "'cpu'", "'cpus'"]),
 }
 

@@ -6,13 +6,20 @@ from typing import Any
 
 import pytest
 
+from gavo_jax.cli import main
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 
 
 def row(run: str, drift: float | None = 0.01) -> dict[str, Any]:
     values: dict[str, Any] = {name: {TEXT: "", REAL: 1.5, FLAG: True}.get(kind, 2) for name, kind in COLUMNS.items()}
-    return values | {"run": run, "rpe_translation_rmse_m_per_s": drift, "configuration": {"a": [1, None]}, "seed": None}
+    return values | {
+        "run": run,
+        "rpe_translation_rmse_m_per_s": drift,
+        "configuration": {"a": [1, None]},
+        "versions": {},
+        "seed": None,
+    }
 
 
 def write_many(folder: Path, start: Any, name: str) -> None:
@@ -71,3 +78,29 @@ def test_any_parquet_reader_sees_one_table(tmp_path):
         Table(tmp_path).append(row(run))
     (Table(tmp_path).folder / ".d.partial").write_bytes(b"")
     assert dataset.dataset(Table(tmp_path).folder).to_table().num_rows == 3
+
+
+FOREIGN = {
+    "other columns": {"a": [1, 2]},
+    "no column at all": {},
+    "two rows": {name: [value, value] for name, value in {**row("x"), "configuration": "{}", "versions": "{}"}.items()},
+    "another run": {name: [value] for name, value in {**row("y"), "configuration": "{}", "versions": "{}"}.items()},
+    "other types": {name: ["text"] for name in COLUMNS},
+    "no object": {name: [value] for name, value in {**row("x"), "configuration": "[]", "versions": "{}"}.items()},
+    "no JSON": {name: [value] for name, value in {**row("x"), "configuration": "{", "versions": "{}"}.items()},
+    "no time": {
+        name: [value]
+        for name, value in {**row("x"), "configuration": "{}", "versions": "{}", "frames_per_second": 0.0}.items()
+    },
+}
+
+
+@pytest.mark.parametrize("columns", FOREIGN.values(), ids=FOREIGN.keys())
+def test_a_foreign_file_is_named_in_one_line(tmp_path, columns, capsys):
+    """Whatever it holds, a Parquet file that is no row of a run is neither reported nor a traceback."""
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    Table(tmp_path).append(row("a"))
+    parquet.write_table(arrow.table(columns), Table(tmp_path).folder / "x.parquet")
+    assert main(["experiment", "report", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "x.parquet: not a row of results" in error

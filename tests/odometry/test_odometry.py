@@ -22,8 +22,9 @@ from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.image.warp import Points
 from gavo_jax.objective.points import make_references, move_reference
-from gavo_jax.odometry.aligners import Attempt, Recovering, Search
+from gavo_jax.odometry.aligners import Attempt, DoubtingDepth, Recovering, Search
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.run import OdometryRun, run_odometry
 from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
@@ -37,6 +38,7 @@ CAMERA = DEFAULT_CAMERA.level(1)
 FRAMES = 12
 PLAIN = OdometryOptions(recover=False)
 """No wide search where a pair looks wrong: what happens to lost pairs is the subject here."""
+FRAME_TO_FRAME = replace(PLAIN, reference="previous", prior=False)
 
 
 SOLVER = GaussNewton(iterations=(0, 15, 0, 0, 20))
@@ -418,8 +420,8 @@ def test_a_rolling_shutter_is_reckoned_with() -> None:
     sequence = Rendered(frames=FRAMES, camera=camera, noise=NONE, speed=2.0)
     truth = sequence.ground_truth.world_T_camera
 
-    def off(rolling_shutter: bool, reference: Any) -> np.ndarray:
-        options = replace(PLAIN, rolling_shutter=rolling_shutter, reference=reference)
+    def off(rolling_shutter: bool, options: OdometryOptions) -> np.ndarray:
+        options = replace(options, rolling_shutter=rolling_shutter)
         estimate = run(sequence, options).trajectory.world_T_camera
         apart = np.linalg.inv(np.linalg.inv(truth[0]) @ truth) @ estimate
         # over six frames, from the third on: before, nothing is known of the camera's speed
@@ -427,8 +429,8 @@ def test_a_rolling_shutter_is_reckoned_with() -> None:
         turned, moved = drift[:, :3, :3] - np.eye(3), drift[:, :3, 3]
         return np.array([np.sqrt(np.mean(part**2)) for part in (moved, turned)])
 
-    for reference in ("previous", "keyframe"):
-        assert np.all(off(True, reference) < 0.7 * off(False, reference))
+    for options in (PLAIN, FRAME_TO_FRAME):
+        assert np.all(off(True, options) < 0.7 * off(False, options))
 
 
 def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticSequence) -> None:
@@ -471,30 +473,38 @@ def test_warming_up_leaves_the_garbage_collector_as_it_was(collects: bool) -> No
         (gc.enable if before else gc.disable)()
 
 
+@jax.jit
+def keyframe_after_a_turn(grey: jax.Array, depth: jax.Array, turn: jax.Array) -> tuple[Points, jax.Array]:
+    """Points of a frame after a turn to the side by so many radians, and which of them are renewed, [L, N]."""
+    pyramid = build_pyramid(grey, depth, CAMERA.depth_scale)
+    first = make_references(pyramid, CAMERA, levels_of(CAMERA, SOLVER, AlignmentOptions()))
+    keyframe = move_reference(first, exp(jnp.zeros(6).at[4].set(turn)))
+    newest = first._replace(grey=first.grey + 1000.0)
+    return keyframe.points, renew_keyframe(keyframe, newest, CAMERA.level(1), 0.7).grey > 500.0
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.2, 0.25, 0.3, 0.6])
 def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSequence) -> None:
     frame, camera = sequence[0], CAMERA.level(1)
-    pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
-    first = make_references(pyramid, CAMERA, levels_of(CAMERA, SOLVER, AlignmentOptions()))
-    keyframe = move_reference(first, exp(jnp.array([0.0, 0, 0, 0, turn, 0])))
-    renewed = renew_keyframe(keyframe, first._replace(grey=first.grey + 1000.0), camera, 0.7).grey > 500.0
+    points, is_renewed = keyframe_after_a_turn(frame.grey, frame.depth, jnp.float32(turn))
 
-    x, y, q = (leaf[-1] for leaf in keyframe.points)
+    x, y, q = (np.asarray(leaf[-1], float) for leaf in points)
     seen = q > 0
     u, v = x * camera.fx + camera.cx, y * camera.fy + camera.cy
     inside = seen & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
-    overlap = float(jnp.sum(inside) / jnp.sum(seen))
+    overlap = np.sum(inside) / np.sum(seen)
     expected = np.clip((0.8 - overlap) / 0.2, 0.0, 1.0)
-    share = float(jnp.mean(renewed[-1]))
+    renewed = np.asarray(is_renewed)
+    share = np.mean(renewed[-1])
     assert share == pytest.approx(expected, abs=0.13) and (share in (0.0, 1.0)) == (expected in (0.0, 1.0))
     places = np.arange(renewed.shape[1]) % 80 < 40  # each share is spread over the whole image
-    left, right = (float(jnp.mean(renewed[-1][side])) for side in (places, ~places))
+    left, right = (np.mean(renewed[-1][side]) for side in (places, ~places))
     assert left == pytest.approx(right, abs=0.03)
     np.testing.assert_array_equal(renewed[0], renewed[-1])
 
 
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
-    result = run(sequence[:6], replace(PLAIN, reference="previous", prior=False))
+    result = run(sequence[:6], FRAME_TO_FRAME)
     assert result.metrics["lost_pairs"] == 0
     assert errors(result, sequence).max() < 0.01
 
@@ -604,10 +614,11 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
 
 def test_the_wide_search_stands_behind_the_default_one() -> None:
     aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
-    assert isinstance(aligner, Recovering) and isinstance(aligner.first, Search)
-    wide = aligner.second()
-    assert isinstance(wide, Search) and wide.key == aligner.first.key
+    assert isinstance(aligner, Recovering) and isinstance(aligner.first, DoubtingDepth)
+    search, wide = aligner.first.first, aligner.second()
+    assert isinstance(search, Search) and aligner.first.alone is search
+    assert isinstance(wide, Search) and wide.key == search.key
     assert wide.settings.alignment.scouts > 0 and wide.settings.odometry.reference == "previous"
     assert wide.settings.solver.levels == SOLVER.levels
-    assert wide.settings.alignment.points == aligner.first.settings.alignment.points
+    assert wide.settings.alignment.points == search.settings.alignment.points
     assert isinstance(Odometry(CAMERA, SEARCH_ALONE).aligner, Search)

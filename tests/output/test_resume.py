@@ -11,29 +11,30 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from small import CAMERA, GENETIC
 
-from gavo_jax.camera import Camera
 from gavo_jax.cli import main, run
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry, Progress, track
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.tracking import blank_state
-from gavo_jax.output.checkpoint import load_checkpoint, save_checkpoint
+from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
+from gavo_jax.presets import preset
+from gavo_jax.settings import Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
-from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.trajectory import Trajectory
 
-CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
-SOLVER = GaussNewton(iterations=(0, 0, 15, 0, 0))
-GENETIC = GeneticAlgorithm(population=(0, 0, 16, 0, 0), iterations=(0, 0, 5, 0, 0))
 READ_ONLY_CACHE = {**os.environ, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e9"}
 """JAX writes its cache of programs in place: a process that dies meanwhile would spoil it for the others."""
-PLAIN = OdometryOptions(recover=False)
+READ_ONLY_CACHE.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX has set it here; the command sets its own
+NEWTON = preset("gauss-newton")
+"""As the command runs it here."""
+SOLVER = GaussNewton(iterations=(0, 0, 15, 0, 0))
 TIMINGS = {"compile_seconds", "milliseconds_per_pair_median", "frames_per_second"}
 OFTEN = "import sys; from gavo_jax.cli import main, run; run.CHECKPOINT_SECONDS = 0.1; sys.exit(main(sys.argv[1:]))"
 """The command, with more checkpoints than it needs."""
@@ -65,8 +66,9 @@ def whole(clip, tmp_path_factory) -> Path:
 def same_ending(one: Path, other: Path) -> bool:
     """Whether two runs ended with the same files, byte by byte but for the times they took."""
 
-    def rows(folder: Path) -> list[list[str]]:
-        return [row[:-1] for row in csv.reader((folder / "frames.csv").read_text().splitlines())]
+    def rows(folder: Path) -> list[dict[str, str]]:
+        table = csv.DictReader((folder / "frames.csv").read_text().splitlines())
+        return [{name: value for name, value in row.items() if name != "milliseconds"} for row in table]
 
     def figures(folder: Path) -> dict[str, Any]:
         metrics = json.loads((folder / "metrics.json").read_text())
@@ -166,6 +168,15 @@ def test_another_run_is_not_resumed(clip, broken, capsys, more, words):
     assert {path: path.read_bytes() for path in broken.iterdir()} == before
 
 
+def altered(path: Path, **changes: Any) -> None:
+    """Write a checkpoint again with other arrays, as it may be written."""
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    for name, change in changes.items():
+        arrays[name] = change(arrays[name]) if callable(change) else change
+    np.savez(path, **arrays)
+
+
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -182,6 +193,16 @@ def halve(path: Path) -> None:
         ("frames.csv", Path.unlink),
         ("config.json", halve),
         ("config.json", lambda path: path.write_text("[]")),
+        ("config.json", Path.unlink),
+        ("checkpoint.npz", lambda path: altered(path, world_T_camera=np.eye(4))),
+        ("checkpoint.npz", lambda path: altered(path, tracker_0=lambda leaf: leaf + 1)),
+        (
+            "checkpoint.npz",
+            lambda path: altered(path, numbers=lambda old: np.array(str(old).replace('"held": 0', '"held": 1'))),
+        ),
+        ("trajectory.txt", lambda path: path.write_bytes(path.read_bytes().replace(b"0.0333", b"0.0334", 1))),
+        ("frames.csv", lambda path: path.write_bytes(path.read_bytes().replace(b"ok", b"OK", 1))),
+        ("trajectory.txt", lambda path: path.rename(path.with_suffix(".kept")) and path.symlink_to("trajectory.kept")),
     ],
 )
 def test_damaged_files_are_not_resumed(clip, broken, capsys, name, damage):
@@ -192,28 +213,91 @@ def test_damaged_files_are_not_resumed(clip, broken, capsys, name, damage):
     assert error.count("\n") == 1 and str(broken / name) in error
 
 
+def test_a_damaged_checkpoint_is_always_one_line(tmp_path):
+    """Whatever bytes change, the file is refused in one way or read as it was."""
+    path, rng = tmp_path / "checkpoint.npz", np.random.default_rng(0)
+    blank = blank_state(CAMERA.level(3), SOLVER, NEWTON.alignment)
+    save_checkpoint(path, Checkpoint(Progress(blank, 3), {"frames.csv": Mark(7, "")}))
+    whole, refused = path.read_bytes(), 0
+    for _ in range(300):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(data), int(rng.integers(1, 4))):
+            data[place] = rng.integers(256)
+        path.write_bytes(data)
+        try:
+            found = load_checkpoint(path, blank)
+        except GavoError as fault:
+            refused += "not a whole checkpoint" in str(fault) or "larger than" in str(fault)
+        else:
+            assert found.progress.last_index == 3 and found.files == {"frames.csv": Mark(7, "")}
+            refused += 1
+    assert refused == 300
+
+
+@pytest.mark.parametrize("part", ["rgb", "depth"])
+def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, part):
+    """Of the frames that were seen; what comes after them is read as it is now."""
+    own = tmp_path / "clip"
+    shutil.copytree(clip, own)
+    with monkeypatch.context() as patch:
+        cut_short(patch, 4, Power)
+        with pytest.raises(Power):
+            main(arguments(own, tmp_path / "out"))
+    shutil.rmtree(own)
+    shutil.copytree(clip, own, copy_function=shutil.copy)  # other times, the same images
+    (out := tmp_path / "again").mkdir()
+    for path in (tmp_path / "out").iterdir():
+        shutil.copy(path, out)
+    assert main(arguments(own, out, "--resume")) == 0
+    image = sorted((own / part).iterdir())[2]
+    picture = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    picture[7, 7] += 1
+    cv2.imwrite(str(image), picture)
+    capsys.readouterr()
+    assert main(arguments(own, tmp_path / "out", "--resume")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "images are not those" in error
+
+
+def test_a_finished_run_that_nothing_tells_of_is_not_shown_for_another(whole, clip, tmp_path, capsys):
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "out" / "config.json").unlink()
+    assert main(arguments(clip, tmp_path / "out", "--resume", "--seed", "7")) == 2
+    assert "config.json: no such file" in capsys.readouterr().err
+
+
+def test_metrics_are_there_before_the_figures(clip, tmp_path, monkeypatch, capsys):
+    def full(*arguments: Any) -> None:
+        raise GavoError("trajectory.png: cannot be written: No space left on device")
+
+    monkeypatch.setattr(run, "draw", full)
+    assert main(arguments(clip, tmp_path / "out")) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["complete"] is True
+
+
 def test_a_checkpoint_of_another_camera_is_refused(tmp_path):
-    own, other = (blank_state(camera, SOLVER, AlignmentOptions()) for camera in (CAMERA, CAMERA.level(1)))
-    save_checkpoint(tmp_path / "checkpoint.npz", Progress(own, 3), {})
+    own, other = (blank_state(camera, SOLVER, NEWTON.alignment) for camera in (CAMERA, CAMERA.level(1)))
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress(own, 3), {}))
     with pytest.raises(GavoError, match="another camera"):
         load_checkpoint(tmp_path / "checkpoint.npz", other)
 
 
-@pytest.mark.parametrize(("solver", "at"), [(SOLVER, 1), (SOLVER, 4), (GENETIC, 3)])
-def test_a_driver_goes_on_from_a_saved_progress(tmp_path, solver, at):
-    sequence, settings = SyntheticSequence(frames=7, camera=CAMERA), Settings(solver, odometry=PLAIN)
+@pytest.mark.parametrize(("settings", "at"), [(NEWTON, 1), (NEWTON, 4), (GENETIC, 3)])
+def test_a_driver_goes_on_from_a_saved_progress(tmp_path, settings: Settings, at):
+    sequence = SyntheticSequence(frames=7, camera=CAMERA)
     straight = run_odometry(sequence, settings).trajectory.world_T_camera
     first = Odometry(CAMERA, settings)
     for step in track(sequence, odometry=first):
         if step.index == at:
             break
-    save_checkpoint(tmp_path / "checkpoint.npz", first.progress, {"frames.csv": 7})
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(first.progress, {"frames.csv": Mark(7, "")}))
     second = Odometry(CAMERA, settings)
-    second.progress, sizes = load_checkpoint(
-        tmp_path / "checkpoint.npz", blank_state(CAMERA, solver, settings.alignment)
-    )
+    blank = blank_state(CAMERA, settings.solver, settings.alignment)
+    second.progress, files, _ = load_checkpoint(tmp_path / "checkpoint.npz", blank)
     rest = list(track(sequence, odometry=second))
-    assert sizes == {"frames.csv": 7}
+    assert files == {"frames.csv": Mark(7, "")}
     assert [step.index for step in rest] == list(range(at + 1, 7))
     np.testing.assert_array_equal([step.world_T_camera for step in rest], straight[at + 1 :])
 

@@ -1,6 +1,7 @@
 """The viewer: what it saves is read back with Rerun's own reader and compared with the run."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,25 +11,16 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from small import CAMERA, GENETIC
 
 from gavo_jax.alignment.search import Population
-from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry, track
 from gavo_jax.se3 import exp
-from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
-from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.viewer import colors, live, pictures, search_space
 
-CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
-SOLVER = GeneticAlgorithm(population=(0, 0, 0, 8, 12), iterations=(0, 0, 0, 2, 3))
-SEARCH_ALONE = AlignmentOptions(last_step=False)
-"""So that a pair's result is the best of the candidates that are shown."""
-PLAIN = OdometryOptions(recover=False)
-"""So few candidates find little: no second search is the subject here."""
-SETTINGS = Settings(SOLVER, SEARCH_ALONE, PLAIN)
-FRAMES, GENERATIONS, PARTICLES = 4, 2 + 3, (12, 12, 12, 8, 8)
+FRAMES, GENERATIONS, PARTICLES = 4, 8 + 6, (16,) * 8 + (8,) * 6
 ENTITIES_OF_A_PAIR = (
     "/curves/rmse",
     "/curves/distance_error",
@@ -67,7 +59,7 @@ def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "run.rrd"
     sequence = SyntheticSequence(frames=FRAMES, camera=CAMERA)
     shown = live.make_viewer("save", path)
-    odometry = Odometry(sequence.camera, SETTINGS, record=shown.wants_populations)
+    odometry = Odometry(sequence.camera, GENETIC, record=shown.wants_populations)
     with shown:
         shown.open("a run", sequence.camera, sequence.timestamps, sequence.ground_truth)
         steps = list(
@@ -119,7 +111,7 @@ def test_particles_curves_and_path_are_those_of_the_run(run, rows):
         [piece] = [row for row in rows["/world/estimate"] if row["frame"] == step.index]
         assert np.allclose(component(piece, "strips")[0][1], step.world_T_camera[:3, 3], atol=1e-6)
     texts = [component(row, "text")[0] for row in sorted(rows["/state"], key=lambda row: row["generation"])]
-    assert "| 12 | 4 | 1/16 | 1 of 3 |" in texts[0] and "| 8 | 3 | 1/8 | 2 of 2 |" in texts[GENERATIONS - 1]
+    assert "| 16 | 4 | 1/16 | 1 of 8 |" in texts[0] and "| 8 | 3 | 1/8 | 6 of 6 |" in texts[GENERATIONS - 1]
     errors = [component(row, "scalars")[0] for row in rows["/curves/distance_error"]]
     assert len(errors) == FRAMES - 1 and max(errors) < 0.05
 
@@ -130,7 +122,7 @@ def test_a_frame_is_small(run):
 
 def test_recording_changes_nothing(run):
     steps, sequence, _ = run
-    plain = list(track(sequence, odometry=Odometry(sequence.camera, SETTINGS)))
+    plain = list(track(sequence, odometry=Odometry(sequence.camera, GENETIC)))
     assert all(np.array_equal(a.world_T_camera, b.world_T_camera) for a, b in zip(steps, plain, strict=True))
 
 
@@ -245,3 +237,33 @@ def test_a_fault_in_the_thread_reaches_the_user(tmp_path):
     shown.watch("no frame", None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="--viewer save"):
         shown.close()
+
+
+def test_each_of_two_viewers_at_once_has_a_server_of_its_own(tmp_path, monkeypatch):
+    """The second finds the ports free, as the first has not taken them yet: it is not to show the first one's page."""
+    monkeypatch.setattr(live, "_has_screen", lambda: False)
+    asked: list[int] = []
+    free = live._free_port
+
+    def free_port(wanted: int) -> int:
+        asked.append(wanted)
+        return taken.pop(0) if taken else free(wanted)
+
+    first = live.RerunViewer("web", tmp_path / "first.rrd")
+    second = live.RerunViewer("web", tmp_path / "second.rrd")
+    taken: list[int] = []
+    first.open("first", CAMERA, np.zeros(1), None)
+    ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", first.url)]
+    monkeypatch.setattr(live, "_free_port", free_port)
+    for clash in (ports[::-1], [ports[1], free(0)], [free(0), ports[0]]):
+        taken[:] = clash
+        second.open("second", CAMERA, np.zeros(1), None)
+        own = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", second.url)]
+        assert len(own) == 2 and not set(own) & set(ports) and len(asked) == 4
+        assert second._process is not None and set(own) <= live._listening(second._process.pid)
+        second.close()
+        live._end(second._process)
+        asked.clear()
+    first.close()
+    assert first._process is not None
+    live._end(first._process)

@@ -1,0 +1,104 @@
+"""What two frames tell of each direction of motion, against what noise alone would tell.
+
+The Hessian of E is a sum of squared image gradients, and noise has gradients too: a wall without any texture looks as
+well determined as a picture. The noise of two frames is independent, though. So each direction's information is taken
+from products of a point's gradient in the reference with its gradient in the target: what both frames show adds up,
+what only one of them shows cancels, and how far it cancels by chance is known as well.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.camera import to_pixels
+from gavo_jax.image.shutter import Slopes
+from gavo_jax.image.warp import Warped
+from gavo_jax.objective.derivatives import Term, pixel_jacobian
+from gavo_jax.objective.error import Residuals
+from gavo_jax.objective.points import Reference
+from gavo_jax.objective.problem import Problem
+
+SIGNIFICANCE = 4.0
+"""Standard deviations of what noise alone would give, below which a direction's information counts as none."""
+MIN_ALIGNED_SHARE = 1e-3
+"""Mean squared cosine between image gradients and a direction's flow below which its information counts as none: an
+interpolated gradient is wrong by two or three per cent, so that a stripe seems to tell of a motion along itself."""
+ENOUGH = 4800
+"""Points, evenly spread, that the information is taken from where there are twice as many or more."""
+LEAST = 0.01
+"""Squared grey levels a m² or rad²: what is less tells nothing, on any number of points."""
+
+
+class Information(NamedTuple):
+    """Six directions δ of a step on the reference's side, at right angles in the flow that they cause."""
+
+    directions: Float[Array, "6 6"]
+    """As columns; metres and radians."""
+    curvature: Float[Array, " 6"]
+    """Of E along them, as far as both frames confirm it."""
+    determined: Bool[Array, " 6"]
+    """Whether that is more than noise and interpolation would give."""
+
+    def inverse(self) -> Float[Array, "6 6"]:
+        """Inverse of E's Hessian over the determined directions; 0 along the others."""
+        values = jnp.where(self.determined, 1.0 / jnp.where(self.determined, self.curvature, 1.0), 0.0)
+        return (self.directions * values) @ self.directions.T
+
+
+def measure_information(problem: Problem, r: Residuals, terms: list[Term]) -> Information:
+    """What the frames tell at the problem's origin, of which these are the residuals and the `weighted_terms`."""
+    objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // ENOUGH)
+    factor = 2.0 * every / objective.divisor(jnp.sum(r.inside))
+    reference, r, terms = jax.tree.map(lambda leaf: leaf[..., ::every], (objective.reference, r, terms))
+    points = reference.points
+    here = Warped(*to_pixels(plane, points.x, points.y), points.q, jnp.ones_like(points.q))
+    nothing, one = jnp.zeros_like(points.q), jnp.ones_like(points.q)
+
+    def step(along_u: jax.Array, along_v: jax.Array, along_inverse_depth: jax.Array) -> jax.Array:
+        return pixel_jacobian(Slopes(along_u, along_v, along_inverse_depth), here, plane)
+
+    flow_u, flow_v, flow_q = step(one, nothing, nothing), step(nothing, one, nothing), step(nothing, nothing, one)
+    confirmed, possible, noise = jnp.zeros((6, 6)), jnp.zeros((6, 6)), []
+    for seen, (target, _, weight) in zip(_slopes(reference, r, objective.use_depth), terms, strict=True):
+        before, after = seen
+        weight = factor * weight
+        first = step(before.along_u, before.along_v, before.along_inverse_depth)
+        second = problem.tangent.T @ target
+        product = (first * weight) @ second.T
+        confirmed += 0.5 * (product + product.T)
+        across = weight * (_steepness(before) * _steepness(after)).reshape(-1)
+        possible += (flow_u * across) @ flow_u.T + (flow_v * across) @ flow_v.T
+        along = weight * (before.along_inverse_depth**2).reshape(-1)
+        possible += (flow_q * along) @ flow_q.T
+        noise.append((weight, first, second))
+    directions = _whitening(possible + LEAST * jnp.eye(6))
+    values, turn = jnp.linalg.eigh(directions.T @ confirmed @ directions)
+    directions = directions @ turn
+    variance = sum(jnp.sum((weight * (directions.T @ a) * (directions.T @ b)) ** 2, axis=1) for weight, a, b in noise)
+    determined = values > jnp.maximum(SIGNIFICANCE * jnp.sqrt(variance), MIN_ALIGNED_SHARE)
+    return Information(directions, values, determined)
+
+
+def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[Slopes, Slopes]]:
+    """Of each channel the slopes of the reference and those of the target."""
+    facing = reference.facing
+    flat = jnp.zeros_like(facing)
+    grey = Slopes(reference.grey_u, reference.grey_v, flat), Slopes(r.grey_sample.along_u, r.grey_sample.along_v, flat)
+    if not use_depth:
+        return [grey]
+    before = Slopes(facing * reference.slope_u, facing * reference.slope_v, -facing)
+    after = Slopes(facing * r.depth_sample.along_u, facing * r.depth_sample.along_v, -facing)
+    return [grey, (before, after)]
+
+
+def _steepness(slopes: Slopes) -> Float[Array, "*n"]:
+    return jnp.sqrt(slopes.along_u**2 + slopes.along_v**2)
+
+
+def _whitening(possible: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """W with Wᵀ A W = identity for a positive semi-definite A, limited where it is singular."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(possible), 1e-12))  # metres and radians on one footing
+    values, vectors = jnp.linalg.eigh(possible / jnp.outer(size, size))
+    return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-5)) / size[:, None]

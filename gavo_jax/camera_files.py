@@ -1,0 +1,227 @@
+"""The cameras of an RGB-D device, from a preset's name or a file; what the numbers of any file may be."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import MAX_SIDE, PRESETS, Camera
+from gavo_jax.camera_makes import PARSERS, Table
+from gavo_jax.errors import GavoError, read_text, shown
+
+MAX_CAMERA_FILE_BYTES = 65536
+
+LONGEST_LENS = 20
+"""Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
+
+DEPTH_SCALE = 5000.0
+"""Where nobody says it: that of the TUM benchmark."""
+
+LARGEST_SHIFT = 10.0
+"""Metres between the colour and the depth camera of one device; more is a unit mistaken."""
+
+ROTATION_TOLERANCE = 1e-3
+"""How far a rotation, printed with a few digits, may be off one."""
+
+CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model", "depth_scale", "readout")
+REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
+RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
+
+MODELS = {
+    "pinhole": "pinhole",
+    "none": "pinhole",
+    "plumb_bob": "pinhole",
+    "radtan": "pinhole",
+    "brown": "pinhole",
+    "rational": "pinhole",
+    "rational_polynomial": "pinhole",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
+    "kannalabrandt8": "fisheye",
+}
+"""Names of distortion models, as ROS, Kalibr and others call them."""
+
+
+Size = tuple[int, int]
+"""Width and height, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The cameras of an RGB-D device.
+
+    Attributes:
+        color: the colour camera; its `depth_scale` is that of the depth images.
+        depth: the depth camera; None where depth is registered to colour, so that one camera is both.
+        color_T_depth: maps points of the depth camera into the colour camera, metres.
+        origin: where the numbers are from, for people.
+        states_depth_scale: whether that source says the depth scale; else `color.depth_scale` is only an assumption.
+        preset: the preset's name, if it is one: the sensor is known then.
+    """
+
+    color: Camera
+    depth: Camera | None = None
+    color_T_depth: Float[np.ndarray, "4 4"] | None = None
+    origin: str = "as given"
+    states_depth_scale: bool = True
+    preset: str | None = None
+
+    def with_depth_scale(self, scale: float) -> "Calibration":
+        """The same with a depth scale that is known."""
+        return replace(self, color=replace(self.color, depth_scale=scale), states_depth_scale=True)
+
+
+def load_camera(path_or_name: str | Path) -> Camera:
+    """Return a camera from a preset's name (fr1, fr2, fr3, bonn, icl) or from a file; see `load_calibration`.
+
+    Raises:
+        GavoError: no such preset or file, an unreadable line, or an unknown, missing, non-finite or absurd value.
+    """
+    return load_calibration(path_or_name).color
+
+
+def load_calibration(
+    path_or_name: str | Path, size: Size | Callable[[], Size] | None = None, depth_scale: float = DEPTH_SCALE
+) -> Calibration:
+    """Return the calibration that a preset's name stands for or a file holds.
+
+    TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
+    "fisheye"), depth_scale and readout (seconds). Depth that is not registered to colour: a table [depth] with the same
+    keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr. OpenCV
+    FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a matrix of
+    3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
+
+    Args:
+        path_or_name: fr1, fr2, fr3, bonn, icl, or a file.
+        size: width and height of the images, for files that do not say it; or what finds them out.
+        depth_scale: for files that do not say it, raw units per metre.
+
+    Raises:
+        GavoError: no such preset or file, an unreadable line, or an unknown, missing, non-finite or absurd value.
+    """
+    if (name := str(path_or_name)) in PRESETS:
+        return Calibration(PRESETS[name], origin=f"preset {name}", preset=name)
+    path = Path(path_or_name)
+    suffix = path.suffix.lower()
+    if suffix not in PARSERS:
+        *suffixes, last = PARSERS
+        raise GavoError(
+            f"unknown camera {name!r}: neither one of {', '.join(PRESETS)} nor a file ({', '.join(suffixes)} or {last})"
+        )
+    table = PARSERS[suffix](path, read_text(path, MAX_CAMERA_FILE_BYTES))
+    if size is not None and not {"width", "height"} <= table.keys():
+        width, height = size() if callable(size) else size
+        table = {"width": width, "height": height, **table}
+    for key in table:
+        if key not in CAMERA_KEYS + RIG_KEYS:
+            raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(CAMERA_KEYS + RIG_KEYS[:2])})")
+    depth, color_T_depth = _depth_camera(path, table)
+    own = {key: value for key, value in table.items() if key not in RIG_KEYS}
+    if isinstance(table.get("depth"), dict) and "depth_scale" in table["depth"]:
+        own["depth_scale"] = table["depth"]["depth_scale"]
+    color = camera_from_table(path, own, depth_scale)
+    return Calibration(color, depth, color_T_depth, str(path), states_depth_scale="depth_scale" in own)
+
+
+def camera_from_table(path: Path | str, values: Table, depth_scale: float, part: str = "") -> Camera:
+    """Check a camera's values, key by key, and build it.
+
+    Args:
+        path: names the file in messages.
+        values: by the keys of a camera file.
+        depth_scale: where the values do not say it.
+        part: stands before a key's name in messages.
+
+    Raises:
+        GavoError: a value is missing, or is not what it may be.
+    """
+    for key in REQUIRED:
+        if key not in values:
+            raise GavoError(f"{path}: {part}{key}: missing")
+
+    def number(key: str, low: float, high: float, default: float | None = None) -> float:
+        return _number(f"{path}: {part}{key}", values.get(key, default), low, high)
+
+    def whole(key: str) -> int:
+        value = values[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not 16 <= value <= MAX_SIDE:
+            raise GavoError(f"{path}: {part}{key}: must be a whole number from 16 to {MAX_SIDE}")
+        return value
+
+    width, height = whole("width"), whole("height")
+    distortion, model = _distortion(path, part, values)
+    return Camera(
+        fx=number("fx", 1, LONGEST_LENS * width),
+        fy=number("fy", 1, LONGEST_LENS * height),
+        cx=number("cx", -width, 2 * width),
+        cy=number("cy", -height, 2 * height),
+        width=width,
+        height=height,
+        distortion=distortion,
+        depth_scale=number("depth_scale", 1e-3, 1e6, depth_scale),
+        readout=number("readout", 0, 1, 0.0),
+        model=model,
+    )
+
+
+def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float, ...], Any]:
+    given = values.get("model", "pinhole")
+    model = MODELS.get(given.lower()) if isinstance(given, str) else None
+    if model is None:
+        raise GavoError(f"{path}: {part}model: {shown(given)} is none of {', '.join(MODELS)}")
+    numbers = values.get("distortion", [])
+    lengths = (0, 4) if model == "fisheye" else (0, 4, 5, 8, 12, 14)
+    if not isinstance(numbers, list) or len(numbers) not in lengths or ("distortion" in values and numbers == []):
+        wanted = "4 numbers (k1 k2 k3 k4)" if model == "fisheye" else "4, 5 or 8 numbers (k1 k2 p1 p2 [k3 [k4 k5 k6]])"
+        raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}")
+    checked = tuple(_number(f"{path}: {part}distortion", value, -1000, 1000) for value in numbers)
+    return checked + (0.0,) * max(0, (4 if model == "fisheye" else 5) - len(checked)), model
+
+
+def _number(place: str, value: Any, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise GavoError(f"{place}: must be a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _depth_camera(path: Path, table: Table) -> tuple[Camera | None, np.ndarray | None]:
+    """The depth camera and `color_T_depth` of a table; None where depth is registered."""
+    depth = table.get("depth")
+    pose = table.get("colour_T_depth", table.get("color_T_depth"))
+    if depth is None and pose is None:
+        return None, None
+    if not isinstance(depth, dict):
+        raise GavoError(
+            f"{path}: depth: needs the table [depth] with fx, fy, cx, cy, width and height, beside colour_T_depth"
+        )
+    depth = dict(depth)
+    inner = [depth.pop(key) for key in RIG_KEYS[1:] if key in depth]
+    pose = inner[0] if pose is None and inner else pose
+    for key in depth:
+        if key not in CAMERA_KEYS:
+            raise GavoError(f"{path}: depth.{key[:60]}: unknown key (known: {', '.join(CAMERA_KEYS)})")
+    return camera_from_table(path, depth, DEPTH_SCALE, "depth."), _rigid(f"{path}: colour_T_depth", pose)
+
+
+def _rigid(place: str, rows: Any) -> np.ndarray:
+    """Check that rows are those of a rigid transform in metres; none stand for the identity."""
+    if rows is None:
+        return np.eye(4)
+    try:
+        matrix = np.array(rows, float)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise ValueError
+    except (ValueError, TypeError):
+        raise GavoError(f"{place}: must be four rows of four numbers") from None
+    rotation = matrix[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise GavoError(f"{place}: no rigid transform (a rotation and a shift, last row 0 0 0 1)")
+    if np.abs(matrix[:3, 3]).max() > LARGEST_SHIFT:
+        raise GavoError(f"{place}: a shift of more than {LARGEST_SHIFT:g} m: not in metres?")
+    u, _, vt = np.linalg.svd(rotation)
+    matrix[:3, :3] = u @ vt
+    return matrix

@@ -1,0 +1,265 @@
+"""Camera files as several makes of software write them: TOML, ROS, Kalibr, OpenCV, Open3D, ORB-SLAM, plain numbers.
+
+A parser returns what a file says as a table of the keys of our own TOML file; `camera_files` checks the numbers.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gavo_jax.errors import GavoError, parse_toml
+
+Table = dict[str, Any]
+
+
+def _parse_yaml(path: Path, text: str) -> Table:
+    if text.startswith("%YAML:1.0") or "!!opencv-matrix" in text:
+        return _parse_storage(path, text)
+    import yaml  # takes its time, and few files are of this kind
+
+    try:
+        values = next(yaml.load_all(text, _yaml_loader()), None)  # printed messages end with the start of another
+    except (yaml.YAMLError, ValueError, RecursionError, TypeError, AttributeError, OverflowError) as error:
+        raise GavoError(f"{path}: not YAML: {_line(error)}") from None
+    return _of_known_make(path, values)
+
+
+@cache
+def _yaml_loader() -> type[Any]:
+    """A loader that refuses a key that is given twice, of which YAML would keep the last, and takes 1e-3 for a number,
+    which YAML 1.1 takes for text.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            keys = [key.value for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
+            if twice := next((key for key in keys if keys.count(key) > 1), None):
+                raise ValueError(f"key given twice: {str(twice)[:60]!r}")
+            return super().construct_mapping(node, deep)
+
+    number = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789"))
+    return Loader
+
+
+def _parse_json(path: Path, text: str) -> Table:
+    if '"opencv-matrix"' in text:
+        return _parse_storage(path, text)
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GavoError(f"{path}: not JSON: {_line(error)}") from None
+    return _of_known_make(path, values)
+
+
+def _of_known_make(path: Path, values: Any) -> Table:
+    """A table of our keys from that of another make."""
+    if not isinstance(values, dict) or not values:
+        raise GavoError(f"{path}: not a camera file: no `key: value` in it")
+    if not all(isinstance(key, str) for key in values):
+        raise GavoError(f"{path}: not a camera file: a key that is no text")
+    for is_of_make, read in MAKES:
+        if is_of_make(values):
+            try:
+                return read(path, values)
+            except (TypeError, ValueError, KeyError, IndexError, AttributeError):
+                raise GavoError(f"{path}: {read.__doc__ or ''} Entries are missing or of another kind") from None
+    return values
+
+
+def _read_open3d(path: Path, values: Table) -> Table:
+    """Looks like Open3D's intrinsics."""
+    values = values.get("intrinsic", values)
+    fx, _, _, _, fy, _, cx, cy, _ = values["intrinsic_matrix"]  # column by column
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": values["width"], "height": values["height"]}
+
+
+def _read_replica(path: Path, values: Table) -> Table:
+    """Looks like Replica's cam_params."""
+    camera = values["camera"]
+    names = {"fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy", "width": "w", "height": "h", "depth_scale": "scale"}
+    return {ours: camera[theirs] for ours, theirs in names.items()}
+
+
+def _read_ros(path: Path, values: Table) -> Table:
+    """Looks like a ROS camera_info."""
+
+    def first(*names: str) -> Any:
+        return next((values[name] for name in names if name in values), None)
+
+    def numbers(entry: Any) -> list[Any]:
+        return list(entry["data"] if isinstance(entry, dict) else entry or [])
+
+    fx, _, cx, _, fy, cy, _, _, _ = numbers(first("camera_matrix", "K", "k"))
+    return {
+        **{"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        **{"width": first("image_width", "width"), "height": first("image_height", "height")},
+        **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
+        **{key: values[key] for key in ("depth_scale", "readout") if key in values},
+    }
+
+
+def camera_info_distortion(model: str, numbers: list[Any]) -> Table:
+    """Our keys for what a ROS camera_info says of the lens; an empty list stands for none."""
+    return {"distortion": numbers, "model": model or "plumb_bob"} if len(numbers) else {}
+
+
+def _read_kalibr(path: Path, values: Table) -> Table:
+    """Looks like Kalibr's camera chain."""
+    color = _kalibr_camera(values["cam0"])
+    if "cam1" not in values:
+        return color
+    depth_T_color = np.array(values["cam1"]["T_cn_cnm1"], float)
+    return {**color, "depth": _kalibr_camera(values["cam1"]), "colour_T_depth": np.linalg.inv(depth_T_color).tolist()}
+
+
+def _kalibr_camera(values: Table) -> Table:
+    if values["camera_model"] != "pinhole":
+        raise ValueError
+    (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
+    lens = camera_info_distortion(values.get("distortion_model", "none"), list(values.get("distortion_coeffs") or []))
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, **lens}
+
+
+def _is_open3d(values: Table) -> bool:
+    return "intrinsic_matrix" in values or isinstance(values.get("intrinsic"), dict)
+
+
+def _is_replica(values: Table) -> bool:
+    return isinstance(values.get("camera"), dict)
+
+
+def _is_ros(values: Table) -> bool:
+    return any(key in values for key in ("camera_matrix", "K", "k"))
+
+
+def _is_kalibr(values: Table) -> bool:
+    return "cam0" in values
+
+
+MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...] = (
+    (_is_open3d, _read_open3d),
+    (_is_replica, _read_replica),
+    (_is_ros, _read_ros),
+    (_is_kalibr, _read_kalibr),
+)
+"""How each make is known, and read."""
+
+
+def _parse_storage(path: Path, text: str) -> Table:
+    """OpenCV's FileStorage: matrices by the names that OpenCV's own examples use, or ORB-SLAM's keys."""
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (cv2.error, SystemError) as error:
+        raise GavoError(f"{path}: not readable by OpenCV's FileStorage: {_line(error)}") from None
+    try:
+        return _storage_orb(storage) or _storage_matrices(path, storage)
+    except GavoError:
+        raise
+    except (cv2.error, SystemError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise GavoError(f"{path}: not a camera of OpenCV's FileStorage: {_line(error)}") from None
+    finally:
+        storage.release()
+
+
+def _storage_matrices(path: Path, storage: Any) -> Table:
+    def matrix(*names: str) -> np.ndarray | None:
+        found = (storage.getNode(name) for name in names)
+        return next((_matrix_of(node) for node in found if not node.empty() and node.isMap()), None)
+
+    def whole(*names: str) -> int | None:
+        found = (storage.getNode(name) for name in names)
+        return next((int(node.real()) for node in found if not node.empty() and node.isInt()), None)
+
+    intrinsics = matrix("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
+    if intrinsics is None or intrinsics.shape != (3, 3):
+        raise GavoError(f"{path}: camera_matrix: missing, or not 3x3")
+    table: Table = dict(zip(("fx", "fy", "cx", "cy"), intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+    coefficients = matrix("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1")
+    if coefficients is not None and coefficients.size:
+        model = storage.getNode("distortion_model")
+        fisheye = whole("fisheye_model", "fisheye")
+        named = model.string() if model.isString() else "fisheye" if fisheye else "plumb_bob"
+        table |= camera_info_distortion(named, coefficients.ravel().tolist())
+    size = storage.getNode("image_size")
+    sides = [int(size.at(i).real()) for i in range(2)] if size.isSeq() and size.size() == 2 else [None, None]
+    width, height = whole("image_width", "width", "image_Width"), whole("image_height", "height", "image_Height")
+    sizes = {"width": width or sides[0], "height": height or sides[1]}
+    scale = storage.getNode("depth_scale")
+    stated = {"depth_scale": scale.real()} if scale.isReal() or scale.isInt() else {}
+    return {**table, **{key: value for key, value in sizes.items() if value is not None}, **stated}
+
+
+def _matrix_of(node: Any) -> np.ndarray:
+    """A matrix of a FileStorage; not by its own `mat()`, which writes beyond its memory where sizes do not agree."""
+    data = node.getNode("data")
+    numbers = [data.at(i).real() for i in range(data.size())] if data.isSeq() else []
+    rows, columns = (node.getNode(name) for name in ("rows", "cols"))
+    if not (rows.isInt() and columns.isInt()) or int(rows.real()) * int(columns.real()) != len(numbers):
+        raise TypeError("a matrix whose rows and columns are not those of its data")
+    return np.array(numbers).reshape(int(rows.real()), int(columns.real()))
+
+
+def _storage_orb(storage: Any) -> Table | None:
+    """The keys of an ORB-SLAM settings file (`Camera.fx` or `Camera1.fx`); None where it is none."""
+    prefix = next((p for p in ("Camera", "Camera1") if not storage.getNode(f"{p}.fx").empty()), None)
+    if prefix is None:
+        return None
+
+    def real(name: str) -> float | None:
+        node = storage.getNode(name)
+        return None if node.empty() or not (node.isReal() or node.isInt()) else node.real()
+
+    table: Table = {key: real(f"{prefix}.{key}") for key in ("fx", "fy", "cx", "cy")}
+    for key in ("width", "height"):
+        value = real(f"Camera.{key}")
+        table[key] = None if value is None else int(value)
+    lens = [real(f"{prefix}.{key}") for key in ("k1", "k2", "p1", "p2", "k3")]
+    table["distortion"] = [value or 0.0 for value in lens]
+    table["depth_scale"] = real("DepthMapFactor") or real("RGBD.DepthMapFactor")
+    return {key: value for key, value in table.items() if value is not None}
+
+
+def _parse_xml(path: Path, text: str) -> Table:
+    if "<opencv_storage" not in text[:1000]:
+        raise GavoError(f"{path}: not a camera file of OpenCV (<opencv_storage>)")
+    return _parse_storage(path, text)
+
+
+def _parse_numbers(path: Path, text: str) -> Table:
+    """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`; `#` comments."""
+    lines = [re.split(r"[\s,]+", line.split("#")[0].strip()) for line in text.splitlines()]
+    try:
+        rows = [[float(field) for field in line] for line in lines if line != [""]]
+        if len(rows) == 1 and len(rows[0]) >= 4:
+            fx, fy, cx, cy, *distortion = rows[0]
+            lens = {"distortion": distortion} if distortion else {}
+            return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
+        matrix = np.array(rows)
+        if matrix.shape not in ((3, 3), (4, 4), (3, 4)):
+            raise ValueError
+    except ValueError:
+        raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy") from None
+    return dict(zip(("fx", "fy", "cx", "cy"), matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+PARSERS: dict[str, Callable[[Path, str], Table]] = {
+    ".toml": parse_toml,
+    ".yaml": _parse_yaml,
+    ".yml": _parse_yaml,
+    ".json": _parse_json,
+    ".xml": _parse_xml,
+    ".txt": _parse_numbers,
+}
+"""By a file's ending."""

@@ -1,0 +1,81 @@
+"""`gavo inspect`: what a source is, and which of its frames a run would use."""
+
+import json
+from typing import Any
+
+from gavo_jax.cli.options import Inspect
+from gavo_jax.cli.selection import open_sequence
+from gavo_jax.datasets.depth_unit import name_of_unit
+from gavo_jax.inspection import inspect_sequence
+from gavo_jax.output.files import describe
+from gavo_jax.output.screen import say, waiting
+
+
+def inspect(options: Inspect) -> int:
+    """Look at every chosen frame and print what there is to say, for people or as JSON."""
+    sequence = open_sequence(options, force=True)
+    with waiting(f"looking at {len(sequence)} frames …"):
+        facts = inspect_sequence(sequence)
+    if options.json:
+        print(json.dumps(describe(facts), indent=2, allow_nan=False))
+    else:
+        for what, words in _lines(facts):
+            say(f"{what}: {words}")
+    return 0
+
+
+def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    lines = [("source", f"{facts['name']}, {facts['kind']}"), ("frames", str(facts["frames"]))]
+    lines += [("left out", line) for line in facts["left_out"]]
+    refused = "".join(f", {count} {status}" for status, count in facts["frames_not_used"].items())
+    lines.append(("frames used", f"{facts['frames_used']} of {facts['frames']}{refused}"))
+    lines += [("not used", line) for line in facts["why_not"]]
+    lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
+    lines += _recorded(facts["recorded_camera"])
+    lines += [("depth", _depth(facts))]
+    if fault := facts["depth"]["fault"]:
+        lines.append(("depth scale", f"WRONG? {fault}"))
+    if (delay := facts["delay_of_depth_ms"]) is not None:
+        words = f"{delay['median']:.1f} ms after colour in the median, {delay['least']:.1f} to {delay['most']:.1f}"
+        lines.append(("delay of depth", words))
+    return [*lines, ("ground truth", _truth(facts))]
+
+
+def _time(facts: dict[str, Any]) -> str:
+    rate = "no rate" if facts["rate_hz"] is None else f"{facts['rate_hz']:.1f} frames/s"
+    gaps = f"{facts['gaps']} gaps, the longest of {facts['longest_gap_s']:.2f} s" if facts["gaps"] else "no gap"
+    return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}, {gaps}"
+
+
+def _camera(camera: dict[str, Any]) -> str:
+    size = f"{camera['width']}x{camera['height']}"
+    intrinsics = " ".join(f"{name} {camera[name]:g}" for name in ("fx", "fy", "cx", "cy"))
+    lens = f", {camera['model']} distortion {camera['distortion']}" if any(camera["distortion"]) else ""
+    shutter = f", rolling shutter of {1e3 * camera['readout']:g} ms" if camera["readout"] else ""
+    return f"{size}, {intrinsics}{lens}{shutter}"
+
+
+def _recorded(recorded: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """The cameras before undistortion and registration, where they differ."""
+    if recorded is None:
+        return []
+    lines = [("colour as recorded", _camera(recorded["color"]))] if any(recorded["color"]["distortion"]) else []
+    if "depth" in recorded:
+        lines.append(("depth camera", _camera(recorded["depth"]) + ", registered to colour"))
+    return lines
+
+
+def _depth(facts: dict[str, Any]) -> str:
+    depth, unit = facts["depth"], name_of_unit(facts["depth_units_per_metre"])
+    if depth["median_m"] is None:
+        return f"no reading; in {unit}"
+    span = f"{depth['near_m']:.2f} to {depth['far_m']:.2f} m, median {depth['median_m']:.2f} m"
+    return f"{span}, at {100 * depth['coverage']:.0f} % of the pixels; in {unit}"
+
+
+def _truth(facts: dict[str, Any]) -> str:
+    truth = facts["ground_truth"]
+    if truth is None:
+        return "none"
+    covered = f"{truth['frames_covered']} of {facts['frames']} frames covered"
+    return f"{truth['poses']} poses over {truth['duration_s']:.2f} s and {truth['path_m']:.2f} m, {covered}"

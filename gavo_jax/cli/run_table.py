@@ -1,0 +1,95 @@
+"""What `gavo run` prints in the end: its figures, and in words why one that people look for is missing."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.evaluation import rotation_angle
+from gavo_jax.odometry.metrics import (
+    ABSOLUTE_ERROR,
+    COMPILE_SECONDS,
+    DRIFT,
+    DRIFT_PER_FRAME,
+    FINAL_DISTANCE,
+    FRAMES_PER_SECOND,
+    MILLISECONDS,
+    ROTATION_DRIFT,
+)
+from gavo_jax.output.files import TRAJECTORY
+from gavo_jax.output.screen import number, print_table, say
+from gavo_jax.trajectory import Trajectory
+
+ERRORS = (
+    ("drift: RPE over 1 s, translation, RMSE", DRIFT, 6, "m/s"),
+    ("drift: RPE over 1 s, rotation, RMSE", ROTATION_DRIFT, 6, "deg/s"),
+    ("RPE over 1 frame, translation, RMSE", DRIFT_PER_FRAME, 6, "m/frame"),
+    ("absolute error after alignment, RMSE", ABSOLUTE_ERROR, 6, "m"),
+    ("distance error at the end", FINAL_DISTANCE, 6, "m"),
+)
+"""Rows of the table: what, key in metrics.json, decimals, unit. Those without a figure are left out."""
+
+COUNTS = (
+    ("frames", "frames", 0, ""),
+    ("lost pairs", "lost_pairs", 0, ""),
+    ("compilation", COMPILE_SECONDS, 1, "s"),
+    ("time a pair, median", MILLISECONDS, 1, "ms"),
+    ("speed, decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
+)
+
+Row = tuple[str, str, str]
+
+
+def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bool) -> None:
+    """Print the table of a run and where its files are.
+
+    Args:
+        name: of the run.
+        metrics: as in metrics.json.
+        folder: the run's.
+        has_truth: whether the sequence has a ground truth.
+    """
+    trajectory = Trajectory.read_tum(folder / TRAJECTORY)
+    known = [row for row in ERRORS if metrics.get(row[1]) is not None]
+    rows: list[Row] = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in known]
+    if not known:
+        rows += _of_trajectory(trajectory, metrics)
+    rows += [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
+    counted = metrics.get("statuses", {}).items()
+    rows += [(f"pairs: {status}", str(count), "") for status, count in counted if status != "ok"]
+    if metrics.get("unknown_motions"):
+        rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
+    print_table(name, ("", "", "unit"), rows)
+    if reason := _why_no_drift(metrics, trajectory, has_truth):
+        say(reason)
+    say(f"files in {folder}")
+
+
+def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:
+    """What a trajectory tells without a truth beside it."""
+    places = trajectory.world_T_camera[:, :3, 3]
+    known = np.diff(trajectory.segments) == 0
+    path = float(np.linalg.norm(np.diff(places, axis=0), axis=1)[known].sum())
+    angle = float(np.degrees(rotation_angle(trajectory.world_T_camera[-1:, :3, :3])[0]))
+    share = metrics.get("statuses", {}).get("ok", 0) / max(1, metrics.get("pairs", 0))
+    return [
+        ("length of the path", number(path), "m"),
+        ("end: x, y, z", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
+        ("end: turned by", number(angle, 2), "deg"),
+        ("pairs that are ok", number(100 * share, 1), "%"),
+    ]
+
+
+def _why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: bool) -> str | None:
+    """One sentence where there is no drift over a second."""
+    if metrics.get(DRIFT) is not None:
+        return None
+    if not has_truth:
+        return "No ground truth: no errors, but what the trajectory itself tells."
+    if metrics.get(DRIFT_PER_FRAME) is None:
+        return "The ground truth covers no two of these frames: no errors, but what the trajectory itself tells."
+    lasts = float(np.ptp(trajectory.timestamps))
+    if lasts < 1:
+        return f"No drift over 1 s: the frames last {lasts:.2f} s; the errors per frame and over all stand for it."
+    return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart; the other errors stand for it."

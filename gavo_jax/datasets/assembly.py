@@ -1,0 +1,193 @@
+"""From decoded images to a `Frame`: intensities to 8 bits, depth to the frame's units and to the colour camera."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Shaped, UInt16
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import Calibration
+from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.images import NO_READING, to_8_bits, white_of, without_invalid
+from gavo_jax.datasets.registration import Registration
+from gavo_jax.errors import GavoError
+
+FINE, COARSE = 5000.0, 1000.0
+"""Units per metre of frames whose files hold floats: the finer as long as it reaches far enough."""
+
+FARTHEST_FINE = 12.0
+"""Metres: where the farthest readings lie beyond, 16 bits of the finer unit do not hold them."""
+
+METRES, MILLIMETRES = 1.0, 1000.0
+
+METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 60.0), (100.0, 60000.0)
+"""Median depth of a file of floats that is taken as one of metres, or of millimetres."""
+
+
+class DepthUnit(NamedTuple):
+    """What depth is counted in, per metre."""
+
+    file: float
+    """In the files."""
+    frame: float
+    """In frames: their camera's `depth_scale`."""
+
+
+class DepthImage(NamedTuple):
+    """Raw depth with a name for messages."""
+
+    raw: UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
+    name: str
+
+
+def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: float | None) -> DepthUnit:
+    """The units of files of floats, which a camera's `depth_scale` seldom speaks of: metres, mostly.
+
+    Args:
+        samples: depth images of the sequence, as stored.
+        calibration: its `depth_scale` counts where the values are neither metres nor millimetres.
+        given: units per metre, if somebody says so.
+
+    Raises:
+        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`.
+    """
+    samples = list(samples)
+    clean = [without_invalid(image.raw) for image in samples]
+    readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
+    median = float(np.median(readings)) if readings.size else METRES
+    file = given or _likely_unit(median, calibration)
+    if file is None:
+        raise GavoError(
+            f"{samples[0].name}: depth of median {median:g}, in neither metres nor millimetres: say --depth-scale, "
+            "units per metre"
+        )
+    far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
+    return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE)
+
+
+def _likely_unit(median: float, calibration: Calibration) -> float | None:
+    stated = calibration.color.depth_scale
+    if calibration.preset is None and calibration.states_depth_scale and _is_within(median / stated, METRE_MEDIANS):
+        return stated
+    if _is_within(median, METRE_MEDIANS):
+        return METRES
+    return MILLIMETRES if _is_within(median, MILLIMETRE_MEDIANS) else None
+
+
+def _is_within(value: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= value <= bounds[1]
+
+
+@dataclass(frozen=True)
+class FrameAssembler:
+    """Makes frames of one source's images.
+
+    Attributes:
+        calibration: of the images as recorded.
+        unit: of depth.
+        white: full scale of 16-bit intensities.
+        color: whether frames carry RGB beside grey. Grey is the same either way.
+        undistort: whether lens distortion is taken out.
+    """
+
+    calibration: Calibration
+    unit: DepthUnit
+    white: int = 255
+    color: bool = False
+    undistort: bool = True
+
+    @cached_property
+    def recorded(self) -> Camera:
+        """The colour camera as it records, with the frames' depth scale."""
+        return replace(self.calibration.color, depth_scale=self.unit.frame)
+
+    @property
+    def camera(self) -> Camera:
+        """Of the frames as they come."""
+        return self.recorded.rectified() if self.undistort else self.recorded
+
+    def frame(
+        self,
+        bgr: Shaped[np.ndarray, "h w 3"],
+        depth: DepthImage,
+        name: str,
+        timestamp: float,
+        depth_timestamp: float | None = None,
+    ) -> Frame:
+        """Make a frame.
+
+        Args:
+            bgr: the colour image, 8 or 16 bits.
+            depth: raw, as in the file.
+            name: of the colour image, for messages.
+            timestamp: of the colour image, seconds.
+            depth_timestamp: of the depth image, where it is known.
+
+        Raises:
+            FrameError: an image is not of its camera's size.
+        """
+        camera = self.recorded
+        _check_size(bgr, camera, name, "camera")
+        image = to_8_bits(bgr, self.white)
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if self.color else None
+        if self.undistort:
+            grey = camera.undistort_image(grey)
+            rgb = None if rgb is None else camera.undistort_image(rgb)
+        return Frame(grey, self._depth(depth), timestamp, rgb, depth_timestamp)
+
+    def _depth(self, depth: DepthImage) -> UInt16[np.ndarray, "height width"]:
+        camera = self.calibration.depth
+        if camera is None:
+            _check_registered(depth, self.recorded)
+            raw = in_frame_units(depth.raw, self.unit)
+            return self.recorded.undistort_depth(raw) if self.undistort else raw
+        _check_size(depth.raw, camera, depth.name, "depth camera")
+        moved = self._registration(in_frame_units(depth.raw, self.unit), self.unit.frame)
+        return np.where(self._with_grey, moved, np.uint16(0)) if self.undistort else moved
+
+    @cached_property
+    def _registration(self) -> Registration:
+        depth, color_T_depth = self.calibration.depth, self.calibration.color_T_depth
+        assert depth is not None and color_T_depth is not None
+        return Registration(depth, self.camera, color_T_depth)
+
+    @cached_property
+    def _with_grey(self) -> np.ndarray:
+        """Where an undistorted image holds what was recorded, and not a border that was drawn on."""
+        everywhere = np.ones((self.recorded.height, self.recorded.width), np.uint16)
+        return self.recorded.undistort_depth(everywhere) > 0
+
+
+def in_frame_units(raw: np.ndarray, unit: DepthUnit) -> UInt16[np.ndarray, "h w"]:
+    """Raw depth as frames have it: 16 bits, 0 = no reading, `unit.frame` units to a metre."""
+    clean = without_invalid(raw)
+    if clean.dtype == np.uint16 and unit.file == unit.frame:
+        return clean
+    scaled = clean * np.float32(unit.frame / unit.file) + np.float32(0.5)
+    return np.where(scaled < NO_READING, scaled, np.float32(0)).astype(np.uint16)
+
+
+def common_white(images: Iterable[np.ndarray]) -> int:
+    """Full scale that holds all of some images' intensities."""
+    return max((white_of(image) for image in images if image.dtype != np.uint8), default=255)
+
+
+def _check_registered(depth: DepthImage, camera: Camera) -> None:
+    height, width = depth.raw.shape
+    if (width, height) != (camera.width, camera.height):
+        raise FrameError(
+            f"{depth.name}: is {width}x{height} pixels, the colour camera's images are {camera.width}x{camera.height}: "
+            "to register it, the camera file needs the depth camera (a table [depth]) and colour_T_depth"
+        )
+
+
+def _check_size(image: np.ndarray, camera: Camera, name: str, whose: str) -> None:
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        expected = f"the {whose}'s images are {camera.width}x{camera.height}"
+        raise FrameError(f"{name}: is {width}x{height} pixels, {expected}: say --camera with a camera of that size")

@@ -1,0 +1,411 @@
+"""Recordings of ROS: bags of ROS 1, and of ROS 2 as SQLite or MCAP, read as a stream through the library rosbags."""
+
+import contextlib
+import io
+import struct
+import threading
+import weakref
+from collections.abc import Iterator
+from copy import copy
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Self, overload
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import Calibration, camera_from_table
+from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
+from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
+from gavo_jax.datasets.files import SAMPLED, Reading
+from gavo_jax.datasets.messages import CAMERA_INFO, COMPRESSED, IMAGE, camera_table, color_of, depth_of, is_depth
+from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
+from gavo_jax.errors import GavoError, blamed
+from gavo_jax.trajectory import Trajectory, associate
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+METADATA = "metadata.yaml"
+"""In the folder of a ROS 2 bag."""
+
+MILLIMETRES = 1000.0
+"""Units of 16UC1, by REP 118."""
+
+FAR_AHEAD = 64
+"""Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
+
+NOWHERE: tuple[int, int] = (2**62, 2**62)
+"""Behind every message: where a stream stands before it is entered."""
+
+COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered")
+"""Words in the names of topics that are chosen before others."""
+
+
+class _Topic(NamedTuple):
+    """The messages of one topic, in the order in which they were received."""
+
+    name: str
+    kind: str
+    received: np.ndarray
+    """Nanoseconds."""
+    stamps: np.ndarray
+    """Seconds, of their headers."""
+
+
+class BagSequence:
+    """Frames of a recording: a topic of colour and one of depth images, paired by the stamps of their headers.
+
+    Messages are read one after the other and nothing of them is kept; a frame out of order is found by its time.
+
+    Attributes:
+        name: of the file or folder.
+        calibration: the cameras as they record.
+        ground_truth: None: recordings hold none.
+        left_out: what is not used, and why, a line each.
+        kind: what kind of source it is.
+    """
+
+    kind: ClassVar[str] = "ROS bag"
+
+    def __init__(self, path: Path, reading: Reading) -> None:
+        """Read the stamps of both topics, and the camera.
+
+        Raises:
+            GavoError: no bag, a torn one, no topic of colour or depth or several, no camera, no frame.
+        """
+        self._bag = _Bag(path)
+        self.name = path.resolve().name if path.is_dir() else path.resolve().stem
+        self.ground_truth: Trajectory | None = None
+        color, depth = self._bag.choose(reading)
+        self._topics = tuple(self._bag.topic(name) for name in (color, depth))
+        i, j = associate(self._topics[0].stamps, self._topics[1].stamps, reading.max_difference)
+        if len(i) == 0:
+            raise GavoError(
+                f"{path}: no stamps of {color} and {depth} within {reading.max_difference:g} s of each other"
+            )
+        order = np.argsort(self._topics[0].stamps[i], kind="stable")
+        self._pairs = np.stack([i, j], 1)[order]
+        self._timestamps = self._topics[0].stamps[i][order]
+        self.left_out = [
+            f"{len(topic.stamps) - len(i)} of {topic.name}: none of {other} within {reading.max_difference:g} s"
+            for topic, other in zip(self._topics, (depth, color), strict=True)
+            if len(topic.stamps) > len(i)
+        ]
+        self.calibration = self._calibrate(path, reading)
+        self._stream = _Stream(self._bag, self._topics)
+        self._shared = _Shared(self, reading)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the file's ending, or the folder's metadata."""
+        return (path / METADATA).is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> Self:
+        """Read the recording as told."""
+        return cls(path, reading)
+
+    @property
+    def timestamps(self) -> Float[np.ndarray, " frames"]:
+        """Colour stamp of each frame, seconds."""
+        return self._timestamps
+
+    @property
+    def camera(self) -> Camera:
+        """Of the frames as they come."""
+        return self._shared.assembler.camera
+
+    @property
+    def depth_unit(self) -> DepthUnit:
+        """Of the messages, and of frames."""
+        return self._shared.assembler.unit
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._pairs)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> "BagSequence": ...
+    def __getitem__(self, index: int | slice) -> "Frame | BagSequence":
+        """Decode frame `index`, or return the sequence of a slice.
+
+        Raises:
+            IndexError: no such frame.
+            FrameError: one of its images cannot be decoded.
+        """
+        if isinstance(index, slice):
+            part = copy(self)
+            part._pairs, part._timestamps = self._pairs[index], self._timestamps[index]
+            return part
+        bgr, depth, stamps = self._decoded(index)
+        return self._shared.assembler.frame(bgr, depth, self._label(0, stamps[0]), *stamps)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode frame after frame; raises `FrameError` at one that cannot be decoded."""
+        return (self[index] for index in range(len(self)))
+
+    def raw_depth(self, index: int) -> np.ndarray:
+        """The depth image of a frame as it was recorded."""
+        return self._decoded(index)[1].raw
+
+    def check(self) -> None:
+        """Refuse a first frame that is unusable.
+
+        Raises:
+            GavoError: there is none, or it cannot be decoded.
+        """
+        if len(self) == 0:
+            raise GavoError(f"{self.name}: no frames in the chosen range")
+        self[0]
+
+    def _decoded(self, index: int) -> tuple[np.ndarray, DepthImage, tuple[float, float]]:
+        pair = self._pairs[index]
+        stamps = tuple(float(topic.stamps[at]) for topic, at in zip(self._topics, pair, strict=True))
+        color, depth = self._stream.messages(int(pair[0]), int(pair[1]))
+        names = [self._label(at, stamp) for at, stamp in enumerate(stamps)]
+        bgr = color_of(self._topics[0].kind, color, names[0])
+        raw = depth_of(self._topics[1].kind, depth, names[1])
+        return bgr, DepthImage(raw, names[1]), (stamps[0], stamps[1])
+
+    def _label(self, topic: int, stamp: float) -> str:
+        return f"{self._bag.path}: {self._topics[topic].name} at {stamp:.6f}"
+
+    def _calibrate(self, path: Path, reading: Reading) -> Calibration:
+        if not reading.is_auto:
+            found = reading.calibration(None, MILLIMETRES)
+        else:
+            found = self._bag.calibration(*(topic.name for topic in self._topics))
+        return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
+
+
+class _Shared:
+    """What kind of images a recording has, found out once; its slices share it."""
+
+    def __init__(self, sequence: BagSequence, reading: Reading):
+        self._sequence, self._reading = sequence, reading
+
+    @cached_property
+    def assembler(self) -> FrameAssembler:
+        sequence, reading = self._sequence, self._reading
+        colors, depths = [], []
+        for at in range(min(SAMPLED, len(sequence))):
+            with contextlib.suppress(FrameError):
+                bgr, depth, _ = sequence._decoded(at)
+                colors.append(bgr)
+                depths.append(depth)
+        calibration = sequence.calibration
+        if any(depth.raw.dtype != np.uint16 for depth in depths):
+            unit = float_unit(depths, calibration, reading.depth_scale)
+        else:
+            scale = calibration.color.depth_scale
+            if calibration.preset is not None and reading.depth_scale is None:
+                scale = _scale_of_integers(depths, calibration)
+            unit = DepthUnit(scale, scale)
+        return FrameAssembler(calibration, unit, common_white(colors), reading.color, reading.undistort)
+
+
+def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> float:
+    """Millimetres, as messages have them, unless they look otherwise: a preset's scale is that of its files."""
+    sample = sample_depth([depth.raw for depth in depths])
+    if sample is None:
+        return MILLIMETRES
+    return better_scale(sample, MILLIMETRES, calibration.color, calibration.preset in KINECTS) or MILLIMETRES
+
+
+class _Stream:
+    """Gives the messages of frame after frame; each is read once while frames are asked for in order."""
+
+    def __init__(self, bag: "_Bag", topics: tuple[_Topic, ...]) -> None:
+        self._bag, self._topics, self._lock = bag, topics, threading.Lock()
+        self._numbers = {topic.name: at for at, topic in enumerate(topics)}
+        self._coming: Iterator[tuple[str, bytes, str]] = iter(())
+        self._next: list[int] = list(NOWHERE)
+        self._pending: dict[tuple[int, int], tuple[bytes, str]] = {}
+
+    def messages(self, *wanted: int) -> list[Any]:
+        """The messages of these numbers, one of each topic.
+
+        Raises:
+            FrameError: the recording ends before, or a message cannot be read.
+        """
+        with self._lock:
+            for key in [key for key in self._pending if key[1] < wanted[key[0]]]:
+                del self._pending[key]
+            if any(self._is_out_of_reach(topic, number) for topic, number in enumerate(wanted)):
+                self._enter(wanted)
+            while missing := [key for key in enumerate(wanted) if key not in self._pending]:
+                with blamed(str(self._bag.path), FrameError):
+                    found = next(self._coming, None)
+                if found is None:
+                    self._next = list(NOWHERE)
+                    raise FrameError(f"{self._bag.path}: ends before message {missing[0][1]}")
+                name, raw, kind = found
+                topic = self._numbers[name]
+                self._pending[topic, self._next[topic]] = raw, kind
+                self._next[topic] += 1
+            return [self._bag.deserialize(*self._pending[key]) for key in enumerate(wanted)]
+
+    def _is_out_of_reach(self, topic: int, number: int) -> bool:
+        ahead = number - self._next[topic]
+        return (topic, number) not in self._pending and not 0 <= ahead <= FAR_AHEAD
+
+    def _enter(self, wanted: tuple[int, ...]) -> None:
+        """Go to where the earlier of the wanted messages lies."""
+        start = min(int(topic.received[number]) for topic, number in zip(self._topics, wanted, strict=True))
+        self._next = [int(np.searchsorted(topic.received, start)) for topic in self._topics]
+        self._pending.clear()
+        self._coming = self._bag.stream([topic.name for topic in self._topics], start)
+
+
+class _Bag:
+    """A recording as the library opens it; whatever it raises is one line here."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError:
+            raise GavoError(f"{path}: recordings of ROS need the extra [bag]: pip install 'gavo-jax[bag]'") from None
+        self.path = path
+        with blamed(f"{path}: not a bag that can be read"):
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+            _own_files(self._reader)
+        weakref.finalize(self, _close, self._reader)
+        self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
+
+    def stream(self, names: list[str], start: int | None = None) -> Iterator[tuple[str, bytes, str]]:
+        """Topic, content and type of messages, in the order in which they were received, from a time (ns) on."""
+        connections = [connection for connection in self._reader.connections if connection.topic in names]
+        for connection, _, raw in self._reader.messages(connections, start=start):
+            yield connection.topic, bytes(raw), connection.msgtype
+
+    def deserialize(self, raw: bytes, kind: str) -> Any:
+        """The message; raises `FrameError` for one that is torn."""
+        with blamed(str(self.path), FrameError):
+            return self._reader.deserialize(raw, kind)
+
+    def topic(self, name: str) -> _Topic:
+        """Go over the messages of a topic for their stamps; those without one get the time they were received."""
+        connections = [connection for connection in self._reader.connections if connection.topic == name]
+        received, stamps = [], []
+        with blamed(str(self.path)):
+            for _, time, raw in self._reader.messages(connections):
+                received.append(time)
+                stamps.append(_stamp(raw, self._reader.is2))
+        if not any(stamps):
+            stamps = [time * 1e-9 for time in received]
+        return _Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
+
+    def first(self, name: str) -> Any | None:
+        """The first message of a topic."""
+        with blamed(str(self.path)):
+            found = next(self.stream([name]), None)
+            return None if found is None else self._reader.deserialize(found[1], found[2])
+
+    def choose(self, reading: Reading) -> tuple[str, str]:
+        """The topics of colour and depth, those that are named or those that the messages' types speak for."""
+        depth = {}
+        for name, kind in sorted(self.kinds.items()):
+            if (message := self.first(name)) is not None:
+                depth[name] = is_depth(kind, message, name)
+        found = []
+        for is_wanted, given, what, option, words in (
+            (False, reading.color_topic, "colour", "--colour-topic", COLOR_NAMES),
+            (True, reading.depth_topic, "depth", "--depth-topic", DEPTH_NAMES),
+        ):
+            if given is not None:
+                if given not in depth:
+                    raise GavoError(f"{self.path}: {option}: no images on {given!r}: those are on {_named(depth)}")
+                found.append(given)
+                continue
+            names = [name for name, is_one in depth.items() if is_one == is_wanted]
+            best = [name for name in names if any(word in name for word in words)] or names
+            if len(best) != 1:
+                what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
+                raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
+            found += best
+        return found[0], found[1]
+
+    def calibration(self, color: str, depth: str) -> Calibration:
+        """The cameras of two topics, from the camera_info beside each."""
+        found = self._info(color)
+        if found is None:
+            raise GavoError(f"{self.path}: no camera_info for {color}: say --camera")
+        name, info = found
+        camera = self._camera(name, info, color)
+        other = self._info(depth)
+        moved = None if other is None else self._camera(*other, depth)
+        if other is None or moved is None or moved.rectified() == camera.rectified():
+            return Calibration(camera, origin=name, states_depth_scale=False)
+        color_T_depth = between(self._transforms(), info.header.frame_id, other[1].header.frame_id)
+        if color_T_depth is None:
+            raise GavoError(
+                f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie: "
+                "say --camera with a file of both cameras ([depth], colour_T_depth), or another --depth-topic"
+            )
+        origin = f"{name}, {other[0]} and {FIXED_TOPIC}"
+        return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
+
+    def _transforms(self) -> dict[tuple[str, str], np.ndarray]:
+        """The fixed transforms of the recording."""
+        topics = [c.topic for c in self._reader.connections if (c.topic, c.msgtype) == (FIXED_TOPIC, TRANSFORMS)]
+        with blamed(f"{self.path}: {FIXED_TOPIC}"):
+            raw = list(self.stream(topics)) if topics else []
+            return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
+
+    def _info(self, topic: str) -> tuple[str, Any] | None:
+        """Name and first message of the camera_info beside a topic of images."""
+        infos = [c.topic for c in self._reader.connections if c.msgtype == CAMERA_INFO]
+        parts = topic.split("/")
+        for length in range(len(parts) - 1, 0, -1):
+            name = "/".join([*parts[:length], "camera_info"])
+            if name in infos and (message := self.first(name)) is not None:
+                return name, message
+        return None
+
+    def _camera(self, name: str, info: Any, topic: str) -> Camera:
+        with blamed(f"{self.path}: {name}"):
+            return camera_from_table(f"{self.path}: {name}", camera_table(info, "rect" in topic), MILLIMETRES)
+
+
+class _File(io.BufferedReader):
+    """A file that closes itself when nobody holds it any more: to read a recording is no context to be left."""
+
+    def close(self) -> None:
+        self.raw.close()
+        super().close()
+
+
+def _own_files(reader: Any) -> None:
+    """Let the library read files that close themselves in place of those that it opened.
+
+    It does not get to closing a ROS 1 file while somebody holds a message of its last chunk.
+    """
+    for part in reader.readers:
+        if isinstance(file := getattr(part, "bio", None), io.BufferedReader):
+            part.bio = _File(io.FileIO(file.name))
+            file.close()
+
+
+def _close(reader: Any) -> None:
+    """Close a recording that nobody holds any more, as far as the library gets."""
+    with contextlib.suppress(Exception):
+        reader.close()
+
+
+def _stamp(raw: Any, is_2: bool) -> float:
+    """Seconds, from the header that every image message begins with."""
+    data = bytes(raw[:12])
+    if len(data) < 12:
+        return 0.0
+    order = "<" if not is_2 or data[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack(f"{order}II", data[4:12])
+    return seconds + nanoseconds * 1e-9
+
+
+def _named(topics: Any) -> str:
+    return ", ".join(sorted(topics)) or "no topic"

@@ -1,0 +1,149 @@
+"""Whether depth is counted in the units that its camera says: a scale wrong by 5 or 1000 gives a trajectory as wrong.
+
+A median alone does not tell: scenes of 0.4 m and of 8 m are both real. What tells is the sensor. The first Kinect and
+its like measure disparity, so that the steps between the depths that they can return grow with the square of depth, by
+the same factor in every such camera: `KINECT_STEP`. And they see nothing nearer than `KINECT_NEAREST`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import FrameError
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.images import without_invalid
+
+COMMON = (5000.0, 1000.0, 1.0)
+"""Units per metre of files: of the TUM benchmark, millimetres, metres."""
+
+LOOKED_AT = 3
+"""Frames."""
+
+KINECTS = ("fr1", "fr2", "fr3", "bonn")
+"""Presets of such cameras."""
+
+KINECT_STEP = 2.85e-3
+"""1/m: the step between two depths that such a camera returns at 1 m, an eighth of a pixel of disparity at a baseline
+of 75 mm and a focal length of 585 pixels."""
+
+KINECT_NEAREST = 0.35
+"""Metres."""
+
+KINECT_VIEW = (0.76, 0.93)
+"""Focal length over the image's width of such cameras."""
+
+PLAUSIBLE = (0.02, 150.0)
+"""Metres: a median depth outside is that of no scene."""
+
+USUAL = (0.2, 10.0)
+"""Metres: a median depth that a unit has to lead to if it is to be proposed for one that is not plausible."""
+
+USUAL_MEDIAN = 1.5
+"""Metres: of several such units the one that leads nearest to it is proposed."""
+
+STEP_TOLERANCE = 0.15
+"""How far the unit that the steps speak of may be off a common one."""
+
+LEAST_STEP = 3.5
+"""Raw units: rounding hides the law of smaller steps."""
+
+LEAST_STEPS, SPREAD = 40, 0.35
+"""Steps that have to be seen, and how far the middle half of them may differ, to be taken for a law."""
+
+
+class DepthSample(NamedTuple):
+    """What the raw depth of a few frames says, in its own units."""
+
+    near: float
+    """First percentile."""
+    median: float
+    far: float
+    """99th percentile."""
+    kinect_scale: float | None
+    """Units per metre by the steps, if the sensor were such a camera; None where the steps follow no law."""
+
+
+def sample_depth(images: Sequence[np.ndarray]) -> DepthSample | None:
+    """Look at the raw depth of a few frames; None where there is no reading."""
+    clean = [without_invalid(image) for image in images]
+    readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
+    if readings.size == 0:
+        return None
+    near, median, far = np.percentile(readings, [1, 50, 99])
+    return DepthSample(float(near), float(median), float(far), _kinect_scale(readings))
+
+
+def _kinect_scale(readings: np.ndarray) -> float | None:
+    values = np.unique(readings).astype(float)
+    steps, middles = np.diff(values), (values[1:] + values[:-1]) / 2
+    resolution = 1.0 if readings.dtype == np.uint16 else 0.0
+    per_square = (steps / middles**2)[steps >= LEAST_STEP * resolution]
+    if len(per_square) < LEAST_STEPS:
+        return None
+    low, middle, high = np.percentile(per_square, [25, 50, 75])
+    return None if high - low > SPREAD * middle else KINECT_STEP / float(middle)
+
+
+def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: bool = False) -> float | None:
+    """The unit, per metre, that depth is probably counted in, if that is not `scale`; None where nothing speaks for it.
+
+    Args:
+        sample: of the first frames.
+        scale: units per metre as the camera says.
+        camera: of the images.
+        is_kinect: whether the camera is known to be one of those.
+    """
+    looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
+    by_steps = sample.kinect_scale if is_kinect or looks_so else None
+    others = [other for other in COMMON if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
+    seen = [other for other in others if sample.near / other > KINECT_NEAREST]
+    for other in seen:
+        if by_steps is not None and abs(by_steps / other - 1) < STEP_TOLERANCE:
+            return other
+    if is_kinect and sample.median / scale < KINECT_NEAREST:
+        return max(seen, default=None)
+    if PLAUSIBLE[0] < sample.median / scale < PLAUSIBLE[1]:
+        return None
+    likely = [other for other in others if sample.median / other > USUAL[0]]
+    return min(likely, key=lambda other: abs(np.log(sample.median / other / USUAL_MEDIAN)), default=None)
+
+
+def fault_of_scale(sequence: FrameSequence) -> str | None:
+    """What is probably wrong with the depth scale of a sequence and what to set instead; None where nothing is.
+
+    Its first frames tell; ones that cannot be read are left out.
+    """
+    sample, scale = sample_sequence(sequence)
+    calibration = getattr(sequence, "calibration", None)
+    is_kinect = getattr(calibration, "preset", None) in KINECTS
+    better = None if sample is None else better_scale(sample, scale, sequence.camera, is_kinect)
+    if sample is None or better is None:
+        return None
+    return (
+        f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
+        f"{name_of_unit(better)}: set --depth-scale {better:g}"
+    )
+
+
+def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
+    """What the first frames' depth says, as it is stored where the sequence tells, and the units per metre it has."""
+    read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
+    unit = getattr(sequence, "depth_unit", None)
+    images = []
+    for index in range(min(LOOKED_AT, len(sequence))):
+        try:
+            images.append(read(index))
+        except FrameError:
+            continue
+    return sample_depth(images), sequence.camera.depth_scale if unit is None else unit.file
+
+
+NAMES = {1.0: "metres", 1000.0: "millimetres", 5000.0: "the TUM benchmark's 5000 to a metre"}
+"""Common units in words."""
+
+
+def name_of_unit(scale: float) -> str:
+    """A unit in words."""
+    return NAMES.get(scale, f"{scale:g} to a metre")

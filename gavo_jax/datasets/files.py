@@ -1,0 +1,306 @@
+"""Sequences whose frames lie as image files."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar, NamedTuple, overload
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera, preset_for_sequence
+from gavo_jax.camera_files import DEPTH_SCALE, Calibration, Size, load_calibration
+from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
+from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.datasets.depth_unit import better_scale, sample_depth
+from gavo_jax.datasets.images import read_color, read_depth
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import Trajectory
+
+SAMPLED = 3
+"""Frames, from the first to the last, that show what kind of images a sequence has."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a source is to be read; what is left out, it says itself, or is found out.
+
+    Attributes:
+        camera: a camera, a calibration, what `load_calibration` takes, or "auto": what the source brings.
+        depth_scale: raw depth units per metre.
+        rate: frames per second, where there are no stamps.
+        color: whether frames carry RGB beside grey.
+        undistort: whether lens distortion is taken out.
+        max_difference: colour and depth stamps at least this far apart, in seconds, are not of one frame.
+        color_topic: of a recording.
+        depth_topic: of a recording.
+    """
+
+    camera: Camera | Calibration | str = "auto"
+    depth_scale: float | None = None
+    rate: float | None = None
+    color: bool = False
+    undistort: bool = True
+    max_difference: float = 0.02
+    color_topic: str | None = None
+    depth_topic: str | None = None
+
+    @property
+    def is_auto(self) -> bool:
+        """Whether the source has to bring its camera."""
+        return isinstance(self.camera, str) and self.camera == "auto"
+
+    def calibration(self, size: Callable[[], Size] | None = None, depth_scale: float = DEPTH_SCALE) -> Calibration:
+        """The calibration that is named.
+
+        Args:
+            size: finds out width and height of the images, for a file that does not say it.
+            depth_scale: of a kind of source, for a file that does not say it.
+
+        Raises:
+            GavoError: as `load_calibration`.
+        """
+        if isinstance(self.camera, Calibration):
+            return self.camera
+        if isinstance(self.camera, Camera):
+            return Calibration(self.camera)
+        return load_calibration(self.camera, size, depth_scale)
+
+
+class Entry(NamedTuple):
+    """A frame's files."""
+
+    stamp: float
+    """Of the colour image, seconds."""
+    color: Path
+    depth: Path | None
+    depth_stamp: float | None = None
+    doubt: str = ""
+    """Why the frame's time cannot be trusted."""
+
+
+class FileSequence:
+    """Frames that lie as pairs of image files, decoded one by one when asked for; nothing of them is kept.
+
+    Attributes:
+        name: of the folder.
+        ground_truth: the true trajectory, or None.
+        entries: files of each frame, in the order of their stamps.
+        calibration: the cameras as they record.
+    """
+
+    kind: ClassVar[str] = "image files"
+    scale_is_open: ClassVar[bool] = False
+    """Whether the kind of source leaves the unit of depth open: what depth looks like decides, if nobody says it."""
+
+    def __init__(
+        self,
+        name: str,
+        entries: Sequence[Entry],
+        calibration: Calibration,
+        ground_truth: Trajectory | None = None,
+        reading: Reading = Reading(),
+        left_out: Sequence[str] = (),
+    ) -> None:
+        """Take note of the files; none is read yet.
+
+        Args:
+            name: for tables and folders.
+            entries: in the order of their stamps.
+            calibration: the cameras as they record.
+            ground_truth: with its own stamps.
+            reading: `depth_scale`, `color` and `undistort` count.
+            left_out: what lies there and is not used, and why, a line each.
+        """
+        self.name, self.ground_truth, self.left_out = name, ground_truth, tuple(left_out)
+        self.entries = list(entries)
+        if reading.depth_scale is not None:
+            calibration = calibration.with_depth_scale(reading.depth_scale)
+        self.calibration = calibration
+        self._timestamps = np.array([entry.stamp for entry in self.entries])
+        self._images = _Images(self.entries, calibration, reading, self.scale_is_open)
+
+    @property
+    def timestamps(self) -> Float[np.ndarray, " frames"]:
+        """Colour stamp of each frame, seconds."""
+        return self._timestamps
+
+    @property
+    def camera(self) -> Camera:
+        """Of the frames as they come: without distortion when they are undistorted, else as recorded."""
+        return self._images.assembler.camera
+
+    @property
+    def depth_unit(self) -> DepthUnit:
+        """Of the files, and of frames."""
+        return self._images.assembler.unit
+
+    @property
+    def files(self) -> list[tuple[Path, ...]]:
+        """Images of each frame."""
+        return [tuple(path for path in (entry.color, entry.depth) if path is not None) for entry in self.entries]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.entries)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> "FileSequence": ...
+    def __getitem__(self, index: int | slice) -> "Frame | FileSequence":
+        """Decode frame `index`, or return the sequence of a slice.
+
+        Raises:
+            IndexError: no such frame.
+            FrameError: one of its two images is missing, torn, or of the wrong size or kind, or its stamp is in doubt.
+        """
+        if isinstance(index, slice):
+            part = copy(self)
+            part._timestamps, part.entries = self._timestamps[index], self.entries[index]
+            return part
+        entry = self.entries[index]
+        if entry.doubt:
+            raise TimestampError(entry.doubt)
+        assert entry.depth is not None
+        return self._images.assembler.frame(
+            read_color(entry.color),
+            DepthImage(read_depth(entry.depth), str(entry.depth)),
+            str(entry.color),
+            entry.stamp,
+            entry.depth_stamp,
+        )
+
+    def raw_depth(self, index: int) -> np.ndarray:
+        """The depth image of a frame as it is stored; raises `FrameError` as reading the frame does."""
+        entry = self.entries[index]
+        if entry.depth is None:
+            raise TimestampError(entry.doubt)
+        return read_depth(entry.depth)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode frame after frame; raises `FrameError` at one that cannot be read."""
+        return (self[index] for index in range(len(self)))
+
+    def check(self) -> None:
+        """Refuse what can be known before a run: a missing image among these frames, an unusable first frame.
+
+        Raises:
+            GavoError: names the image and the fault.
+        """
+        if len(self) == 0:
+            raise GavoError(f"{self.name}: no frames in the chosen range")
+        for entry in self.entries:
+            for path in (entry.color, entry.depth):
+                if path is not None and not os.path.isfile(path):
+                    raise GavoError(f"{path}: image is missing: restore it, or take its row out of the list")
+        self[0]
+
+
+CAMERA_FILES = (
+    *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
+    *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
+    *("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt"),
+)
+"""Names by which a camera file in a folder, or in the one above, is known."""
+
+
+def own_camera_file(folder: Path) -> Path | None:
+    """The camera file that lies in a folder, if one does."""
+    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def preset_by_name(folder: Path) -> Calibration:
+    """The preset that a folder's name speaks of.
+
+    Raises:
+        GavoError: it speaks of none; the message says what would help.
+    """
+    try:
+        return load_calibration(preset_for_sequence(folder.resolve().name))
+    except GavoError as error:
+        raise GavoError(f"{folder}: no camera file in it, and {error}") from None
+
+
+def size_of_first(entries: Sequence[Entry]) -> Size:
+    """Width and height of the first colour image that can be read.
+
+    Raises:
+        FrameError: why the first cannot, where none of the first few can.
+    """
+    fault: FrameError | None = None
+    for entry in entries[:SAMPLED]:
+        try:
+            height, width = read_color(entry.color).shape[:2]
+            return width, height
+        except FrameError as error:
+            fault = fault or error
+    raise fault or FrameError("no frames")
+
+
+def resolve_folder(folder: Path) -> Path:
+    """The folder's true place.
+
+    Raises:
+        GavoError: there is none.
+    """
+    try:
+        resolved = folder.resolve()
+        if not resolved.is_dir():
+            raise GavoError(f"{folder}: no such folder")
+        return resolved
+    except (OSError, RuntimeError, ValueError) as error:
+        raise error if isinstance(error, GavoError) else GavoError(f"{str(folder)!r}: unusable: {error}") from None
+
+
+class _Images:
+    """What kind of images a whole sequence has, found out from a few of them once; its slices share it."""
+
+    def __init__(self, entries: list[Entry], calibration: Calibration, reading: Reading, scale_is_open: bool):
+        self._entries, self._calibration, self._reading = entries, calibration, reading
+        self._scale_is_open = scale_is_open
+
+    @cached_property
+    def assembler(self) -> FrameAssembler:
+        colors, depths = [], []
+        for at in sorted({round(share * (len(self._entries) - 1)) for share in np.linspace(0, 1, SAMPLED)}):
+            entry = self._entries[max(at, 0)]
+            try:
+                colors.append(read_color(entry.color))
+                if entry.depth is not None:
+                    depths.append(DepthImage(read_depth(entry.depth), str(entry.depth)))
+            except FrameError:
+                continue  # told of when the frame itself is read
+        scale = self._calibration.color.depth_scale
+        if self._scale_is_open and not self._calibration.states_depth_scale:
+            sample = sample_depth([depth.raw for depth in depths])
+            scale = sample and better_scale(sample, scale, self._calibration.color) or scale
+        unit = DepthUnit(scale, scale)
+        if any(depth.raw.dtype != np.uint16 for depth in depths):
+            unit = float_unit(depths, self._calibration, self._reading.depth_scale)
+        return FrameAssembler(
+            self._calibration, unit, common_white(colors), self._reading.color, self._reading.undistort
+        )
+
+
+def open_pair(
+    images: Sequence[tuple[str | Path, str | Path]], calibration: Calibration, reading: Reading = Reading()
+) -> FileSequence:
+    """A few frames that belong together, each of a colour and a depth image.
+
+    Args:
+        images: paths of colour and depth, for each frame.
+        calibration: of all of them.
+        reading: as of `FileSequence`.
+
+    Raises:
+        GavoError: one file is given as colour and as depth.
+    """
+    for color, depth in images:
+        if Path(color) == Path(depth):
+            raise GavoError(f"{color}: given as colour and as depth alike")
+    entries = [Entry(0.0, Path(color), Path(depth)) for color, depth in images]
+    return FileSequence("pair", entries, calibration, reading=reading)

@@ -1,0 +1,410 @@
+"""Datasets whose frames are numbered files in a folder: 7-Scenes, ScanNet, Replica, Open3D's, and plain folders.
+
+Each class says how its folder is recognised, where the images and poses lie, and which camera took them.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.datasets.files import (
+    Entry,
+    FileSequence,
+    Reading,
+    own_camera_file,
+    preset_by_name,
+    resolve_folder,
+    size_of_first,
+)
+from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
+from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.trajectory import Trajectory, associate, inverse
+
+RATE = 30.0
+"""Frames per second where nobody says it: that of nearly every RGB-D camera."""
+
+MILLIMETRES = 1000.0
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
+DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
+
+MAX_POSE_BYTES = 4096
+
+SKEWED = 0.01
+"""A pose whose rotation is off one by more is none."""
+
+STAMP_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e9, 1.0))
+"""Names that are numbers from so large on are stamps since 1970: nanoseconds, microseconds, milliseconds, seconds."""
+
+
+class Found(NamedTuple):
+    """Image files of a folder by the numbers in their names."""
+
+    color: dict[int, Path]
+    depth: dict[int, Path]
+
+
+class NumberedFolder(FileSequence):
+    """Frames of which colour and depth have the same number; their time is that number over the rate."""
+
+    kind: ClassVar[str] = "folder of numbered images"
+    poses_of_depth: ClassVar[bool] = False
+    """Whether the poses are those of the depth camera, where it is another than the colour camera."""
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether the folder is laid out like this dataset."""
+        raise NotImplementedError
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """The image files."""
+        raise NotImplementedError
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """The camera that the folder, or the dataset, brings.
+
+        Raises:
+            GavoError: there is none, or it cannot be read.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """True poses, world_T_camera, by the numbers of their frames; empty where there is no truth."""
+        return {}
+
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> Self:
+        """Find the files and read camera and poses; no image is read, but where the camera's file lacks the size.
+
+        Raises:
+            GavoError: no frame, no camera, unreadable poses.
+        """
+        root = resolve_folder(path)
+        found = cls.find(path)
+        rate = reading.rate or RATE
+        numbers = sorted(found.color.keys() & found.depth.keys())
+        if not numbers:
+            counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
+            raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
+        entries = [Entry(number / rate, found.color[number], found.depth[number]) for number in numbers]
+        if reading.is_auto:
+            calibration = cls.calibrate(path, entries[0], reading)
+        else:
+            calibration = reading.calibration(partial(size_of_first, entries), MILLIMETRES)
+        poses = cls.poses(path)
+        known = [number for number in numbers if number in poses]
+        truth = None
+        if known:
+            moved = calibration.color_T_depth if cls.poses_of_depth else None
+            posed_T_color = np.eye(4) if moved is None else inverse(moved)
+            truth = Trajectory(np.array(known) / rate, np.stack([poses[number] @ posed_T_color for number in known]))
+        return cls(root.name, entries, calibration, truth, reading, _alone(found, numbers))
+
+
+class SevenScenes(NumberedFolder):
+    """A sequence of 7-Scenes (Shotton et al. 2013): `frame-000000.color.png`, `.depth.png`, `.pose.txt`.
+
+    Depth is in millimetres, 65535 where there is none, and not registered to colour.
+    """
+
+    kind: ClassVar[str] = "7-Scenes sequence"
+    poses_of_depth: ClassVar[bool] = True
+    CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480, depth_scale=MILLIMETRES)
+    """As the dataset's page has it, for colour and depth alike."""
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the names of the images."""
+        return bool(_any(path, "frame-*.color.*")) and bool(_any(path, "frame-*.depth.*"))
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Both kinds lie in the folder itself."""
+        return Found(
+            _numbered(path.glob("frame-*.color.*"), COLOR_SUFFIXES),
+            _numbered(path.glob("frame-*.depth.*"), DEPTH_SUFFIXES),
+        )
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """The camera file beside the frames, else the dataset's."""
+        file = own_camera_file(path)
+        if file is None:
+            return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
+        return _millimetres(load_calibration(file, partial(size_of_first, [first]), MILLIMETRES))
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """A file for each frame."""
+        return _pose_files(path.glob("frame-*.pose.txt"))
+
+
+class ScanNet(NumberedFolder):
+    """A scan of ScanNet (Dai et al. 2017) as its reader exports it: `color/`, `depth/`, `pose/`, `intrinsic/`."""
+
+    kind: ClassVar[str] = "ScanNet scan"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the file of the colour camera, beside the images."""
+        return (path / "intrinsic" / "intrinsic_color.txt").is_file() and (path / "depth").is_dir()
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Each kind has a folder."""
+        return Found(_images(path / "color", COLOR_SUFFIXES), _images(path / "depth", DEPTH_SUFFIXES))
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """The files of both cameras, as far as they are two; the scans say that nothing is to be turned or shifted."""
+        color, depth = (path / "intrinsic" / f"intrinsic_{name}.txt" for name in ("color", "depth"))
+        found = _millimetres(load_calibration(color, partial(size_of_first, [first]), MILLIMETRES))
+        if not depth.is_file() or first.depth is None:
+            return found
+        height, width = read_depth(first.depth).shape
+        other = load_calibration(depth, (width, height), MILLIMETRES).color
+        if other == found.color:
+            return found
+        return replace(found, depth=other, color_T_depth=np.eye(4), origin=f"{color}, {depth.name}")
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """A file for each frame; those of frames that were not tracked hold infinities."""
+        return _pose_files((path / "pose").glob("*.txt"))
+
+
+class Replica(NumberedFolder):
+    """A rendered room of Replica as NICE-SLAM has it: `results/frame*.jpg`, `results/depth*.png`, `traj.txt`."""
+
+    kind: ClassVar[str] = "Replica room"
+    CAMERA = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680, depth_scale=6553.5)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the names of the images."""
+        return (path / "results").is_dir() and bool(_any(path / "results", "frame*")) and (path / "traj.txt").exists()
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Both kinds lie in one folder."""
+        results = path / "results"
+        return Found(
+            _numbered(results.glob("frame*"), COLOR_SUFFIXES), _numbered(results.glob("depth*"), DEPTH_SUFFIXES)
+        )
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """cam_params.json of the room or of all rooms, else the one that they were rendered with."""
+        file = own_camera_file(path) or own_camera_file(path.parent)
+        if file is None:
+            return Calibration(cls.CAMERA, origin="the one that Replica was rendered with")
+        return load_calibration(file, partial(size_of_first, [first]), cls.CAMERA.depth_scale)
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """A row of sixteen numbers for each frame."""
+        rows = data_rows(path / "traj.txt")
+        return {number: pose for number, (place, row) in enumerate(rows) if (pose := _pose(place, row)) is not None}
+
+
+class PlainFolder(FileSequence):
+    """A folder of colour and a folder of depth images, or one folder of both told apart by their names.
+
+    Names that are stamps (seconds with decimals, or a time since 1970 in s, ms, µs or ns) are paired by time; else
+    images of the same number are of one frame, and its time is that number over the rate.
+    """
+
+    kind: ClassVar[str] = "folder of colour and depth images"
+    scale_is_open: ClassVar[bool] = True
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the folders' names, or the files'."""
+        color, depth = _plain_files(path)
+        return bool(color and depth)
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """The camera file in the folder, or in the one above, else the preset that the folder's name speaks of.
+
+        Raises:
+            GavoError: there is none.
+        """
+        file = own_camera_file(path) or own_camera_file(path.parent)
+        if file is None:
+            return preset_by_name(path)
+        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> Self:
+        """Find the files, pair them and read the camera.
+
+        Raises:
+            GavoError: no frame, no camera.
+        """
+        root = resolve_folder(path)
+        color, depth = _plain_files(path)
+        entries, left_out = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
+        if reading.is_auto:
+            calibration = cls.calibrate(path, entries[0], reading)
+        else:
+            calibration = reading.calibration(partial(size_of_first, entries), MILLIMETRES)
+        truth = path / "groundtruth.txt"
+        return cls(
+            root.name, entries, calibration, Trajectory.read_tum(truth) if truth.exists() else None, reading, left_out
+        )
+
+
+class Open3DFolder(PlainFolder):
+    """A folder of Open3D's reconstruction system, or of Redwood: `color/` or `image/`, `depth/`, an intrinsics file."""
+
+    kind: ClassVar[str] = "Open3D reconstruction folder"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the intrinsics' file beside the images."""
+        return cls._intrinsics(path) is not None and super().recognises(path)
+
+    @classmethod
+    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+        """The intrinsics' file; depth is in millimetres unless said otherwise."""
+        file = cls._intrinsics(path)
+        assert file is not None
+        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+
+    @classmethod
+    def _intrinsics(cls, path: Path) -> Path | None:
+        names = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json")
+        return next((path / name for name in names if (path / name).is_file()), None)
+
+
+def _any(folder: Path, pattern: str) -> Path | None:
+    return next(folder.glob(pattern), None)
+
+
+def _images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    return _numbered(folder.iterdir(), suffixes) if folder.is_dir() else {}
+
+
+def _numbered(files: Iterable[Path], suffixes: Sequence[str]) -> dict[int, Path]:
+    """Images by the last number in their names."""
+    found = {}
+    for file in sorted(files):
+        number = re.findall(r"\d+", file.name[: -len(file.suffix)])
+        if file.suffix.lower() in suffixes and number and len(number[-1]) <= 18:
+            found.setdefault(int(number[-1]), file)
+    return found
+
+
+def _alone(found: Found, numbers: Sequence[int]) -> list[str]:
+    """What makes no frame, a line each."""
+    lines = []
+    for images, one, other in ((found.color, "colour", "depth"), (found.depth, "depth", "colour")):
+        if count := len(images) - len(numbers):
+            lines.append(f"{count} {one} images: no {other} image of the same number")
+    return lines
+
+
+def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
+    """Colour and depth files, each in the order of their names."""
+    for color in COLOR_FOLDERS:
+        for depth in DEPTH_FOLDERS:
+            if (path / color).is_dir() and (path / depth).is_dir():
+                pair = ((path / color, COLOR_SUFFIXES), (path / depth, DEPTH_SUFFIXES))
+                return tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in ends) for folder, ends in pair)  # pyright: ignore[reportReturnType]
+    files = sorted(path.iterdir()) if path.is_dir() else []
+    depth = [file for file in files if "depth" in file.name.lower() and file.suffix.lower() in DEPTH_SUFFIXES]
+    named = re.compile("colou?r|rgb|image|frame", re.IGNORECASE)
+    color = [file for file in files if named.search(file.name) and file.suffix.lower() in COLOR_SUFFIXES]
+    return [file for file in color if file not in set(depth)], depth
+
+
+def _by_stamp(
+    path: Path, color: list[Path], depth: list[Path], reading: Reading
+) -> tuple[list[Entry], list[str]] | None:
+    """Frames by the stamps that all names are; None where they are none, or the rate is said."""
+    stamps = [[_stamp(file.stem) for file in files] for files in (color, depth)]
+    if reading.rate is not None or any(stamp is None for some in stamps for stamp in some):
+        return None
+    first, second = (np.array(some, float) for some in stamps)
+    i, j = associate(first, second, reading.max_difference)
+    if len(i) == 0:
+        raise GavoError(
+            f"{path}: by their names no colour and depth image lie within {reading.max_difference:g} s of each other: "
+            "say --rate if the names are no stamps"
+        )
+    entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
+    lines = []
+    for count, one, other in ((len(color) - len(i), "colour", "depth"), (len(depth) - len(i), "depth", "colour")):
+        if count:
+            lines.append(f"{count} {one} images: no {other} image within {reading.max_difference:g} s")
+    return sorted(entries, key=lambda entry: entry.stamp), lines
+
+
+def _stamp(stem: str) -> float | None:
+    """Seconds, if a name is a stamp."""
+    number = re.search(r"(\d+(?:\.\d+)?)$", stem)
+    if number is None:
+        return None
+    value = float(number[1])
+    if "." in number[1]:
+        return value
+    return next((value * unit for least, unit in STAMP_UNITS if value >= least), None)
+
+
+def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> tuple[list[Entry], list[str]]:
+    """Frames by the numbers in the names."""
+    found = Found(_numbered(color, COLOR_SUFFIXES), _numbered(depth, DEPTH_SUFFIXES))
+    numbers = sorted(found.color.keys() & found.depth.keys())
+    if not numbers:
+        counts = f"{len(color)} colour and {len(depth)} depth images"
+        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
+    rate = reading.rate or RATE
+    return [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers], _alone(found, numbers)
+
+
+def _millimetres(calibration: Calibration) -> Calibration:
+    """The same where the file says nothing of depth: the dataset does."""
+    return calibration if calibration.states_depth_scale else calibration.with_depth_scale(MILLIMETRES)
+
+
+def _pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
+    poses = {}
+    for file in sorted(files):
+        numbers = re.findall(r"\d+", file.name)
+        fields = [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row]
+        pose = _pose(str(file), fields)
+        if pose is not None and numbers and len(numbers[-1]) <= 18:
+            poses[int(numbers[-1])] = pose
+    return poses
+
+
+def _pose(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
+    """A rigid transform from sixteen numbers, row by row; None where it is not finite: the frame was not tracked.
+
+    Raises:
+        GavoError: no sixteen numbers, or no rigid transform.
+    """
+    try:
+        matrix = np.array([float(field) for field in fields]).reshape(4, 4)
+    except ValueError:
+        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
+    if not np.isfinite(matrix).all():
+        return None
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    rotation = u @ vt
+    if np.abs(rotation - matrix[:3, :3]).max() > SKEWED or np.linalg.det(rotation) < 0:
+        raise GavoError(f"{place}: the pose is no rotation and shift")
+    matrix[:3, :3] = rotation
+    return matrix

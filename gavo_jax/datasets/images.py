@@ -1,0 +1,253 @@
+"""Image files into arrays: whatever OpenCV decodes, NumPy arrays, OpenEXR; one line for what cannot be read."""
+
+import contextlib
+import io
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8, UInt16
+
+from gavo_jax.camera import MAX_SIDE
+from gavo_jax.datasets.base import FrameError
+
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
+"""Of what is looked for in a folder; a file that is named may have any."""
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".pgm", ".pfm")
+
+MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
+"""Of a file: the largest image with sixteen bytes to a pixel, and some room."""
+
+PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01", b"\x93NUMPY"
+
+NO_READING = 65535
+"""Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
+
+WHITES = (255, 1023, 4095, 16383, 65535)
+"""Full scales of sensors: what 16-bit intensities are measured against."""
+
+AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def read_color(path: str | Path) -> UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]:
+    """Return a colour image as BGR of 8 or 16 bits; grey has three equal channels, transparency is left out.
+
+    Raises:
+        FrameError: it is missing, torn, or no image of 8 or 16 bits; the message names it.
+    """
+    path = Path(path)
+    return decode_color(read_bytes(path), str(path))
+
+
+def decode_color(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]:
+    """`read_color` of a file's content; `name` stands in messages."""
+    if data.startswith(NPY_SIGNATURE):
+        image = _color_array(_decode_npy(data, name))
+    else:
+        image = _decode(data, name, AS_COLOR)
+    if image is None or image.ndim != 3 or image.dtype not in (np.uint8, np.uint16):
+        found = "nothing" if image is None else _describe(image)
+        raise FrameError(f"{name}: not a colour image: expected colour or grey of 8 or 16 bits, found {found}")
+    return image
+
+
+def read_depth(path: str | Path) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]:
+    """Return raw depth, as it stands in the file: 16-bit integers, or float32 for all else.
+
+    What is no reading (0, 65535, negative, NaN, infinity) is left as it is: see `without_invalid`.
+
+    Raises:
+        FrameError: it is missing, torn, or no depth: one channel of 16 bits or more; the message names it.
+    """
+    path = Path(path)
+    return decode_depth(read_bytes(path), str(path))
+
+
+def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]:
+    """`read_depth` of a file's content; `name` stands in messages."""
+    if data.startswith(NPY_SIGNATURE):
+        image = _decode_npy(data, name)
+    elif data.startswith(EXR_SIGNATURE):
+        image = _decode_exr(data, name)
+    else:
+        image = _decode(data, name, AS_STORED)
+    if image.ndim == 3 and image.shape[-1] == 1:
+        image = image[..., 0]
+    if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
+        found = _describe(image)
+        raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
+    return image if image.dtype == np.uint16 else image.astype(np.float32)
+
+
+def to_8_bits(image: Shaped[np.ndarray, "h w *channels"], white: int) -> UInt8[np.ndarray, "h w *channels"]:
+    """Scale intensities so that `white` is 255; 8-bit images come back as they are."""
+    return image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255.0 / white)
+
+
+def white_of(image: Shaped[np.ndarray, "h w *channels"]) -> int:
+    """The smallest full scale of a sensor that holds all of an image: 16 bits often hold 10, 12 or 14."""
+    most = int(image.max(initial=0))
+    return next(white for white in WHITES if most <= white)
+
+
+def without_invalid(depth: UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]) -> np.ndarray:
+    """Return raw depth with 0 where there is no reading: 0, 65535 (of 16 bits), negative, NaN, infinity."""
+    if depth.dtype == np.uint16:
+        return cv2.threshold(depth, NO_READING - 1, 0, cv2.THRESH_TOZERO_INV)[1] if depth.max() == NO_READING else depth
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return a file's content.
+
+    Raises:
+        FrameError: it is missing, no file, too large or unreadable.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise FrameError(f"{path}: not a file")
+        if path.stat().st_size > MAX_BYTES:
+            raise FrameError(f"{path}: larger than {MAX_BYTES} bytes: no image of up to {MAX_SIDE} pixels a side")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise FrameError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, FrameError):
+            raise
+        raise FrameError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
+    if not data:
+        raise FrameError(f"{name}: empty file: get it anew")
+    if data.startswith(PNG_SIGNATURE):
+        _check_png(data, name)
+    elif not _is_known(data):
+        raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
+    image = _decoded(data, flags)
+    if image is None and flags == AS_COLOR:
+        image = _decoded(data, AS_STORED)  # what is whole, but no colour, is to be told by its kind
+    if image is None:
+        raise FrameError(f"{name}: torn or damaged image: get the file anew")
+    if max(image.shape[:2]) > MAX_SIDE:
+        height, width = image.shape[:2]
+        raise FrameError(f"{name}: is {width}x{height} pixels: more than {MAX_SIDE} a side")
+    return image
+
+
+def _decoded(data: bytes, flags: int) -> np.ndarray | None:
+    try:
+        with _quiet():
+            return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError):
+        return None
+
+
+SIGNATURES = (
+    PNG_SIGNATURE,
+    b"\xff\xd8\xff",
+    b"BM",
+    b"II*\0",
+    b"MM\0*",
+    b"II+\0",
+    b"MM\0+",
+    b"RIFF",
+    b"\0\0\0\x0cjP",
+    b"\xff\x4f\xff\x51",
+    b"#?R",
+    b"GIF8",
+    *(b"P" + kind for kind in (b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"f", b"F")),
+)
+"""First bytes of the formats that OpenCV decodes."""
+
+
+def _is_known(data: bytes) -> bool:
+    """Whether a file begins like an image that OpenCV decodes (AVIF names itself a little later)."""
+    return data.startswith(SIGNATURES) or data[4:12] in (b"ftypavif", b"ftypavis")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep OpenCV from saying on standard error, in lines of its own, what is wrong with a file."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _check_png(data: bytes, name: str) -> None:
+    """Refuse a PNG that is too large, or whose chunks are not all whole: OpenCV decodes part of a torn one silently."""
+    at = len(PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise FrameError(f"{name}: damaged PNG image (checksum): get the file anew")
+        if at == len(PNG_SIGNATURE):
+            if kind != b"IHDR" or length != 13:
+                break
+            width, height = struct.unpack_from(">II", data, at + 8)
+            if max(width, height) > MAX_SIDE:
+                raise FrameError(f"{name}: is {width}x{height} pixels: more than {MAX_SIDE} a side")
+        if kind == b"IEND":
+            return
+        at = end + 4
+    raise FrameError(f"{name}: torn PNG image (no end): get the file anew")
+
+
+def _decode_npy(data: bytes, name: str) -> np.ndarray:
+    file = io.BytesIO(data)
+    try:
+        image = np.load(file, allow_pickle=False)
+    except (ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
+        raise FrameError(f"{name}: not a NumPy array of numbers: {' '.join(str(error).split())[:100]}") from None
+    if not 2 <= image.ndim <= 3 or min(image.shape) == 0 or max(image.shape) > MAX_SIDE:
+        raise FrameError(f"{name}: not an image: an array of shape {image.shape}")
+    if image.dtype.kind not in "uif":
+        raise FrameError(f"{name}: not an image: an array of {image.dtype}")
+    return image.astype(image.dtype.newbyteorder("="))
+
+
+def _color_array(image: np.ndarray) -> np.ndarray:
+    """BGR of an array, which holds RGB or RGBA as Python has it."""
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=-1)
+    return np.ascontiguousarray(image[..., 2::-1]) if image.shape[-1] in (3, 4) else image[..., 0]
+
+
+def _decode_exr(data: bytes, name: str) -> np.ndarray:
+    try:
+        import OpenEXR  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise FrameError(
+            f"{name}: OpenEXR images need the extra [exr] (pip install 'gavo-jax[exr]'), or TIFF or .npy instead"
+        ) from None
+    try:
+        with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library reads nothing but files
+            file.write(data)
+            file.flush()
+            channels = OpenEXR.File(file.name).channels()
+    except Exception as error:  # of several kinds, which the library does not document
+        raise FrameError(f"{name}: torn or damaged OpenEXR image: {' '.join(str(error).split())[:100]}") from None
+    chosen = next((channels[key] for key in ("Z", "Y", "R", "depth", "D") if key in channels), None)
+    if chosen is None:
+        chosen = next(iter(channels.values()), None)
+    if chosen is None:
+        raise FrameError(f"{name}: an OpenEXR image without channels")
+    pixels = np.asarray(chosen.pixels)
+    return pixels[..., 0] if pixels.ndim == 3 else pixels
+
+
+def _describe(image: np.ndarray) -> str:
+    channels = 1 if image.ndim == 2 else image.shape[-1]
+    kind = {"f": "floats of ", "i": "signed ", "u": ""}.get(image.dtype.kind, f"{image.dtype} of ")
+    return f"{channels} channel{'s' * (channels != 1)} of {kind}{8 * image.dtype.itemsize} bits"

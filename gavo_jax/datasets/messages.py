@@ -1,0 +1,132 @@
+"""Images and cameras in the messages of ROS, whatever version: raw, compressed, and depth compressed its own way."""
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gavo_jax.datasets.base import FrameError
+from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth
+
+IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+
+LAYOUTS: dict[str, tuple[str, int, int | None]] = {
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2BGR),
+    "bgr8": ("u1", 3, None),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2BGR),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "8UC3": ("u1", 3, None),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "mono8": ("u1", 1, cv2.COLOR_GRAY2BGR),
+    "8UC1": ("u1", 1, cv2.COLOR_GRAY2BGR),
+    "rgb16": ("u2", 3, cv2.COLOR_RGB2BGR),
+    "bgr16": ("u2", 3, None),
+    "16UC3": ("u2", 3, None),
+    "mono16": ("u2", 1, cv2.COLOR_GRAY2BGR),
+    "16UC1": ("u2", 1, cv2.COLOR_GRAY2BGR),
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUYV),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUYV),
+    "32FC1": ("f4", 1, None),
+    "64FC1": ("f8", 1, None),
+}
+"""Of an encoding: the number type, channels, and what makes BGR of it (None: it is, or it is depth)."""
+
+DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16")
+
+DEPTH_HEADER = 12
+"""Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
+
+
+def is_depth(kind: str, message: Any, topic: str) -> bool:
+    """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
+    encoding = message.encoding if kind == IMAGE else message.format
+    if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding:
+        return True
+    return "depth" in topic and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
+
+
+def color_of(kind: str, message: Any, name: str) -> np.ndarray:
+    """BGR of 8 or 16 bits.
+
+    Raises:
+        FrameError: an encoding that is not known, or too few bytes; `name` stands in it.
+    """
+    if kind == COMPRESSED:
+        return decode_color(bytes(message.data), name)
+    pixels = _pixels(message, name)
+    conversion = LAYOUTS[message.encoding][2]
+    if pixels.dtype.kind == "f":
+        raise FrameError(f"{name}: encoding {message.encoding} is no colour")
+    return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
+    """Raw depth, 16-bit integers or float32.
+
+    Raises:
+        FrameError: no depth, an encoding that is not known, or too few bytes; `name` stands in it.
+    """
+    if kind == IMAGE:
+        if message.encoding not in DEPTH_ENCODINGS:
+            raise FrameError(
+                f"{name}: encoding {message.encoding[:40]!r} is no depth: {', '.join(DEPTH_ENCODINGS)} are"
+            )
+        pixels = _pixels(message, name)
+        return pixels if pixels.dtype == np.uint16 else pixels.astype(np.float32)
+    data = bytes(message.data)
+    if "compressedDepth" not in message.format:
+        return decode_depth(data, name)
+    if len(data) < DEPTH_HEADER or not data[DEPTH_HEADER:].startswith(PNG_SIGNATURE):
+        raise FrameError(
+            f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read"
+        )
+    _, slope, offset = struct.unpack_from("<iff", data)
+    stored = decode_depth(data[DEPTH_HEADER:], name)
+    if "32FC1" not in message.format:
+        return stored
+    with np.errstate(divide="ignore"):  # inverse depth was rounded; 0 stands for no reading
+        return np.where(stored > 0, np.float32(slope) / (stored.astype(np.float32) - np.float32(offset)), np.float32(0))
+
+
+def _pixels(message: Any, name: str) -> np.ndarray:
+    """Pixels as they stand in a raw image message, [h, w] or [h, w, channels]."""
+    layout = LAYOUTS.get(message.encoding)
+    if layout is None:
+        raise FrameError(f"{name}: encoding {message.encoding[:40]!r} is not one of {', '.join(LAYOUTS)}")
+    number, channels, _ = layout
+    dtype = np.dtype(number).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * dtype.itemsize
+    data = np.asarray(message.data, np.uint8)
+    if min(height, width) < 1 or step < row or data.size < step * (height - 1) + row:
+        raise FrameError(f"{name}: {data.size} bytes for {width}x{height} pixels of {message.encoding}: too few")
+    whole = data[: step * height] if data.size >= step * height else np.pad(data, (0, step * height - data.size))
+    rows = np.ascontiguousarray(whole.reshape(height, step)[:, :row]).view(dtype)
+    rows = rows.astype(dtype.newbyteorder("="), copy=False)
+    return rows if channels == 1 else rows.reshape(height, width, channels)
+
+
+def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
+    """What a camera_info says, by the keys of a camera file.
+
+    Args:
+        info: the message, of ROS 1 (K, D, P) or ROS 2 (k, d, p).
+        rectified: whether the images are free of distortion; the projection matrix is theirs.
+    """
+
+    def numbers(name: str) -> list[float]:
+        return [float(value) for value in getattr(info, name, getattr(info, name.upper(), ()))]
+
+    k, d, p = numbers("k"), numbers("d"), numbers("p")
+    size = {"width": int(info.width), "height": int(info.height)}
+    if rectified and any(p):
+        return {"fx": p[0], "fy": p[5], "cx": p[2], "cy": p[6], **size}
+    lens = {"distortion": d, "model": info.distortion_model or "plumb_bob"} if any(d) and not rectified else {}
+    return {"fx": k[0], "fy": k[4], "cx": k[2], "cy": k[5], **size, **lens}

@@ -1,0 +1,119 @@
+"""Depth of one camera as another sees it: moved to the colour camera's pixels by the calibration of both."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from gavo_jax.camera import Camera
+
+FOOTPRINT = 1.1
+"""A reading covers a little more than its share of the colour image: surfaces are seldom seen head-on."""
+
+MARGIN = 8
+"""Pixels: the largest footprint, and how far outside the image a reading may lie that reaches into it."""
+
+SAME_SURFACE = 0.03
+"""Share by which two readings of one surface may differ that have one pixel between them."""
+
+NEVER = np.uint16(65535)
+"""Deeper than any reading."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Moves depth images to the colour camera; where surfaces hide each other, the nearest is seen.
+
+    Attributes:
+        depth: the depth camera as it records.
+        color: the camera to which depth is moved: of frames as they come, rectified or not.
+        color_T_depth: maps points of the depth camera into the colour camera, metres.
+    """
+
+    depth: Camera
+    color: Camera
+    color_T_depth: Float[np.ndarray, "4 4"]
+
+    def __call__(self, depth: UInt16[np.ndarray, "h w"], units: float) -> UInt16[np.ndarray, "height width"]:
+        """Return a depth image as the colour camera sees it.
+
+        Args:
+            depth: of the depth camera's size, 0 = no reading.
+            units: per metre, of both images.
+        """
+        flat = depth.ravel()
+        seen = np.flatnonzero(flat)
+        x, y, z = self._points(seen, flat[seen].astype(np.float32) / np.float32(units))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = self._pixels(x, y, z)
+        raw = z * np.float32(units) + np.float32(0.5)
+        moved = np.where((z > 0) & (raw < NEVER), raw, 0).astype(np.uint16)
+        return self._splat(u, v, moved, [size[seen] for size in self._footprints])
+
+    def _points(self, seen: np.ndarray, metres: np.ndarray) -> list[np.ndarray]:
+        """Where readings lie in the colour camera: x, y, z."""
+        shift = self.color_T_depth[:3, 3].astype(np.float32)
+        return [axis[seen] * metres + shift[i] for i, axis in enumerate(self._rays)]
+
+    def _pixels(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows of the colour image."""
+        camera = self.color
+        if not camera.is_distorted:
+            return camera.fx * x / z + np.float32(camera.cx), camera.fy * y / z + np.float32(camera.cy)
+        points = np.stack([x / z, y / z, np.ones_like(z)], -1).astype(np.float64)[:, None]
+        distortion, still = np.array(camera.distortion), np.zeros(3)
+        if camera.model == "fisheye":
+            pixels = cv2.fisheye.projectPoints(points, still, still, camera.matrix, distortion)[0]
+        else:
+            pixels = cv2.projectPoints(points, still, still, camera.matrix, distortion)[0]
+        return pixels[:, 0, 0].astype(np.float32), pixels[:, 0, 1].astype(np.float32)
+
+    def _splat(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, sizes: list[np.ndarray]) -> np.ndarray:
+        """Draw each reading over the pixels that it covers; the nearest stays."""
+        height, width = self.color.height, self.color.width
+        most = [int(np.ceil(size.max())) for size in self._footprints]
+        around = (-MARGIN < u) & (u < width + MARGIN) & (-MARGIN < v) & (v < height + MARGIN)
+        near = around & (depth > 0)
+        u, v, depth, halves = u[near], v[near], depth[near], [size[near] / 2 for size in sizes]
+        left, top = (np.ceil(place - half).astype(np.int32) for place, half in zip((u, v), halves, strict=True))
+        right, bottom = u + halves[0], v + halves[1]
+        drawn = np.full(height * width, NEVER)
+        for i in range(most[1]):
+            for j in range(most[0]):
+                column, row = left + j, top + i
+                inside = (column < np.minimum(right, width)) & (row < np.minimum(bottom, height))
+                inside &= (column >= 0) & (row >= 0)
+                np.minimum.at(drawn, (row * width + column)[inside], depth[inside])
+        drawn[drawn == NEVER] = 0
+        return _without_cracks(drawn.reshape(height, width))
+
+    @cached_property
+    def _footprints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows of the colour image that each pixel of the depth camera covers, seen head-on."""
+        x, y = (axis.reshape(self.depth.height, self.depth.width) for axis in self._rays[:2])
+        columns = FOOTPRINT * np.abs(self.color.fx * np.gradient(x, axis=1))
+        rows = FOOTPRINT * np.abs(self.color.fy * np.gradient(y, axis=0))
+        return tuple(np.minimum(size, MARGIN).ravel().astype(np.float32) for size in (columns, rows))
+
+    @cached_property
+    def _rays(self) -> Float[np.ndarray, "3 pixels"]:
+        """Where each pixel of the depth camera looks, at 1 m along its axis, in the axes of the colour camera."""
+        camera = self.depth
+        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+        pixels, distortion = np.stack([u.ravel(), v.ravel()], -1)[:, None], np.array(camera.distortion)
+        undistort = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
+        ends = undistort(pixels, camera.matrix, distortion)[:, 0]
+        rays = np.concatenate([ends, np.ones((len(ends), 1))], axis=1)
+        return (self.color_T_depth[:3, :3] @ rays.T).astype(np.float32)
+
+
+def _without_cracks(depth: UInt16[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    """Fill pixels that fell between two readings of one surface, as they do where it is seen from aslant."""
+    for image in (depth, depth.T):
+        before, after = image[:, :-2], image[:, 2:]
+        low, high = np.minimum(before, after), np.maximum(before, after)
+        crack = (image[:, 1:-1] == 0) & (low > 0) & (high - low < SAME_SURFACE * high)
+        image[:, 1:-1][crack] = low[crack] + (high - low)[crack] // 2
+    return depth

@@ -1,0 +1,131 @@
+"""Which kind of source lies at a path: the kinds that are known, and those that other packages bring."""
+
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol
+
+from gavo_jax.datasets.bags import BagSequence
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.errors import GavoError, blamed
+
+PLUGINS = "gavo_jax.datasets"
+"""Group of entry points through which other packages bring kinds of sources."""
+
+SHOWN = 5
+"""Names that a message lists."""
+
+
+class Dataset(Protocol):
+    """A kind of source; the class of its sequences itself, mostly."""
+
+    @property
+    def kind(self) -> str:
+        """What it is called."""
+        ...
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a folder or file is of this kind, by names alone: quick, and without reading images."""
+        ...
+
+    def open(self, path: Path, reading: Reading) -> Sequence:
+        """Return the frames.
+
+        Raises:
+            GavoError: names the file and the fault.
+        """
+        ...
+
+
+BUILT_IN: tuple[Dataset, ...] = (TumSequence, SevenScenes, ScanNet, Replica, BagSequence, Open3DFolder, PlainFolder)
+"""In the order in which they are asked."""
+
+_registered: list[Dataset] = []
+
+
+def register_dataset(dataset: Dataset) -> None:
+    """Add a kind of source of one's own; it is asked before those that are built in.
+
+    A package that is installed can do without a call: an entry point of the group `gavo_jax.datasets` leads to it.
+    """
+    if dataset not in _registered:
+        _registered.insert(0, dataset)
+
+
+def datasets() -> tuple[Dataset, ...]:
+    """All kinds of sources, in the order in which they are asked.
+
+    Raises:
+        GavoError: a package's kind cannot be loaded.
+    """
+    _register_plugins()
+    return (*_registered, *BUILT_IN)
+
+
+@cache
+def _register_plugins() -> None:
+    for entry in entry_points(group=PLUGINS):
+        with blamed(f"dataset {entry.name!r} of {entry.value}"):
+            register_dataset(entry.load())
+
+
+def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
+    """Return the frames of a folder or file, whatever kind of source it is.
+
+    Args:
+        path: a folder in the layout of a dataset, or a file.
+        reading: camera, units, rate and what else the source does not say itself.
+
+    Raises:
+        GavoError: there is nothing, nothing that is known, or the source is faulty.
+    """
+    path, reading = Path(path), reading or Reading()
+    try:
+        exists = path.exists()
+    except (OSError, ValueError) as error:
+        raise GavoError(f"{str(path)!r}: unusable: {getattr(error, 'strerror', None) or error}") from None
+    if not exists:
+        raise GavoError(f"{path}: no such folder or file: name one, or the word synthetic")
+    return recognise(path).open(path, reading)
+
+
+def recognise(path: Path) -> Dataset:
+    """The kind of source that lies at a path.
+
+    Raises:
+        GavoError: none that is known; the message says what is there instead.
+    """
+    dataset = _kind_of(path)
+    if dataset is not None:
+        return dataset
+    raise GavoError(f"{path}: {_contents(path)}")
+
+
+def _kind_of(path: Path) -> Dataset | None:
+    for dataset in datasets():
+        with blamed(f"dataset {dataset.kind!r}: {path}"):
+            if dataset.recognises(path):
+                return dataset
+    return None
+
+
+def _contents(path: Path) -> str:
+    """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
+    known = ", ".join(dataset.kind for dataset in datasets())
+    if not path.is_dir():
+        return f"a file of {path.stat().st_size} bytes, not one of: {known}"
+    inside = sorted(path.iterdir())
+    if not inside:
+        return f"an empty folder, not one of: {known}"
+    sources = [child.name for child in inside if child.is_dir() and _kind_of(child) is not None]
+    if sources:
+        return f"a folder of {len(sources)} sources ({_listed(sources)}), of which one is to be named"
+    return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(name[:60] for name in names[:SHOWN]) + more

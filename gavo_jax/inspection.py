@@ -1,0 +1,151 @@
+"""What a source of frames is, found by looking at it: for `gavo inspect`, and a line of it for every run."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
+from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame
+
+Facts = dict[str, Any]
+
+MAX_REASONS = 5
+"""Frames that cannot be read of which it is said why."""
+
+
+def summary(sequence: Sequence) -> str:
+    """One line: what the source is, how many frames, which camera and where from, and what depth is counted in."""
+    camera, source = sequence.camera, _source(sequence)
+    return (
+        f"{sequence.name}: {source['kind']}, {len(sequence)} frames of {camera.width}x{camera.height}; "
+        f"camera fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({source['camera_from']}); "
+        f"depth in {name_of_unit(source['depth_units_per_metre'])}"
+    )
+
+
+def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: None) -> Facts:
+    """Look at every frame and return what there is to know, as JSON has it; see docs/sources.md for the names.
+
+    Args:
+        sequence: at least two frames.
+        on_frame: called after each frame.
+    """
+    stamps = np.asarray(sequence.timestamps)
+    looked = _look(sequence, on_frame)
+    return {
+        "name": sequence.name,
+        **_source(sequence),
+        "frames": len(sequence),
+        "frames_used": looked["used"],
+        "frames_not_used": looked["not_used"],
+        "why_not": looked["reasons"],
+        "left_out": list(getattr(sequence, "left_out", ())),
+        **_times(stamps),
+        "delay_of_depth_ms": looked["delay"],
+        "image": looked["image"],
+        "depth": looked["depth"] | {"fault": fault_of_scale(sequence)},
+        "camera": _camera(sequence.camera),
+        "recorded_camera": _recorded(sequence),
+        "ground_truth": _truth(sequence, stamps),
+    }
+
+
+def _source(sequence: Sequence) -> Facts:
+    calibration, unit = getattr(sequence, "calibration", None), getattr(sequence, "depth_unit", None)
+    return {
+        "kind": getattr(sequence, "kind", type(sequence).__name__),
+        "camera_from": getattr(calibration, "origin", "the sequence"),
+        "depth_units_per_metre": sequence.camera.depth_scale if unit is None else unit.file,
+    }
+
+
+def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
+    """Decode every frame and check it as a run would, before anything is aligned."""
+    history, statuses, reasons, delays, ranges, coverages = History(), Counter(), [], [], [], []
+    used, contrast = 0, []
+    for index, timestamp in enumerate(sequence.timestamps):
+        try:
+            frame: Frame | FrameError = sequence[index]
+        except FrameError as error:
+            frame = error
+            reasons.append(str(error))
+        finding, history = check_frame(frame, float(timestamp), sequence.camera, history)
+        if finding.use is Use.NOTHING:
+            statuses[finding.status.name.lower()] += 1
+        else:
+            used += 1
+        if isinstance(frame, Frame):
+            readings = frame.depth[::4, ::4][frame.depth[::4, ::4] > 0] / sequence.camera.depth_scale
+            coverages.append(readings.size / frame.depth[::4, ::4].size)
+            contrast.append((float(frame.grey.mean()), float(frame.grey.std())))
+            if readings.size:
+                ranges.append(np.percentile(readings, [1, 50, 99]))
+            if frame.depth_timestamp is not None:
+                delays.append(1e3 * (frame.depth_timestamp - frame.timestamp))
+        on_frame()
+    low, median, high = np.median(ranges, axis=0).tolist() if ranges else (None, None, None)
+    mean, deviation = np.mean(contrast, axis=0).tolist() if contrast else (None, None)
+    return {
+        "used": used,
+        "not_used": dict(statuses),
+        "reasons": reasons[:MAX_REASONS],
+        "delay": _spread(delays),
+        "image": {"mean": mean, "standard_deviation": deviation},
+        "depth": {
+            **{"near_m": low, "median_m": median, "far_m": high},
+            "coverage": float(np.mean(coverages)) if coverages else None,
+        },
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
+
+
+def _times(stamps: np.ndarray) -> Facts:
+    intervals = np.diff(stamps)
+    interval = float(np.median(intervals)) if intervals.size else 0.0
+    gaps = intervals[intervals > MAX_INTERVAL_RATIO * interval] if interval > 0 else intervals[:0]
+    return {
+        "first_timestamp": float(stamps[0]),
+        "duration_s": float(stamps[-1] - stamps[0]),
+        "rate_hz": 1 / interval if interval > 0 else None,
+        "gaps": len(gaps),
+        "longest_gap_s": float(gaps.max(initial=0.0)),
+    }
+
+
+def _camera(camera: Camera) -> Facts:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(camera).items()}
+
+
+def _recorded(sequence: Sequence) -> Facts | None:
+    """The cameras as they record, where the sequence tells."""
+    calibration = getattr(sequence, "calibration", None)
+    if calibration is None:
+        return None
+    facts: Facts = {"color": _camera(calibration.color)}
+    if calibration.depth is not None:
+        facts |= {"depth": _camera(calibration.depth), "colour_T_depth": calibration.color_T_depth.tolist()}
+    return facts
+
+
+def _truth(sequence: Sequence, stamps: np.ndarray) -> Facts | None:
+    truth = sequence.ground_truth
+    if truth is None:
+        return None
+    _, valid = truth.interpolate(stamps)
+    steps = np.diff(truth.world_T_camera[:, :3, 3], axis=0)
+    return {
+        "poses": len(truth),
+        "duration_s": float(np.ptp(truth.timestamps)),
+        "path_m": float(np.linalg.norm(steps, axis=1).sum()),
+        "frames_covered": int(np.count_nonzero(valid)),
+    }

@@ -1,0 +1,123 @@
+"""Ctrl-C, at any moment of the command: one line on standard error, and exit status 130.
+
+While modules are imported the process ends where it stands (`early`). From then on Ctrl-C is a KeyboardInterrupt, as in
+any program, with two additions. Where Python would drop it (in a finaliser, or a callback of the garbage collector) it
+is raised once more, and a compiler that cannot be interrupted is not waited for.
+
+Only the command does so: in other people's programs nothing here is called.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any, TypeVar
+
+from gavo_jax import early
+
+R = TypeVar("R")
+
+AGAIN_AFTER = 0.02
+"""Seconds after which a dropped interrupt is raised again: the callback that dropped it is over by then."""
+
+_came = False
+"""Whether Ctrl-C came."""
+
+
+@contextlib.contextmanager
+def raised() -> Iterator[None]:
+    """Let Ctrl-C be a KeyboardInterrupt while the block runs; after it the command ends in peace."""
+    before = signal.getsignal(signal.SIGINT)
+    is_ours = before is early.end
+    if threading.current_thread() is not threading.main_thread() or not (
+        is_ours or before is signal.default_int_handler
+    ):
+        yield
+        return
+    global _came
+    _came = False
+    hook = sys.unraisablehook
+
+    def raise_again(dropped: Any) -> None:
+        if dropped.exc_type is not KeyboardInterrupt:
+            hook(dropped)
+            return
+        timer = threading.Timer(AGAIN_AFTER, _send_again)
+        timer.daemon = True
+        timer.start()
+
+    sys.unraisablehook = raise_again
+    signal.signal(signal.SIGINT, _raise)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN if is_ours else before)
+        sys.unraisablehook = hook
+
+
+def leave(status: int) -> None:
+    """End the process if it is the command's and Ctrl-C came: at once, as threads of compilers may still be at work.
+
+    The interpreter would wait for them, or take the ground from under their feet.
+    """
+    if early.is_ours and _came:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
+
+
+def came() -> bool:
+    """Whether Ctrl-C came in the last `raised` block."""
+    return _came
+
+
+def ignore() -> None:
+    """Take no notice of Ctrl-C any more in a `raised` block: it came, and what is left to do is short."""
+    if signal.getsignal(signal.SIGINT) is _raise:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def interruptible(work: Callable[[], R]) -> R:
+    """Return what a function returns that is busy in compiled code for long; Ctrl-C does not wait for its end.
+
+    It runs in a thread of its own in a `raised` block, and as any call elsewhere.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C. The function goes on as long as the process does: it must write nothing but what is
+            written whole.
+    """
+    if signal.getsignal(signal.SIGINT) is not _raise or threading.current_thread() is not threading.main_thread():
+        return work()
+    results: list[R] = []
+    faults: list[BaseException] = []
+
+    def do() -> None:
+        try:
+            results.append(work())
+        except BaseException as fault:
+            faults.append(fault)
+
+    thread = threading.Thread(target=do, daemon=True)
+    thread.start()
+    thread.join()
+    if faults:
+        raise faults[0]
+    return results[0]
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    global _came
+    _came = True
+    raise KeyboardInterrupt
+
+
+def _send_again() -> None:
+    """Send the signal again, to the main thread, which it wakes where it waits."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)

@@ -1,0 +1,119 @@
+"""Whether a motion fits the run so far: what a camera can do, and how well its frames matched until now.
+
+A frame that doesn't belong to its time stamp can match its reference perfectly. What gives it away is the motion: it
+starts and stops as no camera does. And a match that is far worse than the run's usual one is wrong, or its depth is,
+even where it would pass for a pair by itself.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.se3 import log
+from gavo_jax.status import AlignmentStatus, as_findings, gravest
+
+REMEMBERED = 15
+"""Pairs whose median says what is usual."""
+MIN_REMEMBERED = 3
+"""Pairs that have to be known before one can be unusual."""
+MAX_ACCELERATION = (15.0, 28.0)
+"""m/s² and rad/s²: over two frames of a hand-held camera the truth of the TUM clips reaches 3 and 21
+(`benchmarks/acceleration.py`); a car brakes by 10.
+"""
+MAX_SPEED = (5.0, 12.0)
+"""m/s and rad/s: images of a faster camera are smeared."""
+STAMP_JITTER = 0.02
+"""Seconds that two stamps may be off against each other; a moving camera then seems faster or slower, on its way."""
+TOLERANCE = (0.015, 0.01)
+"""Metres and radians that an estimate may be off by itself."""
+MAX_ERROR_RATIO = 6.0
+"""E over its usual value, above which a pair is `HIGH_ERROR`; a motion larger than usual may have
+as much larger an error."""
+SCENE_DISTANCE = 1.5
+"""Metres at which a translation moves the image as a rotation by so many radians does."""
+SMALLEST_SHIFT = 0.005
+"""Radians that the image moves by at least: the error of a camera at rest is the sensor's noise alone."""
+MIN_DEPTH_RATIO = 0.65
+"""Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`; likewise."""
+
+
+class Usual(NamedTuple):
+    """Figures of the last good pairs; not-a-number where there were none yet."""
+
+    errors: Float[Array, " n"]
+    """E over the image's squared contrast, as it grows with the camera's gain."""
+    shifts: Float[Array, " n"]
+    """How far the image moved, radians."""
+    explained_depths: Float[Array, " n"]
+
+    @classmethod
+    def unknown(cls) -> "Usual":
+        """Before the first pair."""
+        return cls(*(jnp.full(REMEMBERED, jnp.nan, jnp.float32) for _ in cls._fields))
+
+    def after(self, result: Alignment, contrast: Float[Array, ""]) -> "Usual":
+        """With one more pair."""
+        figures = (result.error / contrast**2, _shift(result), result.explained.depth)
+        return Usual(*(jnp.append(old[1:], new) for old, new in zip(self, figures, strict=True)))
+
+
+def judge_by_history(
+    result: Alignment,
+    usual: Usual,
+    contrast: Float[Array, ""],
+    predicted: Float[Array, " 6"],
+    elapsed: Float[Array, ""],
+    last_elapsed: Float[Array, ""],
+) -> Alignment:
+    """The result with what the run so far says against it among its findings.
+
+    Args:
+        result: Of the new frame.
+        usual: Of the pairs before.
+        contrast: Of the new image, grey levels.
+        predicted: Twist of the motion if the camera had gone on as before.
+        elapsed: Since the reference, seconds.
+        last_elapsed: The time that the motion before took; a second where there was none.
+    """
+    motion = result.target_T_reference
+    change = _change(log(motion), predicted, STAMP_JITTER / elapsed)
+    possible = jnp.array(MAX_ACCELERATION) * elapsed * 0.5 * (elapsed + last_elapsed)
+    reachable = jnp.array(MAX_SPEED) * elapsed
+    tolerance = jnp.array(TOLERANCE)
+    implausible = jnp.any(change > possible + tolerance) | jnp.any(_lengths(log(motion)) > reachable + tolerance)
+    larger = jnp.maximum(_shift(result) / jnp.maximum(_usual(usual.shifts), SMALLEST_SHIFT), 1.0)
+    error, explained_depth = result.error / contrast**2 / larger, result.explained.depth * larger
+    findings = result.findings | as_findings(
+        {
+            AlignmentStatus.IMPLAUSIBLE_MOTION: implausible,
+            AlignmentStatus.HIGH_ERROR: error > MAX_ERROR_RATIO * _usual(usual.errors),
+            AlignmentStatus.DEPTH_MISMATCH: explained_depth < MIN_DEPTH_RATIO * _usual(usual.explained_depths),
+        }
+    )
+    return result._replace(findings=findings, status=gravest(findings))
+
+
+def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, " 2"]:
+    """How far translation and rotation are from what was predicted, which may take that share more or less of time."""
+    moved, expected = twist.reshape(2, 3), predicted.reshape(2, 3)
+    along = jnp.sum(moved * expected, axis=1) / jnp.maximum(jnp.sum(expected**2, axis=1), 1e-12)
+    stretched = jnp.clip(along, 1.0 - share, 1.0 + share)[:, None] * expected
+    return jnp.linalg.norm(moved - stretched, axis=1)
+
+
+def _shift(result: Alignment) -> Float[Array, ""]:
+    """How far a motion moves the image, about, in radians."""
+    translation, rotation = _lengths(log(result.target_T_reference))
+    return rotation + translation / SCENE_DISTANCE
+
+
+def _lengths(twist: Float[Array, " 6"]) -> Float[Array, " 2"]:
+    """Of the translation and of the rotation."""
+    return jnp.linalg.norm(twist.reshape(2, 3), axis=1)
+
+
+def _usual(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Median of what is remembered; not-a-number, of which no comparison holds, where that is too little."""
+    return jnp.where(jnp.sum(jnp.isfinite(values)) >= MIN_REMEMBERED, jnp.nanmedian(values), jnp.nan)

@@ -1,0 +1,38 @@
+"""Whether the images that a run has seen are still the same when it goes on."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+TAIL = 64
+"""Bytes at a file's end. In a PNG they hold the checksum of all pixels, so that nothing else has to be read."""
+
+
+class SeenImages:
+    """A digest of images, frame after frame.
+
+    Args:
+        files: Of each frame, in their order; none where frames do not come from files.
+    """
+
+    def __init__(self, files: Sequence[Sequence[Path]] = ()) -> None:
+        self._files, self._count, self._sha256 = files, 0, hashlib.sha256()
+
+    def up_to(self, index: int) -> str:
+        """Take the frames in up to that one, and return the digest of all so far."""
+        for paths in self._files[self._count : index + 1]:
+            for path in paths:
+                self._sha256.update(_fingerprint(path))
+        self._count = max(self._count, index + 1)
+        return self._sha256.hexdigest()
+
+
+def _fingerprint(path: Path) -> bytes:
+    """Size and end of a file; of one that cannot be read, that it cannot."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(max(size - TAIL, 0))
+            return hashlib.sha256(size.to_bytes(8) + file.read(TAIL)).digest()
+    except OSError:
+        return bytes(32)

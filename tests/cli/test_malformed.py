@@ -1,0 +1,291 @@
+"""Malformed sources, one after the other: status 2 and one line with the file, what was found and what would help."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from command import runner
+from layouts import CAMERA, GREYS, LAYOUTS, METRES, image, raw
+from recordings import COLOR, DEPTH, Recorder, Shot, record
+
+SHOTS = [
+    Shot(1 + i / 30, np.dstack([grey] * 3), raw(metres, 1000))
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True))
+]
+
+
+def write(name: str, content: str | bytes) -> Callable[[Path], object]:
+    return lambda clip: (clip / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def edit(name: str, old: str, new: str) -> Callable[[Path], object]:
+    def change(clip: Path) -> None:
+        text = (clip / name).read_text()
+        assert old in text
+        (clip / name).write_text(text.replace(old, new))
+
+    return change
+
+
+def cut(name: str, keep: float) -> Callable[[Path], object]:
+    def change(clip: Path) -> None:
+        data = (clip / name).read_bytes()
+        (clip / name).write_bytes(data[: int(len(data) * keep)])
+
+    return change
+
+
+def remove(name: str) -> Callable[[Path], object]:
+    return lambda clip: shutil.rmtree(clip / name) if (clip / name).is_dir() else (clip / name).unlink()
+
+
+def pixels(name: str, array: np.ndarray) -> Callable[[Path], object]:
+    return lambda clip: image(clip / name, array)
+
+
+def encoded(ending: str, array: np.ndarray) -> bytes:
+    return cv2.imencode(ending, array)[1].tobytes()
+
+
+SMALL = np.zeros((60, 80), np.uint8)
+FIRST = "0.000000.png"
+FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
+    "tum: no depth list": ("tum", remove("depth.txt"), ["depth.txt", "no such file"]),
+    "tum: a list of prose": ("tum", write("rgb.txt", "this is no list\n"), ["rgb.txt:1", "expected `timestamp path`"]),
+    "tum: a stamp of text": (
+        "tum",
+        edit("rgb.txt", "0.000000 rgb", "noon rgb"),
+        ["rgb.txt:2", "not a time stamp", "noon"],
+    ),
+    "tum: an empty list": ("tum", write("depth.txt", "# nothing\n"), ["depth.txt", "lists no images"]),
+    "tum: a binary list": ("tum", write("rgb.txt", b"\x89PNG\xff\xfe"), ["rgb.txt", "not a text file"]),
+    "tum: stamps of another day": (
+        "tum",
+        edit("depth.txt", "\n0.", "\n99990."),
+        ["rgb.txt and depth.txt", "within 0.02 s"],
+    ),
+    "tum: a path out of it": (
+        "tum",
+        edit("rgb.txt", "rgb/0.0", "../../0.0"),
+        ["rgb.txt:2", "leaves the sequence's folder"],
+    ),
+    "tum: a missing image": ("tum", remove(f"rgb/{FIRST}"), [FIRST, "missing", "restore"]),
+    "tum: truth of prose": ("tum", write("groundtruth.txt", "x y z\n"), ["groundtruth.txt:1"]),
+    "tum: no camera": ("tum", remove("camera.toml"), ["clip", "no camera known", "--camera"]),
+    "tum: half a camera": ("tum", write("camera.toml", "fx = 131\n"), ["camera.toml", "fy: missing"]),
+    "tum: a camera of text": (
+        "tum",
+        edit("camera.toml", "fx = 131.0", "fx = 'long'"),
+        ["camera.toml: fx", "must be a number"],
+    ),
+    "tum: a camera of another size": (
+        "tum",
+        edit("camera.toml", "160", "320"),
+        [FIRST, "160x120", "320x120", "--camera"],
+    ),
+    "tum: associations of three": (
+        "associations",
+        write("associations.txt", "0 a 0\n"),
+        ["associations.txt:1", "expected"],
+    ),
+    "image: empty": ("tum", write(f"rgb/{FIRST}", b""), [FIRST, "empty file"]),
+    "image: torn PNG": ("tum", cut(f"rgb/{FIRST}", 0.5), [FIRST, "torn PNG", "anew"]),
+    "image: text": ("tum", write(f"rgb/{FIRST}", "hello"), [FIRST, "no image", "hello"]),
+    "image: torn JPEG": ("scannet", cut("color/0.jpg", 0.5), ["color/0.jpg", "torn or damaged", "anew"]),
+    "image: torn JPEG, deep": ("replica", cut("results/frame000000.jpg", 0.9), ["frame000000.jpg", "torn or damaged"]),
+    "image: another size": ("plain", pixels("rgb/0.png", SMALL), ["rgb/0.png", "80x60", "160x120", "--camera"]),
+    "image: of floats": (
+        "tum",
+        write(f"rgb/{FIRST}", encoded(".tiff", METRES[0].astype(np.float32))),
+        [FIRST, "8 or 16 bits"],
+    ),
+    "depth: of 8 bits": ("tum", pixels(f"depth/{FIRST}", GREYS[0]), [FIRST, "not a depth image", "16 bits", "8 bits"]),
+    "depth: colour": (
+        "tum",
+        pixels(f"depth/{FIRST}", np.dstack([GREYS[0]] * 3)),
+        [FIRST, "not a depth image", "3 channels"],
+    ),
+    "depth: a JPEG": ("tum", write(f"depth/{FIRST}", encoded(".jpg", GREYS[0])), [FIRST, "not a depth image"]),
+    "depth: torn TIFF": ("plain", cut("depth/0.tiff", 0.5), ["depth/0.tiff", "torn or damaged"]),
+    "depth: torn array": ("one_folder", cut("depth_000.npy", 0.5), ["depth_000.npy", "not a NumPy array"]),
+    "depth: array of text": (
+        "one_folder",
+        lambda clip: np.save(clip / "depth_000.npy", np.array([["a"]])),
+        ["depth_000.npy", "not an image", "<U1"],
+    ),
+    "depth: another size": (
+        "plain",
+        pixels("depth/0.tiff", METRES[0][:60, :80].astype(np.float32)),
+        ["depth/0.tiff", "80x60", "160x120", "[depth]", "colour_T_depth"],
+    ),
+    "depth: OpenEXR, torn": (
+        "tum",
+        lambda clip: (clip / f"depth/{FIRST}").write_bytes(b"\x76\x2f\x31\x01" + bytes(60)),
+        [FIRST, "OpenEXR"],
+    ),
+    "depth: inches": (
+        "plain",
+        lambda clip: [image(clip / f"depth/{i}.tiff", (METRES[i] * 1e7).astype(np.float32)) for i in range(4)],
+        ["depth/0.tiff", "neither metres nor millimetres", "--depth-scale"],
+    ),
+    "7-scenes: no depth": (
+        "seven_scenes",
+        lambda clip: [file.unlink() for file in clip.glob("*.depth.png")],
+        ["clip", "a folder of", "not one of"],
+    ),
+    "7-scenes: a pose of prose": (
+        "seven_scenes",
+        write("frame-000002.pose.txt", "up"),
+        ["000002.pose.txt", "four rows"],
+    ),
+    "7-scenes: a skewed pose": (
+        "seven_scenes",
+        lambda clip: np.savetxt(clip / "frame-000002.pose.txt", 3 * np.eye(4)),
+        ["000002.pose.txt", "no rotation"],
+    ),
+    "7-scenes: intrinsics of prose": (
+        "seven_scenes",
+        write("camera-intrinsics.txt", "wide"),
+        ["camera-intrinsics.txt", "3x3"],
+    ),
+    "scannet: no common numbers": (
+        "scannet",
+        lambda clip: [file.rename(file.with_name(f"8{file.name}")) for file in list((clip / "depth").iterdir())],
+        ["clip", "4 colour and 4 depth images", "same number"],
+    ),
+    "scannet: intrinsics of zeros": (
+        "scannet",
+        lambda clip: np.savetxt(clip / "intrinsic/intrinsic_color.txt", np.zeros((4, 4))),
+        ["intrinsic_color.txt: fx", "from 1"],
+    ),
+    "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
+    "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
+    "replica: a list for a camera": (
+        "replica",
+        write("cam_params.json", '{"camera": {"w": 3}}'),
+        ["cam_params.json", "Replica"],
+    ),
+    "open3d: torn intrinsics": ("open3d", cut("camera_intrinsic.json", 0.5), ["camera_intrinsic.json", "not JSON"]),
+    "open3d: short matrix": (
+        "open3d",
+        write("camera_intrinsic.json", json.dumps({"width": 160, "height": 120, "intrinsic_matrix": [1, 2]})),
+        ["camera_intrinsic.json", "Open3D"],
+    ),
+    "plain: no camera": ("plain", remove("camera.yaml"), ["clip", "no camera file", "no camera known", "--camera"]),
+    "plain: YAML that is none": ("plain", write("camera.yaml", "fx: [1, 2"), ["camera.yaml", "not YAML"]),
+    "plain: stamps that never meet": (
+        "plain",
+        lambda clip: [
+            file.rename(file.with_name(f"{day}0.{file.stem}5{file.suffix}"))
+            for day, part in ((1, "rgb"), (2, "depth"))
+            for file in list((clip / part).iterdir())
+        ],
+        ["clip", "within 0.02 s", "--rate"],
+    ),
+    "plain: only colour": ("plain", remove("depth"), ["clip", "a folder of", "not one of"]),
+    "nothing at all": (
+        "plain",
+        lambda clip: [remove(n)(clip) for n in ("rgb", "depth", "camera.yaml")],
+        ["an empty folder"],
+    ),
+    "one frame": ("plain", lambda clip: [remove(f"rgb/{i}.png")(clip) for i in (1, 2, 3)], ["clip", "at least 2"]),
+}
+
+
+def torn_bag(path: Path) -> Path:
+    found = record(path / "x", "ros1", "raw", SHOTS, CAMERA)
+    cut("x.bag", 0.4)(path)
+    return found
+
+
+def no_images(path: Path) -> Path:
+    recorder = Recorder(path / "x.bag", "ros1")
+    recorder.info("/camera_info", 1.0, CAMERA)
+    recorder.close()
+    return path / "x.bag"
+
+
+def two_colours(path: Path) -> Path:
+    recorder = Recorder(path / "x", "mcap")
+    for topic in ("/left", "/right"):
+        recorder.image(topic, 1.0, GREYS[0], "mono8")
+    recorder.image("/depth", 1.0, SHOTS[0].depth, "16UC1")
+    recorder.close()
+    return path / "x"
+
+
+def odd_encoding(path: Path) -> Path:
+    recorder = Recorder(path / "x", "sqlite")
+    for stamp in (1.0, 1.1):
+        recorder.info("/camera/color/camera_info", stamp, CAMERA)
+        recorder.image(COLOR, stamp, SHOTS[0].bgr, "nv24")
+        recorder.image(DEPTH, stamp, SHOTS[0].depth, "16UC1")
+    recorder.close()
+    return path / "x"
+
+
+def no_metadata(path: Path) -> Path:
+    (path / "x").mkdir()
+    (path / "x" / "metadata.yaml").write_text("hello: there\n")
+    return path / "x"
+
+
+def file_of(name: str, content: bytes) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        (path / name).write_bytes(content)
+        return path / name
+
+    return make
+
+
+OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
+    "nowhere": (lambda path: path / "nowhere", ["nowhere", "no such folder or file", "synthetic"]),
+    "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
+    "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a file of 100 bytes", "not one of"]),
+    "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
+    "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),
+    "bag: torn": (torn_bag, ["x.bag"]),
+    "bag: no images": (no_images, ["x.bag", "no colour images", "--colour-topic"]),
+    "mcap: text": (file_of("x.mcap", b"hello"), ["x.mcap", "not a bag"]),
+    "db3: text": (file_of("x.db3", b"hello" * 300), ["x.db3", "not a bag"]),
+    "mcap: several colours": (two_colours, ["/left, /right", "--colour-topic"]),
+    "mcap: no camera": (lambda path: record(path / "x", "mcap", "raw", SHOTS, None), ["no camera_info", "--camera"]),
+    "sqlite: odd encoding": (odd_encoding, [COLOR, "nv24"]),
+    "ros 2: metadata of something else": (no_metadata, ["x", "not a bag"]),
+}
+
+
+def test_there_are_at_least_forty():
+    assert len(FOLDERS) + len(OTHERS) >= 40
+
+
+def refuse(capsys: pytest.CaptureFixture[str], source: Path, words: list[str]) -> None:
+    for command in ("run", "inspect"):
+        done = runner(capsys)(command, source)
+        assert done.status == 2 and not done.out, done
+        assert done.err.startswith("gavo: ") and done.err.count("\n") == 1 and len(done.err) < 700, done.err
+        assert all(word in done.err for word in words), done.err
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_malformed_folder(capfd, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    layout, damage, words = FOLDERS[name]
+    clip = tmp_path / "clip"
+    clip.mkdir() if layout != "tum" else None
+    LAYOUTS[layout][1](clip)
+    damage(clip)
+    refuse(capfd, clip, [str(clip), *words])
+    assert [path.name for path in tmp_path.iterdir()] == ["clip"]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_another_malformed_source(capfd, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    make, words = OTHERS[name]
+    refuse(capfd, make(tmp_path), [str(tmp_path), *words])
+    assert not (tmp_path / "runs").exists()

@@ -1,0 +1,94 @@
+"""Names of files and sequences are other people's words: whatever they are, they do not command the terminal."""
+
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command import runner
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+
+EVIL = "cl\x1b]0;gotcha\x07\x1b[31m\x9bip [b] {task} %s $\\frac$\n"
+
+
+@pytest.fixture
+def gavo(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_tum(SyntheticSequence(frames=40, camera=Camera(65.5, 65.5, 39.5, 29.5, 80, 60)), tmp_path / EVIL)
+    (Path(EVIL) / "camera.toml").rename("camera.toml")
+    return runner(capsys)
+
+
+EXPERIMENT = """
+[[sequences]]
+path = "cl*"
+camera = "camera.toml"
+[[methods]]
+name = "opencv-rgb"
+[[methods]]
+name = "opencv-rgbd"
+"""
+RUN = ("run", EVIL, "--camera", "camera.toml", "--method", "gauss-newton", "--frames", "34", "--output", "run" + EVIL)
+COMMANDS = {
+    "run": (0, RUN),
+    "nothing to resume": (0, (*RUN, "--resume")),
+    "evaluate": (0, ("evaluate", f"{EVIL}/groundtruth.txt", f"{EVIL}/groundtruth.txt")),
+    "compare": (
+        0,
+        ("compare", EVIL, "--camera", "camera.toml", "--methods", "opencv-rgb", "--output", "compare" + EVIL),
+    ),
+    "experiment": (0, ("experiment", "e.toml", "--output", "table" + EVIL)),
+    "markdown": (0, ("experiment", "report", "table" + EVIL, "--markdown")),
+    "unknown method": (2, ("run", "--method", EVIL)),
+    "unknown option": (2, ("run", EVIL, f"--{EVIL}")),
+    "no number": (2, ("run", "--frames", EVIL)),
+    "no camera": (2, ("run", EVIL, "--camera", EVIL)),
+    "no file": (2, ("evaluate", EVIL + "x", EVIL)),
+    "setting": (2, ("run", "--set", EVIL)),
+    "download": (2, ("download", EVIL)),
+    "no settings": (2, ("run", "--settings", EVIL)),
+    "tune": (2, ("tune", EVIL)),
+}
+
+
+def test_no_name_commands_the_terminal(gavo):
+    Path("e.toml").write_text(EXPERIMENT)
+    for name, (status, words) in COMMANDS.items():
+        done = gavo(*words)
+        assert done.status == status, (name, done.err)
+        for line in (done.out + done.err).splitlines():
+            assert line.isprintable(), (name, line)
+        assert status == 0 or done.err.count("\n") == 1, (name, done.err)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a terminal")
+def test_on_a_terminal_too(gavo, tmp_path):
+    """Where colours and bars are drawn: these are the only commands."""
+    for words, status in ((RUN, 0), (("download", EVIL, "--to", "data"), 2)):
+        mine, its = pty.openpty()
+        process = subprocess.Popen([sys.executable, "-m", "gavo_jax", *words], stdout=its, stderr=its, stdin=its)
+        os.close(its)
+        printed = b""
+        try:
+            while data := os.read(mine, 65536):
+                printed += data
+        except OSError:  # the other end is closed
+            pass
+        assert process.wait() == status, printed
+        assert b"gotcha" in printed and b"Traceback" not in printed
+        for evil in (b"\x1b]", b"\x07", b"\x1b[31m\xc2\x9b", b"\xc2\x9b"):
+            assert evil not in printed
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "cp1252", "utf-16"])
+@pytest.mark.parametrize("words", ["--help", "run --help", "experiment --help", "evaluate nöwhere nöwhere"])
+def test_any_encoding_of_the_screen(encoding, words):
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    command = [sys.executable, "-m", "gavo_jax", *words.split()]
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert done.returncode == (0 if "--help" in words else 2)
+    assert "Traceback" not in done.stderr.decode(encoding)

@@ -1,0 +1,332 @@
+"""Recordings of ROS 1 and ROS 2, raw and compressed: the frames that were recorded, whatever the order of asking."""
+
+import gc
+import os
+import sys
+import threading
+import tracemalloc
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from layouts import CAMERA, GREYS, METRES
+from recordings import COLOR, DEPTH, KINDS, STYLES, Recorder, Shot, record
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets import bags as bags_module
+from gavo_jax.datasets.bags import BagSequence
+from gavo_jax.datasets.base import FrameError
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.messages import LAYOUTS, color_of, depth_of
+from gavo_jax.datasets.registry import open_source
+from gavo_jax.errors import GavoError
+
+MILLIMETRES = [np.round(metres * 1000).astype(np.uint16) for metres in METRES]
+STAMPS = [1305031102.175304 + i / 30 for i in range(4)]
+LENS = replace(CAMERA, distortion=(0.05, -0.1, 0.001, 0.0, 0.02))
+BGRS = [cv2.applyColorMap(grey, cv2.COLORMAP_BONE) for grey in GREYS]
+
+
+def shots(depths: list[np.ndarray] = MILLIMETRES, delay: float = 0.004) -> list[Shot]:
+    return [Shot(*parts, parts[0] + delay) for parts in zip(STAMPS, BGRS, depths, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory) -> dict[tuple[str, str, str], Path]:
+    """Every kind, style and type of depth."""
+    folder = tmp_path_factory.mktemp("bags")
+    floats = [metres.astype(np.float32) for metres in METRES]
+    return {
+        (kind, style, name): record(folder / f"{kind}_{style}_{name}", kind, style, shots(depths), CAMERA)
+        for kind in KINDS
+        for style in STYLES
+        for name, depths in (("u16", MILLIMETRES), ("f32", floats))
+    }
+
+
+@pytest.mark.parametrize("name", ["u16", "f32"])
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_come_as_recorded(bags, kind, style, name):
+    sequence = open_source(bags[kind, style, name], Reading(color=True))
+    sequence.check()
+    assert isinstance(sequence, BagSequence) and len(sequence) == 4 and sequence.left_out == []
+    np.testing.assert_allclose(sequence.timestamps, STAMPS, atol=1e-6)
+    expected = replace(CAMERA, depth_scale=5000.0 if name == "f32" else 1000.0)
+    assert sequence.camera == expected and sequence.calibration.origin.endswith("/camera_info")
+    for i, frame in enumerate(sequence):
+        assert frame.depth_timestamp == pytest.approx(STAMPS[i] + 0.004, abs=1e-6) and frame.color is not None
+        assert np.abs(frame.color[..., ::-1].astype(int) - BGRS[i]).mean() < (3 if style == "jpeg" else 0.01)
+        tolerance = 0.0006 if style == "raw" or name == "u16" else 0.004
+        assert np.abs(frame.depth / sequence.camera.depth_scale - METRES[i]).max() < tolerance
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_can_be_asked_for_in_any_order_and_from_any_thread(bags, kind):
+    sequence = open_source(bags[kind, "raw", "u16"])
+    depths = [frame.depth for frame in sequence]
+    for index in (2, 0, 3, 3, 1, -1, 0):
+        np.testing.assert_array_equal(sequence[index].depth, depths[index])
+    np.testing.assert_array_equal(sequence[1:4:2][1].depth, depths[3])
+    with pytest.raises(IndexError):
+        sequence[4]
+    found = []
+    threads = [threading.Thread(target=lambda i=i: found.append((i, sequence[i].depth))) for i in (3, 1, 2, 0)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 4 and all(np.array_equal(depth, depths[i]) for i, depth in found)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_far_frames_are_gone_to(tmp_path, kind):
+    """Messages that come in the order of their arrival, not of their stamps, and frames far from one another."""
+    recorder = Recorder(tmp_path / ("x.bag" if kind == "ros1" else "x"), kind)
+    recorder.info("/camera/color/camera_info", 0.5, CAMERA)
+    for i in range(300):
+        pixels = np.full((120, 160), i, np.uint16)
+        for at, (topic, encoding) in enumerate(((COLOR, "mono16"), (DEPTH, "16UC1"))):
+            late = 1.0 + i / 30 + (0.1 if i % 7 == at else 0.0)
+            recorder.image(topic, 1.0 + i / 30, pixels, encoding, late)
+    recorder.close()
+    sequence = open_source(recorder.writer.path)
+    assert len(sequence) == 300
+    for index in (0, 1, 250, 251, 3, 299, 7, 8, 9, 150):
+        assert np.all(sequence[index].depth == index)
+    for index in range(0, 300, 40):
+        assert np.all(sequence[::40][index // 40].depth == index)
+
+
+def test_a_single_file_of_ros_2_will_do(bags):
+    for kind, ending in (("mcap", ".mcap"), ("sqlite", ".db3")):
+        file = next(bags[kind, "raw", "u16"].glob(f"*{ending}"))
+        assert len(open_source(file)) == 4
+
+
+def test_the_lens_is_the_recordings(tmp_path):
+    path = record(tmp_path / "lens", "mcap", "raw", shots(), LENS)
+    sequence = open_source(path)
+    assert isinstance(sequence, BagSequence) and sequence.calibration.color.distortion == LENS.distortion
+    assert not sequence.camera.is_distorted and (sequence[0].depth == 0).mean() > 0.02
+    assert open_source(path, Reading(undistort=False)).camera.distortion == LENS.distortion
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(1000.0, 1000.0), (5000.0, 5000.0)])
+def test_a_presets_scale_is_that_of_its_files(tmp_path, scale, expected):
+    """Messages have millimetres, by convention; the images of a benchmark that were recorded as they are look so."""
+    big = Camera.preset("fr3")
+    step = 2.85e-3
+    metres = np.tile(1 / (np.round(1 / np.geomspace(0.8, 3.0, 640) / step) * step), (480, 1))
+    depth, color = np.round(metres * scale).astype(np.uint16), np.zeros((480, 640, 3), np.uint8)
+    path = record(tmp_path / "kinect", "ros1", "compressed", [Shot(t, color, depth) for t in (1.0, 1.1)], None)
+    assert open_source(path, Reading(camera="fr3")).camera == replace(big, depth_scale=expected)
+    assert open_source(path, Reading(camera="fr3", depth_scale=2000.0)).camera.depth_scale == 2000
+
+
+def test_topics_are_found_by_type_or_named(tmp_path):
+    recorder = Recorder(tmp_path / "many", "mcap")
+    for stamp in (1.0, 1.1):
+        for name in ("color", "infra1", "infra2"):
+            recorder.image(f"/cam/{name}/image_rect_raw", stamp, GREYS[0], "mono8")
+            recorder.info(f"/cam/{name}/camera_info", stamp, LENS)
+        for name in ("depth", "aligned_depth_to_color"):
+            recorder.image(f"/cam/{name}/image_rect_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/cam/depth/camera_info", stamp, replace(CAMERA, fx=150.0), frame="depth_optical")
+    recorder.close()
+    sequence = open_source(tmp_path / "many")
+    assert isinstance(sequence, BagSequence) and not sequence.calibration.color.is_distorted, "images are rectified"
+    reading = Reading(color_topic="/cam/infra1/image_rect_raw")
+    assert isinstance(other := open_source(tmp_path / "many", reading), BagSequence)
+    assert other.calibration.origin == "/cam/infra1/camera_info"
+    with pytest.raises(GavoError, match=r"another camera than .*/tf_static.*--camera with a file of both"):
+        open_source(tmp_path / "many", Reading(depth_topic="/cam/depth/image_rect_raw"))
+    with pytest.raises(GavoError, match=r"--depth-topic: no images on '/nowhere': those are on /cam/aligned"):
+        open_source(tmp_path / "many", Reading(depth_topic="/nowhere"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_path, kind):
+    """Colour and depth hang on one link, turned and shifted; the chain between them is followed."""
+    recorder = Recorder(tmp_path / ("rig.bag" if kind == "ros1" else "rig"), kind)
+    small = replace(CAMERA, fx=65.0, fy=66.0, cx=39.0, cy=30.0, width=80, height=60)
+    for stamp in (1.0, 1.1):
+        recorder.image("/cam/color/image_raw", stamp, GREYS[0], "mono8")
+        recorder.info("/cam/color/camera_info", stamp, CAMERA, frame="color_optical")
+        recorder.image("/cam/depth/image_raw", stamp, np.full((60, 80), 2000, np.uint16), "16UC1")
+        recorder.info("/cam/depth/camera_info", stamp, small, frame="depth_optical")
+    path = recorder.writer.path
+    recorder.fixed(1.0, {("link", "depth_optical"): ([0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0])})
+    recorder.fixed(1.0, {("/link", "color_optical"): ([0.03, 0.01, 0.0], [0.0, 0.0, np.sin(0.1), np.cos(0.1)])})
+    recorder.close()
+    sequence = open_source(path)
+    assert isinstance(sequence, BagSequence) and sequence.calibration.color_T_depth is not None
+    link_T_color = np.eye(4)
+    link_T_color[:2, :2] = [[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]
+    link_T_color[:3, 3] = 0.03, 0.01, 0.0
+    link_T_depth = np.eye(4)
+    link_T_depth[2, 3] = 0.1
+    np.testing.assert_allclose(
+        sequence.calibration.color_T_depth, np.linalg.inv(link_T_color) @ link_T_depth, atol=1e-9
+    )
+    depth = sequence[0].depth
+    assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
+
+
+def test_what_a_recording_lacks_is_said(tmp_path):
+    recorder = Recorder(tmp_path / "two", "sqlite")
+    recorder.image("/left", 1.0, GREYS[0], "mono8")
+    recorder.image("/right", 1.0, GREYS[0], "mono8")
+    recorder.image("/z", 9.0, MILLIMETRES[0], "16UC1")
+    recorder.close()
+    for reading, fault in (
+        (Reading(), "colour images on /left, /right; there are images on /left, /right, /z: say --colour-topic"),
+        (Reading(color_topic="/left"), "no stamps of /left and /z within 0.02 s"),
+        (Reading(color_topic="/left", max_difference=10.0), "no camera_info for /left: say --camera"),
+    ):
+        with pytest.raises(GavoError) as caught:
+            open_source(tmp_path / "two", reading)
+        assert fault in str(caught.value) and str(tmp_path / "two") in str(caught.value)
+    recorder = Recorder(tmp_path / "none.bag", "ros1")
+    recorder.info("/camera_info", 1.0, CAMERA)
+    recorder.close()
+    with pytest.raises(GavoError, match=r"none\.bag: no colour images; there are images on no topic"):
+        open_source(tmp_path / "none.bag")
+
+
+def test_messages_without_partners_are_counted(tmp_path):
+    some = shots()
+    some[3] = some[3]._replace(depth_stamp=STAMPS[3] + 5)
+    sequence = open_source(record(tmp_path / "gap", "sqlite", "raw", some, CAMERA))
+    assert isinstance(sequence, BagSequence) and len(sequence) == 3
+    assert sequence.left_out == [
+        f"1 of {COLOR}: none of {DEPTH} within 0.02 s",
+        f"1 of {DEPTH}: none of {COLOR} within 0.02 s",
+    ]
+
+
+def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path):
+    recorder = Recorder(tmp_path / "zero", "mcap")
+    for received in (5.0, 5.1):
+        recorder.image(COLOR, 0.0, BGRS[0], "bgr8", received)
+        recorder.image(DEPTH, 0.0, MILLIMETRES[0], "16UC1", received)
+    recorder.close()
+    np.testing.assert_allclose(open_source(tmp_path / "zero", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_torn_or_empty_recording_is_refused_in_one_line(tmp_path, kind):
+    path = record(tmp_path / "torn", kind, "raw", shots(), CAMERA)
+    file = path if path.is_file() else next(path.glob("*.mcap" if kind == "mcap" else "*.db3"))
+    whole = file.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:100], b"", b"hello" * 100):
+        file.write_bytes(content)
+        with pytest.raises(GavoError) as caught:
+            open_source(path).check()
+        assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+    (tmp_path / "metadata.yaml").write_text("hello")
+    with pytest.raises(GavoError):
+        open_source(tmp_path)
+
+
+def test_without_the_library_it_is_said_what_to_install(bags, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(GavoError, match=r"\[bag\]"):
+        open_source(bags["ros1", "raw", "u16"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_does_not_grow_with_the_recording(tmp_path, kind):
+    peaks = []
+    for count in (60, 240):
+        some = [Shot(1 + i / 30, BGRS[i % 4], MILLIMETRES[i % 4]) for i in range(count)]
+        sequence = open_source(record(tmp_path / f"long{count}", kind, "raw", some, CAMERA))
+        assert sequence[0].grey.size
+        tracemalloc.start()
+        assert sum(int(frame.grey[0, 0]) >= 0 for frame in sequence) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.3 * peaks[0]
+
+
+def message(pixels: np.ndarray, encoding: str, **changes: object) -> SimpleNamespace:
+    rows = np.ascontiguousarray(pixels)
+    fields = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.strides[0], "is_bigendian": 0}
+    return SimpleNamespace(encoding=encoding, data=rows.view(np.uint8).ravel(), **{**fields, **changes})
+
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+PLAIN = np.full((8, 12, 3), (30, 90, 200), np.uint8)
+
+
+@pytest.mark.parametrize("encoding", [name for name, layout in LAYOUTS.items() if layout[0] in ("u1", "u2")])
+def test_every_encoding_of_colour_becomes_bgr(encoding):
+    number, channels, _ = LAYOUTS[encoding]
+    blue, green, red = 30, 90, 200
+    order = {"rgb": (red, green, blue), "bgr": (blue, green, red)}.get(encoding[:3], (blue, green, red))
+    if channels >= 3:
+        pixels = np.full((8, 12, channels), (*order, 255)[:channels], np.uint8).astype(number)
+        expected = np.full((8, 12, 3), (blue, green, red))
+    elif encoding.startswith("bayer"):
+        tile = np.array([{"r": red, "g": green, "b": blue}[letter] for letter in encoding[6:10]], np.uint8)
+        pixels, expected = np.tile(tile.reshape(2, 2), (4, 6)), np.full((8, 12, 3), (blue, green, red))
+    elif channels == 2:
+        luma = (90, 128) if "yuy" in encoding else (128, 90)
+        pixels, expected = np.full((8, 12, 2), luma, np.uint8), np.full((8, 12, 3), round(1.164 * (90 - 16)))
+    else:
+        pixels, expected = np.full((8, 12), 77, number), np.full((8, 12, 3), 77)
+    found = color_of(IMAGE, message(pixels, encoding), "x")
+    assert np.abs(found[2:-2, 2:-2].astype(int) - expected[2:-2, 2:-2]).max() <= 2
+
+
+def test_rows_may_be_padded_and_numbers_of_either_end():
+    depth = np.arange(96, dtype=np.uint16).reshape(8, 12) * 300
+    wide = np.zeros((8, 20), np.uint16)
+    wide[:, :12] = depth
+    np.testing.assert_array_equal(depth_of(IMAGE, message(wide, "16UC1", width=12), "x"), depth)
+    short = message(wide, "16UC1", width=12)
+    short.data = short.data[:-16]
+    np.testing.assert_array_equal(depth_of(IMAGE, short, "x"), depth)
+    swapped = message(depth.byteswap(), "16UC1", is_bigendian=1)
+    np.testing.assert_array_equal(depth_of(IMAGE, swapped, "x"), depth)
+    doubles = depth_of(IMAGE, message(depth.astype(np.float64) / 1000, "64FC1"), "x")
+    np.testing.assert_allclose(doubles, depth / 1000, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("reader", "kind", "faulty"),
+    [
+        (color_of, IMAGE, message(PLAIN, "nv24")),
+        (color_of, IMAGE, message(PLAIN, "bgr8", height=9)),
+        (color_of, IMAGE, message(PLAIN, "bgr8", step=3)),
+        (color_of, IMAGE, message(PLAIN, "bgr8", height=0)),
+        (color_of, IMAGE, message(np.zeros((4, 4), np.float32), "32FC1")),
+        (depth_of, IMAGE, message(PLAIN, "bgr8")),
+        (color_of, COMPRESSED, SimpleNamespace(format="jpeg", data=b"\xff\xd8\xff")),
+        (depth_of, COMPRESSED, SimpleNamespace(format="16UC1; compressedDepth rvl", data=bytes(40))),
+        (depth_of, COMPRESSED, SimpleNamespace(format="16UC1; compressedDepth png", data=b"x")),
+    ],
+)
+def test_faulty_messages_are_refused_in_one_line(reader, kind, faulty):
+    with pytest.raises(FrameError, match="^x: ") as caught:
+        reader(kind, faulty, "x")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_file_of_ros_1_is_closed_however_it_is_let_go(bags, monkeypatch):
+    """The library closes a ROS 1 file's last chunk first, which fails while a message of it is held."""
+    monkeypatch.setattr(bags_module, "_close", lambda reader: None)
+    before = set(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sequence = open_source(bags["ros1", "raw", "u16"])
+        assert sequence[2].depth.size
+        del sequence
+        gc.collect()  # the sequence lets go of its reader,
+        gc.collect()  # which holds itself
+    assert not [one for one in caught if issubclass(one.category, ResourceWarning)]
+    assert before is None or set(os.listdir("/proc/self/fd")) <= before

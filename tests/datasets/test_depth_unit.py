@@ -1,0 +1,127 @@
+"""Depth scales that are wrong by 5 or 1000 are noticed; right ones never are, near or far."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from layouts import CAMERA, LAYOUTS, METRES, image, kinect, raw
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.depth_unit import better_scale, sample_depth
+from gavo_jax.datasets.selection import open_part
+from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
+from gavo_jax.errors import GavoError
+
+FR1 = Camera.preset("fr1")
+OWN = Camera(520.0, 520.0, 319.5, 239.5, 640, 480)
+RNG = np.random.default_rng(0)
+CLIPS = ("fr1_xyz", "fr1_desk", "fr1_rpy")
+
+
+def depths(low: float, high: float) -> np.ndarray:
+    return np.exp(RNG.uniform(np.log(low), np.log(high), (240, 320)))
+
+
+def stereo(metres: np.ndarray, scale: float, step: float) -> np.ndarray:
+    """As another stereo camera returns it, in finer steps of disparity."""
+    return np.round(scale / (np.round(1 / metres / step) * step)).astype(np.uint16)
+
+
+def smooth(metres: np.ndarray, scale: float) -> np.ndarray:
+    """As a time-of-flight camera returns it."""
+    return np.round(scale * metres).astype(np.uint16)
+
+
+def proposed(image: np.ndarray, scale: float, camera: Camera, is_kinect: bool) -> float | None:
+    sample = sample_depth([image])
+    assert sample is not None
+    return better_scale(sample, scale, camera, is_kinect)
+
+
+SCENES = [(0.37, 0.5), (0.36, 0.8), (0.4, 1.2), (1.0, 3.0), (2.0, 6.0), (5.0, 9.5), (7.5, 9.0)]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scale", [1000.0, 5000.0])
+@pytest.mark.parametrize("sensor", [kinect, smooth])
+def test_right_scales_are_never_doubted(scene, scale, sensor):
+    image = sensor(depths(*scene), scale)
+    assert proposed(image, scale, OWN, False) is None
+    assert proposed(image, scale, FR1, True) is None
+
+
+@pytest.mark.parametrize("step", [3.3e-4, 5.1e-4, 5.7e-4, 6.8e-4, 1.04e-3, 2e-3])
+@pytest.mark.parametrize("scene", [*SCENES, (0.15, 0.4)])
+def test_other_sensors_are_never_taken_for_a_kinect(scene, step):
+    """RealSense cameras, by the step of their disparity; their lenses see wider or narrower."""
+    image = stereo(depths(*scene), 1000.0, step)
+    for focal in (425.0, 640.0):
+        assert proposed(image, 1000.0, Camera(focal, focal, 424, 240, 848, 480), False) is None
+
+
+@pytest.mark.parametrize("scene", [(0.6, 1.5), (1.0, 3.0), (1.5, 4.0)])
+@pytest.mark.parametrize(("scale", "said"), [(5000.0, 1000.0), (1000.0, 5000.0)])
+def test_a_kinects_steps_tell_a_factor_of_five(scene, scale, said):
+    image = kinect(depths(*scene), scale)
+    assert proposed(image, said, OWN, False) == scale
+    assert proposed(image, said, FR1, True) == scale
+
+
+def test_a_kinect_sees_nothing_nearer_than_it_can():
+    assert proposed(smooth(depths(0.8, 1.5), 1000.0), 5000.0, FR1, True) == 1000
+    assert proposed(smooth(depths(0.8, 1.5), 1000.0), 5000.0, OWN, False) is None
+
+
+@pytest.mark.parametrize(("scale", "said"), [(1000.0, 1.0), (5000.0, 1.0), (5000.0, 5e6), (1000.0, 1e6)])
+@pytest.mark.parametrize("sensor", [kinect, smooth])
+def test_a_factor_of_a_thousand_is_told_by_the_range(scale, said, sensor):
+    better = proposed(sensor(depths(1.0, 3.0), scale), said, FR1, True)
+    assert better == (scale if sensor is kinect else better) and better in (1000, 5000)
+
+
+def test_metres_read_as_millimetres():
+    metres = depths(1.0, 3.0).astype(np.float32)
+    assert proposed(metres, 1000.0, FR1, True) == 1
+    assert proposed(metres, 1.0, FR1, True) is None
+    assert sample_depth([np.zeros((4, 4), np.uint16)]) is None
+
+
+def test_a_wrong_scale_is_refused_in_one_line_unless_forced(tmp_path):
+    (tmp_path / "clip").mkdir()
+    LAYOUTS["plain"][1](tmp_path / "clip")
+    for i, metres in enumerate(METRES):
+        (tmp_path / f"clip/depth/{i}.tiff").unlink()
+        image(tmp_path / f"clip/depth/{i}.png", kinect(np.maximum(metres, 0.5), 1000))
+    assert CAMERA.depth_scale == 5000
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("fx=131\nfy=131\ncx=79.5\ncy=59.5\nwidth=160\nheight=120\ndepth_scale=5000\n")
+    with pytest.raises(
+        GavoError, match=r"clip: .*millimetres: set --depth-scale 1000, or go on with --force"
+    ) as caught:
+        open_part(str(tmp_path / "clip"), str(wrong))
+    assert len(str(caught.value).splitlines()) == 1
+    assert open_part(str(tmp_path / "clip"), str(wrong), force=True).camera.depth_scale == 5000
+    assert open_part(str(tmp_path / "clip")).camera.depth_scale == 1000
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+def test_real_clips(data_dir, clip):
+    """In their units, none is doubted from any frame on; in others each is."""
+    sequence = open_part(str(data_dir / clip))
+    for start in range(0, len(sequence) - 2, 6):
+        images = [sequence[i].depth for i in range(start, start + 3)]
+        for camera, is_kinect in ((FR1, True), (OWN, False)):
+            sample = sample_depth(images)
+            assert sample is not None and better_scale(sample, 5000.0, camera, is_kinect) is None
+            assert better_scale(sample, 1000.0, camera, is_kinect) == 5000
+            metric = sample_depth([raw(image / 5000, 1000) for image in images])
+            assert metric is not None and better_scale(metric, 1000.0, camera, is_kinect) is None
+            assert better_scale(metric, 5000.0, camera, is_kinect) == 1000
+
+
+def test_the_rendered_room():
+    camera = replace(CAMERA, depth_scale=1000.0)
+    for said, right in ((1000.0, None), (5000.0, 1000.0)):
+        images = [frame.depth for frame in SyntheticSequence(frames=3, noise=KINECT, camera=camera)]
+        sample = sample_depth(images)
+        assert sample is not None and better_scale(sample, said, camera) == right

@@ -1,0 +1,277 @@
+"""Folders of every dataset: recognised by what lies in them, and read to the same frames."""
+
+import shutil
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, image, kinect, raw
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets import registry
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.folders import PlainFolder, SevenScenes
+from gavo_jax.datasets.registry import open_source, recognise, register_dataset
+from gavo_jax.datasets.selection import open_part
+from gavo_jax.errors import GavoError
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "clip").mkdir()
+    return tmp_path / "clip"
+
+
+def wrote(folder: Path, name: str) -> Path:
+    shutil.rmtree(folder)
+    if name != "tum":
+        folder.mkdir()
+    LAYOUTS[name][1](folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_layout_gives_the_same_frames(folder, name):
+    sequence = open_source(wrote(folder, name))
+    sequence.check()
+    assert recognise(folder).kind == LAYOUTS[name][0]
+    assert sequence.name == "clip" and len(sequence) == 4
+    camera = sequence.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (131, 131, 79.5, 59.5, 160, 120)
+    first = 1 / 30 if "open3d" in name else 0.0
+    np.testing.assert_allclose(sequence.timestamps - first, np.arange(4) / 30, atol=1e-6)
+    for i, frame in enumerate(sequence):
+        assert isinstance(frame, Frame)
+        lossy = name in ("scannet", "replica", "open3d", "open3d_image")
+        assert np.abs(frame.grey.astype(int) - GREYS[i]).mean() < (1.5 if lossy else 0.1)
+        off = frame.depth / camera.depth_scale - METRES[i]
+        assert np.abs(off).max() < 0.51 / min(camera.depth_scale, 1000 if "float" not in name else 5000) + 1e-6
+        np.testing.assert_array_equal(frame.depth > 0, DEPTHS[i] > 0)
+    part = sequence[1:4:2]
+    np.testing.assert_array_equal(part[1].depth, sequence[3].depth)
+
+
+@pytest.mark.parametrize("name", ["seven_scenes", "replica", "scannet"])
+def test_poses_are_the_truth(folder, name):
+    truth = open_source(wrote(folder, name)).ground_truth
+    assert truth is not None
+    kept = [0, 1, 3] if name == "scannet" else [0, 1, 2, 3]
+    np.testing.assert_allclose(truth.timestamps, np.array(kept) / 30)
+    np.testing.assert_allclose(truth.world_T_camera, POSES[kept], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["seven_scenes", "plain", "associations"])
+def test_the_rate_can_be_said(folder, name):
+    sequence = open_source(wrote(folder, name), Reading(rate=10.0))
+    np.testing.assert_allclose(sequence.timestamps, np.arange(4) / 10)
+    if sequence.ground_truth is not None:
+        np.testing.assert_allclose(sequence.ground_truth.timestamps, np.arange(4) / 10)
+
+
+def test_frames_keep_their_numbers_where_some_are_missing(folder):
+    wrote(folder, "seven_scenes")
+    (folder / "frame-000001.color.png").unlink()
+    (folder / "frame-000003.depth.png").unlink()
+    sequence = open_source(folder)
+    assert isinstance(sequence, SevenScenes)
+    np.testing.assert_allclose(sequence.timestamps, [0, 2 / 30])
+    assert sequence.left_out == (
+        "1 colour images: no depth image of the same number",
+        "1 depth images: no colour image of the same number",
+    )
+
+
+@pytest.mark.parametrize(
+    ("stems", "seconds"),
+    [
+        (["1305031102.175304", "1305031102.2113"], [1305031102.175304, 1305031102.2113]),
+        (["1305031102175304", "1305031102211300"], [1305031102.175304, 1305031102.2113]),
+        (["1305031102175", "1305031102211"], [1305031102.175, 1305031102.211]),
+        (["rgb_1305031102175304000", "rgb_1305031102211300000"], [1305031102.175304, 1305031102.2113]),
+        (["0.0", "0.04"], [0.0, 0.04]),
+    ],
+)
+def test_names_that_are_stamps_are_paired_by_time(folder, stems, seconds):
+    for stem in stems:
+        image(folder / f"color/{stem}.png", GREYS[0])
+    for stem, second in zip(stems, seconds, strict=True):
+        later = f"{second + 0.01:.6f}" if "." in stem else stem
+        image(folder / f"depth/{later}.png", raw(METRES[0], 1000))
+    image(folder / "depth/1400000000.5.png" if "." in stems[0] else folder / "depth/1400000000000000.png", DEPTHS[0])
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_allclose(sequence.timestamps, seconds, atol=1e-6)
+    assert isinstance(sequence, PlainFolder) and sequence.left_out == ("1 depth images: no colour image within 0.02 s",)
+    delay = sequence[1].depth_timestamp
+    assert delay is not None and abs(delay - seconds[1] - (0.01 if "." in stems[0] else 0.0)) < 1e-6
+
+
+def test_a_published_camera_stands_in_for_a_file(folder):
+    wrote(folder, "seven_scenes")
+    (folder / "camera-intrinsics.txt").unlink()
+    for file in folder.glob("frame-*.*.png"):
+        file.unlink()
+    for i in range(2):
+        image(folder / f"frame-{i:06}.color.png", np.zeros((480, 640), np.uint8))
+        image(folder / f"frame-{i:06}.depth.png", np.full((480, 640), 1500, np.uint16))
+    assert open_source(folder).camera == Camera(585, 585, 320, 240, 640, 480, depth_scale=1000)
+
+
+def test_the_folders_name_may_say_the_camera(tmp_path):
+    """A benchmark's images without its lists."""
+    for i in range(2):
+        image(tmp_path / f"fr3_walk/rgb/{i}.png", np.zeros((480, 640), np.uint8))
+        image(tmp_path / f"fr3_walk/depth/{i}.png", np.full((480, 640), 9000, np.uint16))
+    assert open_source(tmp_path / "fr3_walk").camera == Camera.preset("fr3").rectified()
+
+
+@pytest.mark.parametrize("scale", [1000.0, 5000.0])
+def test_the_unit_of_a_plain_folder_is_seen_where_nobody_says_it(folder, scale):
+    wrote(folder, "plain")
+    for i in range(4):
+        (folder / f"depth/{i}.tiff").unlink()
+        image(folder / f"depth/{i}.png", kinect(np.geomspace(0.8, 3.0, 120 * 160).reshape(120, 160), scale))
+    assert open_part(str(folder)).camera.depth_scale == scale
+    (folder / "camera.yaml").write_text((folder / "camera.yaml").read_text() + f"depth_scale: {6000 - scale}\n")
+    with pytest.raises(GavoError, match=f"--depth-scale {scale:g}"):
+        open_part(str(folder))
+
+
+@pytest.mark.parametrize("name", ["tum", "plain", "seven_scenes"])
+def test_a_camera_of_numbers_alone_takes_the_images_size(folder, tmp_path, name):
+    (tmp_path / "mine.txt").write_text("130 130 80 60\n")
+    camera = open_source(wrote(folder, name), Reading(camera=str(tmp_path / "mine.txt"))).camera
+    assert (camera.fx, camera.width, camera.height) == (130, 160, 120)
+
+
+def test_a_camera_that_is_named_goes_before_the_folders_own(folder):
+    mine = Camera(130.0, 130.0, 80.0, 60.0, 160, 120, depth_scale=1000.0)
+    assert open_source(wrote(folder, "open3d"), Reading(camera=mine)).camera == mine
+    assert open_source(folder, Reading(camera=mine, depth_scale=2000)).camera.depth_scale == 2000
+
+
+REFUSED = {
+    "an empty folder": (lambda f: shutil.rmtree(f / "rgb") or shutil.rmtree(f / "depth"), "plain", "camera.yaml"),
+    "no camera": (lambda f: (f / "camera.yaml").unlink(), "plain", "--camera"),
+    "a pose of text": (
+        lambda f: (f / "frame-000001.pose.txt").write_text("a b\n"),
+        "seven_scenes",
+        "000001.pose.txt: ",
+    ),
+    "a pose of zeros": (
+        lambda f: np.savetxt(f / "frame-000001.pose.txt", np.zeros((4, 4))),
+        "seven_scenes",
+        "no rotation",
+    ),
+    "half a pose": (lambda f: (f / "traj.txt").write_text("1 0 0 0 1\n"), "replica", "traj.txt:1: "),
+    "a matrix of text": (lambda f: (f / "camera-intrinsics.txt").write_text("x"), "seven_scenes", "intrinsics.txt: "),
+    "no number in common": (
+        lambda f: [file.rename(file.with_name(f"7{file.name}")) for file in list((f / "depth").iterdir())],
+        "scannet",
+        "no two have the same number",
+    ),
+    "an intrinsics file of something else": (
+        lambda f: (f / "camera_intrinsic.json").write_text('{"width": 3}'),
+        "open3d",
+        "camera_intrinsic.json: ",
+    ),
+    "a torn intrinsics file": (lambda f: (f / "camera_intrinsic.json").write_text("{"), "open3d", "not JSON"),
+    "a camera of another size": (
+        lambda f: (f / "cam_params.json").write_text((f / "cam_params.json").read_text().replace("160", "320")),
+        "replica",
+        "160x120",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_faulty_folder_is_refused_in_one_line(folder, name):
+    damage, layout, fault = REFUSED[name]
+    damage(wrote(folder, layout))
+    with pytest.raises(GavoError) as caught:
+        open_part(str(folder))
+    message = str(caught.value)
+    assert str(folder) in message and fault in message and len(message.splitlines()) == 1, message
+
+
+def test_what_is_no_source_says_what_is_there(tmp_path):
+    with pytest.raises(GavoError, match=r"nowhere: no such folder or file"):
+        open_source(tmp_path / "nowhere")
+    with pytest.raises(GavoError, match=r"an empty folder, not one of: TUM RGB-D folder"):
+        open_source(tmp_path)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(GavoError, match=r"a folder of notes\.txt: not one of"):
+        open_source(tmp_path)
+    with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
+        open_source(tmp_path / "notes.txt")
+    LAYOUTS["replica"][1](tmp_path / "room0")
+    with pytest.raises(GavoError, match=r"a folder of 1 sources \(room0\), of which one is to be named"):
+        open_source(tmp_path)
+
+
+class Lines:
+    """A dataset of somebody else's: files that name a room's frames."""
+
+    kind: ClassVar[str] = "a file of lines"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        return path.suffix == ".lines"
+
+    @staticmethod
+    def open(path: Path, reading: Reading) -> Sequence:
+        from layouts import ROOM
+
+        return ROOM
+
+
+class Entry:
+    name, value = "lines", "own_package:Lines"
+
+    @staticmethod
+    def load() -> type[Lines]:
+        return Lines
+
+
+@pytest.fixture
+def no_plugins(monkeypatch):
+    """Forget what is registered, before and after."""
+    monkeypatch.setattr(registry, "_registered", [])
+    registry._register_plugins.cache_clear()
+    yield monkeypatch
+    registry._register_plugins.cache_clear()
+
+
+@pytest.mark.parametrize("by_entry_point", [True, False])
+def test_other_packages_bring_datasets(tmp_path, no_plugins, by_entry_point):
+    (tmp_path / "x.lines").write_text("")
+    if by_entry_point:
+        no_plugins.setattr(registry, "entry_points", lambda group: [Entry] * (group == "gavo_jax.datasets"))
+    else:
+        register_dataset(Lines)
+    assert len(open_source(tmp_path / "x.lines")) == 4
+
+
+@pytest.mark.parametrize("fault", ["load", "recognises"])
+def test_a_faulty_dataset_of_others_is_named(tmp_path, no_plugins, fault):
+    def raises(*arguments: object) -> None:
+        raise RuntimeError("no\nway")
+
+    broken = type("Broken", (Entry if fault == "load" else Lines,), {fault: staticmethod(raises), "kind": "odd"})
+    if fault == "load":
+        no_plugins.setattr(registry, "entry_points", lambda group: [broken])
+    else:
+        register_dataset(broken)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="(own_package:Lines|'odd'.*): no way"):
+        open_source(tmp_path)
+
+
+def test_red_kitchen_by_its_folder_alone(data_dir):
+    sequence = open_part(str(data_dir / "redkitchen_7scenes"))
+    assert len(sequence) == 60 and sequence.camera == Camera(585, 585, 320, 240, 640, 480, depth_scale=1000)
+    frame = sequence[0]
+    assert 0.5 < np.median(frame.depth[frame.depth > 0]) / 1000 < 4 and frame.depth.max() < 65535
+    assert sequence.ground_truth is not None and len(sequence.ground_truth) == 60
+    with pytest.raises((IndexError, FrameError)):
+        sequence[60]

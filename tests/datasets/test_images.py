@@ -1,0 +1,260 @@
+"""Image files of every kind: what they become, and what is refused in one line."""
+
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import Calibration
+from gavo_jax.datasets.base import Frame, FrameError
+from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
+from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid
+from gavo_jax.errors import GavoError
+
+CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+PORTRAIT = Camera(50.0, 50.0, 23.5, 31.5, 48, 64)
+RNG = np.random.default_rng(0)
+GREY = cv2.GaussianBlur(RNG.integers(0, 256, (48, 64), dtype=np.uint8), (0, 0), 2)
+BGR = cv2.GaussianBlur(RNG.integers(0, 256, (48, 64, 3), dtype=np.uint8), (0, 0), 2)
+RAW = RNG.integers(2000, 30000, (48, 64), dtype=np.uint16)
+METRES = (RAW / 5000).astype(np.float32)
+
+
+def write(path: Path, image: np.ndarray) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, image)
+    elif path.suffix == ".exr":
+        pytest.importorskip("OpenEXR").File({}, {"Z": image}).write(str(path))
+    else:
+        path.write_bytes(cv2.imencode(path.suffix, image)[1].tobytes())
+    return path
+
+
+def palette_png(indices: np.ndarray, palette: np.ndarray) -> bytes:
+    """A PNG whose pixels are indices into a table of RGB."""
+    import zlib
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    height, width = indices.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in indices)
+    header = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
+    parts = [(b"IHDR", header), (b"PLTE", palette.tobytes()), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+AS_FOUND = Reading()
+
+
+def read(color: Path, depth: Path, camera: Camera = CAMERA, reading: Reading = AS_FOUND) -> tuple[Frame, Camera]:
+    pair = open_pair([(color, depth)], Calibration(camera), reading)
+    return pair[0], pair.camera
+
+
+@pytest.fixture
+def depth_file(tmp_path) -> Path:
+    return write(tmp_path / "depth.png", RAW)
+
+
+@pytest.fixture
+def color_file(tmp_path) -> Path:
+    return write(tmp_path / "color.png", BGR)
+
+
+@pytest.mark.parametrize("ending", [".png", ".bmp", ".tiff", ".webp", ".ppm", ".jpg", ".npy"])
+def test_colour_of_any_format(tmp_path, depth_file, ending):
+    image = BGR[..., ::-1] if ending == ".npy" else BGR
+    frame, _ = read(write(tmp_path / f"image{ending}", image), depth_file, reading=Reading(color=True))
+    expected = cv2.cvtColor(BGR, cv2.COLOR_BGR2GRAY).astype(int)
+    tolerance = 12 if ending in (".jpg", ".webp") else 0
+    assert np.abs(frame.grey - expected).max() <= tolerance and frame.grey.dtype == np.uint8
+    assert frame.color is not None and np.abs(frame.color[..., ::-1].astype(int) - BGR).mean() <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("name", "image"),
+    [
+        ("8 bits", GREY),
+        ("16 bits, full scale", GREY.astype(np.uint16) * 257),
+        ("16 bits, 12 used", GREY.astype(np.uint16) * 16),
+        ("16 bits, 8 used", GREY.astype(np.uint16)),
+        ("alpha", np.dstack([GREY] * 3 + [np.full_like(GREY, 3)])),
+        ("16-bit colour", np.dstack([GREY.astype(np.uint16) * 257] * 3)),
+    ],
+)
+@pytest.mark.parametrize("ending", [".png", ".tiff"])
+def test_grey_of_any_kind(tmp_path, depth_file, name, image, ending):
+    frame, _ = read(write(tmp_path / f"image{ending}", image), depth_file)
+    assert np.abs(frame.grey.astype(int) - GREY).max() <= 1, name
+
+
+def test_palettes_are_looked_up(tmp_path, depth_file):
+    palette = RNG.integers(0, 256, (256, 3), dtype=np.uint8)
+    (tmp_path / "image.png").write_bytes(palette_png(GREY, palette))
+    frame, _ = read(tmp_path / "image.png", depth_file, reading=Reading(color=True))
+    assert frame.color is not None
+    np.testing.assert_array_equal(frame.color, palette[np.asarray(GREY, int)])
+
+
+def test_sixteen_bits_are_scaled_alike_in_all_frames_of_a_sequence(tmp_path, depth_file):
+    """A frame that happens to be dark must not come brighter than the others."""
+    images = [GREY.astype(np.uint16) * scale for scale in (16, 3, 1)]
+    files = [write(tmp_path / f"{i}.png", image) for i, image in enumerate(images)]
+    entries = [Entry(float(i), file, depth_file) for i, file in enumerate(files)]
+    sequence = FileSequence("clip", entries, Calibration(CAMERA))
+    for whole, part in ((sequence[1], sequence[1:][0]), (sequence[2], sequence[2:][0])):
+        np.testing.assert_array_equal(whole.grey, part.grey)
+    assert np.abs(sequence[1].grey - GREY.astype(float) * 3 / 16).max() <= 1
+    assert [white_of(image) for image in (images[0], GREY.astype(np.uint16))] == [4095, 255]
+
+
+@pytest.mark.parametrize("ending", [".png", ".tiff", ".npy", ".pgm"])
+def test_depth_of_sixteen_bits_is_taken_as_it_is(tmp_path, color_file, ending):
+    frame, camera = read(color_file, write(tmp_path / f"depth{ending}", RAW))
+    np.testing.assert_array_equal(frame.depth, RAW)
+    assert frame.depth.dtype == np.uint16 and camera.depth_scale == 5000
+
+
+@pytest.mark.parametrize("ending", [".tiff", ".npy", ".pfm", ".exr"])
+@pytest.mark.parametrize("units", [1.0, 1000.0])
+def test_depth_of_floats_in_metres_or_millimetres(tmp_path, color_file, ending, units):
+    """A preset's depth_scale speaks of its PNG files and is not asked."""
+    depth = write(tmp_path / f"depth{ending}", METRES * np.float32(units))
+    pair = open_pair([(color_file, depth)], Calibration(CAMERA, preset="fr1"))
+    np.testing.assert_array_equal(pair[0].depth, RAW)
+    assert pair.camera.depth_scale == 5000
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int32, np.uint32, ">f4", ">u2"])
+def test_arrays_of_any_numbers_are_depth(tmp_path, color_file, dtype):
+    values = METRES if np.dtype(dtype).kind == "f" else RAW // 5
+    frame, camera = read(
+        color_file, write(tmp_path / "depth.npy", values.astype(dtype)), replace(CAMERA, depth_scale=1e3)
+    )
+    metres = frame.depth / camera.depth_scale
+    assert np.abs(metres - (values if np.dtype(dtype).kind == "f" else values / 1000)).max() < 3e-3
+
+
+def test_the_unit_of_floats_can_be_said(tmp_path, color_file):
+    inches = write(tmp_path / "depth.npy", METRES / np.float32(0.0254))
+    frame, camera = read(color_file, inches, reading=Reading(depth_scale=1 / 0.0254))
+    assert np.abs(frame.depth / camera.depth_scale - METRES).max() < 1e-3
+    frame, camera = read(color_file, inches, replace(CAMERA, depth_scale=1 / 0.0254))
+    assert np.abs(frame.depth / camera.depth_scale - METRES).max() < 1e-3
+
+
+def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
+    frame, camera = read(color_file, write(tmp_path / "depth.npy", METRES * 8))
+    assert camera.depth_scale == 1000
+    assert np.abs(frame.depth / 1000 - METRES * 8).max() <= 0.0006
+
+
+def test_floats_in_no_likely_unit_are_refused(tmp_path, color_file):
+    depth = write(tmp_path / "depth.npy", METRES * np.float32(1e6))
+    with pytest.raises(GavoError, match=r"depth\.npy: .*--depth-scale"):
+        read(color_file, depth)
+
+
+def test_what_is_no_reading_is_zero(tmp_path, color_file):
+    raw = RAW.copy()
+    raw[0, :3] = 0, 65535, 65534
+    np.testing.assert_array_equal(without_invalid(raw)[0, :3], [0, 0, 65534])
+    metres = METRES.copy()
+    metres[0, :6] = np.nan, np.inf, -np.inf, -1, 0, 14.0
+    frame, _ = read(color_file, write(tmp_path / "depth.npy", metres))
+    np.testing.assert_array_equal(frame.depth[0, :6], 0)
+    np.testing.assert_array_equal(frame.depth[1:], RAW[1:])
+
+
+def test_portrait_images_of_any_size(tmp_path):
+    color, depth = write(tmp_path / "color.jpg", BGR.transpose(1, 0, 2)), write(tmp_path / "depth.png", RAW.T)
+    frame, _ = read(color, depth, PORTRAIT)
+    np.testing.assert_array_equal(frame.depth, RAW.T)
+    assert frame.grey.shape == (64, 48)
+    with pytest.raises(FrameError, match=r"color\.jpg: is 48x64 pixels, the camera's images are 64x48"):
+        read(color, depth, CAMERA)
+
+
+JPEG, TIFF = cv2.imencode(".jpg", BGR)[1].tobytes(), cv2.imencode(".tiff", METRES)[1].tobytes()
+BAD = {
+    "color.jpg": [JPEG[: len(JPEG) // 2], JPEG[:-2], b"", b"\xff\xd8\xff"],
+    "color.webp": [cv2.imencode(".webp", BGR)[1].tobytes()[:-100]],
+    "color.gif": [b"GIF89a"],
+    "color.tiff": [TIFF],
+    "color.txt": [b"hello"],
+    "color.npy": [b"\x93NUMPY", b"\x93NUMPY\x01\0\x0e\0{'descr':'|O'}\n"],
+    "depth.tiff": [TIFF[:5000], cv2.imencode(".tiff", BGR)[1].tobytes()],
+    "depth.jpg": [JPEG],
+    "depth.png": [cv2.imencode(".png", GREY)[1].tobytes()],
+    "depth.exr": [b"\x76\x2f\x31\x01" + bytes(100)],
+    "depth.npy": [b"\x93NUMPY\x01\0v\0{'descr': '<f4', 'fortran_order': False, 'shape': (4, 4), }" + b" " * 60 + b"\n"],
+}
+
+
+@pytest.mark.parametrize(("name", "content"), [(name, content) for name in BAD for content in BAD[name]])
+def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, capfd, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FrameError) as caught:
+        (read_color if name.startswith("color") else read_depth)(tmp_path / name)
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / name)) and len(message.splitlines()) == 1 and len(message) < 400
+    assert capfd.readouterr() == ("", "")
+
+
+def test_arrays_of_other_things_are_refused(tmp_path):
+    for array in (
+        np.zeros(5),
+        np.zeros((2, 2), complex),
+        np.zeros((0, 4)),
+        np.zeros((2, 2), "U3"),
+        np.zeros((1, 9000)),
+    ):
+        np.save(tmp_path / "depth.npy", array)
+        with pytest.raises(FrameError, match=r"depth\.npy: not an image"):
+            read_depth(tmp_path / "depth.npy")
+
+
+def test_openexr_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    (tmp_path / "depth.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
+    with pytest.raises(FrameError, match=r"\[exr\]"):
+        read_depth(tmp_path / "depth.exr")
+
+
+def test_huge_files_and_images_are_refused_unread(tmp_path):
+    with (tmp_path / "huge.png").open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(FrameError, match="larger than"):
+        read_color(tmp_path / "huge.png")
+    write(tmp_path / "wide.png", np.zeros((4, 8200), np.uint8))
+    write(tmp_path / "wide.bmp", np.zeros((4, 8200), np.uint8))
+    for name in ("wide.png", "wide.bmp"):
+        with pytest.raises(FrameError, match="8200x4"):
+            read_color(tmp_path / name)
+
+
+def test_one_file_is_not_both_images(color_file):
+    with pytest.raises(GavoError, match="colour and as depth"):
+        read(color_file, color_file)
+
+
+@given(
+    content=st.binary(max_size=300),
+    start=st.sampled_from([JPEG, TIFF, b"II*\0", b"RIFF", b"P5 9 9 ", b"\x93NUMPY\x01\0"]),
+)
+def test_no_content_raises_anything_else(tmp_path_factory, content, start):
+    path = tmp_path_factory.mktemp("image") / "image"
+    path.write_bytes(start[: len(start) // 2 + 4] + content)
+    for reader in (read_color, read_depth):
+        try:
+            assert reader(path).ndim >= 2
+        except FrameError as error:
+            assert len(str(error).splitlines()) == 1

@@ -1,0 +1,122 @@
+"""The same few frames written in the layouts of several datasets."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.depth_unit import KINECT_STEP
+from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+ROOM = SyntheticSequence(frames=4, camera=CAMERA)
+GREYS, DEPTHS = [frame.grey for frame in ROOM], [frame.depth for frame in ROOM]
+METRES = [depth / CAMERA.depth_scale for depth in DEPTHS]
+assert ROOM.ground_truth is not None
+POSES = ROOM.ground_truth.interpolate(ROOM.timestamps)[0]
+MATRIX = np.array([[131.0, 0, 79.5], [0, 131.0, 59.5], [0, 0, 1]])
+
+
+def image(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npy":
+        np.save(path, pixels)
+    else:
+        path.write_bytes(cv2.imencode(path.suffix, pixels)[1].tobytes())
+
+
+def raw(metres: np.ndarray, scale: float, none: int = 0) -> np.ndarray:
+    return np.where(metres > 0, np.round(metres * scale), none).astype(np.uint16)
+
+
+def kinect(metres: np.ndarray, scale: float) -> np.ndarray:
+    """As a first Kinect returns it: in steps of disparity."""
+    return np.round(scale / (np.round(1 / metres / KINECT_STEP) * KINECT_STEP)).astype(np.uint16)
+
+
+def seven_scenes(folder: Path) -> None:
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"frame-{i:06}.color.png", grey)
+        image(folder / f"frame-{i:06}.depth.png", raw(metres, 1000, 65535))
+        np.savetxt(folder / f"frame-{i:06}.pose.txt", pose, delimiter="\t ")
+    np.savetxt(folder / "camera-intrinsics.txt", MATRIX)
+
+
+def scannet(folder: Path) -> None:
+    four = np.eye(4)
+    four[:3, :3] = MATRIX
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"color/{i}.jpg", grey)
+        image(folder / f"depth/{i}.png", raw(metres, 1000))
+        (folder / "pose").mkdir(exist_ok=True)
+        np.savetxt(folder / f"pose/{i}.txt", pose if i != 2 else np.full((4, 4), -np.inf))
+    (folder / "intrinsic").mkdir()
+    for name in ("color", "depth"):
+        np.savetxt(folder / f"intrinsic/intrinsic_{name}.txt", four)
+        np.savetxt(folder / f"intrinsic/extrinsic_{name}.txt", np.eye(4))
+
+
+def replica(folder: Path) -> None:
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"results/frame{i:06}.jpg", grey)
+        image(folder / f"results/depth{i:06}.png", raw(metres, 6553.5))
+    np.savetxt(folder / "traj.txt", POSES.reshape(-1, 16))
+    camera = {"w": 160, "h": 120, "fx": 131.0, "fy": 131.0, "cx": 79.5, "cy": 59.5, "scale": 6553.5}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+
+
+def open3d(folder: Path, color: str = "color") -> None:
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"{color}/{i + 1:06}.jpg", grey)
+        image(folder / f"depth/{i + 1:06}.png", raw(metres, 1000))
+    intrinsics = {"width": 160, "height": 120, "intrinsic_matrix": MATRIX.T.ravel().tolist()}
+    (folder / "camera_intrinsic.json").write_text(json.dumps(intrinsics))
+
+
+def open3d_image(folder: Path) -> None:
+    open3d(folder, "image")
+
+
+def plain(folder: Path) -> None:
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"rgb/{i}.png", grey)
+        image(folder / f"depth/{i}.tiff", metres.astype(np.float32))
+    (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
+
+
+def one_folder(folder: Path) -> None:
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"color_{i:03}.png", grey)
+        image(folder / f"depth_{i:03}.npy", metres.astype(np.float32))
+    (folder / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
+
+
+def tum(folder: Path) -> None:
+    write_tum(ROOM, folder)
+
+
+def associations(folder: Path) -> None:
+    rows = []
+    for i, (grey, depth) in enumerate(zip(GREYS, DEPTHS, strict=True)):
+        image(folder / f"rgb/{i}.png", grey)
+        image(folder / f"depth/{i}.png", depth)
+        rows.append(f"{i} depth/{i}.png {i} rgb/{i}.png")
+    (folder / "associations.txt").write_text("\n".join(rows) + "\n")
+    (folder / "calibration.txt").write_text("131 131 79.5 59.5\n")
+
+
+LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "tum": ("TUM RGB-D folder", tum),
+    "associations": ("TUM RGB-D folder", associations),
+    "seven_scenes": ("7-Scenes sequence", seven_scenes),
+    "scannet": ("ScanNet scan", scannet),
+    "replica": ("Replica room", replica),
+    "open3d": ("Open3D reconstruction folder", open3d),
+    "open3d_image": ("Open3D reconstruction folder", open3d_image),
+    "plain": ("folder of colour and depth images", plain),
+    "one_folder": ("folder of colour and depth images", one_folder),
+}
+"""By name: what the layout is recognised as, and who writes it."""

@@ -1,0 +1,18 @@
+"""What tests use to which any camera and any search will do: all the same, so that they share compiled programs."""
+
+from gavo_jax.camera import Camera
+from gavo_jax.objective.losses import l2
+from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.solvers.genetic import GeneticAlgorithm
+
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+PLAIN_ERROR = AlignmentOptions(robust_scale=False, brightness=False, depth=False, last_step=False, loss=l2)
+"""Grey alone: half as long to compile as the default one."""
+ALONE = OdometryOptions(recover=False)
+"""No second search behind the first one."""
+NEWTON = Settings(GaussNewton(iterations=(0, 0, 0, 10, 20)), PLAIN_ERROR, ALONE)
+GENETIC = Settings(
+    GeneticAlgorithm(population=(0, 0, 0, 8, 16), iterations=(0, 0, 0, 6, 8)), AlignmentOptions(last_step=False), ALONE
+)
+"""So few candidates find little. A pair's result is the best of them, and nothing more."""

@@ -1,0 +1,300 @@
+"""Camera files of every make lead to the same camera; faulty ones are refused in one line."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import load_calibration, load_camera
+from gavo_jax.errors import GavoError
+
+MATRIX = np.array([[500.0, 0, 319.5], [0, 510.0, 239.5], [0, 0, 1]])
+RADTAN = [0.1, -0.2, 0.001, -0.002]
+RATIONAL = [0.5, -2.0, 0.001, -0.002, 1.5, 0.4, -1.9, 1.4]
+EQUIDISTANT = [-0.02, 0.01, -0.003, 0.001]
+PINHOLE = Camera(500.0, 510.0, 319.5, 239.5, 640, 480)
+TURN = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+COLOR_T_DEPTH = np.block([[TURN, np.array([[-0.025], [0.001], [0.002]])], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def ros1(model: str, numbers: list[float]) -> str:
+    """As `camera_calibration` saves it."""
+    return f"""image_width: 640
+image_height: 480
+camera_name: rgb
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {MATRIX.ravel().tolist()}
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: {len(numbers)}
+  data: {numbers}
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [480, 0, 320, 0, 0, 490, 240, 0, 0, 0, 1, 0]
+"""
+
+
+def ros_echo(upper: bool, model: str, numbers: list[float]) -> str:
+    """As `rostopic echo` (upper) or `ros2 topic echo` prints a message."""
+    k, d = ("K", "D") if upper else ("k", "d")
+    numbers_below = "".join(f"\n- {number!r}" for number in numbers)
+    matrix = "".join(f"\n- {number!r}" for number in MATRIX.ravel().tolist())
+    head = "header:\n  stamp:\n    sec: 3\n  frame_id: camera\n"
+    lens = f"distortion_model: {model}\n{d}:{numbers_below}\n"
+    return f"{head}height: 480\nwidth: 640\n{lens}{k}:{matrix}\nbinning_x: 0\n---\n"
+
+
+def kalibr(model: str, numbers: list[float], second: bool = False) -> str:
+    camera = f"""  camera_model: pinhole
+  distortion_coeffs: {numbers}
+  distortion_model: {model}
+  intrinsics: [500.0, 510.0, 319.5, 239.5]
+  resolution: [640, 480]
+  rostopic: /camera/image
+"""
+    if not second:
+        return f"cam0:\n{camera}"
+    return f"cam0:\n{camera}cam1:\n{camera}  T_cn_cnm1: {np.linalg.inv(COLOR_T_DEPTH).tolist()}\n"
+
+
+def storage(ending: str, names: dict[str, str], fisheye: bool = False, numbers: list[float] = RADTAN) -> str:
+    file = cv2.FileStorage(ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.write(names["K"], MATRIX)
+    file.write(names["D"], np.array([numbers]))
+    file.write(names["width"], 640)
+    file.write(names["height"], 480)
+    if fisheye:
+        file.write("fisheye_model", 1)
+    return file.releaseAndGetString()
+
+
+OPENCV = {"K": "camera_matrix", "D": "distortion_coefficients", "width": "image_width", "height": "image_height"}
+OTHER = {"K": "K", "D": "D", "width": "width", "height": "height"}
+OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": MATRIX.T.ravel().tolist()}
+REPLICA = {"camera": {"w": 640, "h": 480, "fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5, "scale": 6553.5}}
+ORB = """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: 500.0
+Camera.fy: 510.0
+Camera.cx: 319.5
+Camera.cy: 239.5
+Camera.k1: 0.1
+Camera.k2: -0.2
+Camera.p1: 0.001
+Camera.p2: -0.002
+Camera.width: 640
+Camera.height: 480
+DepthMapFactor: 1000.0
+"""
+TOML = "fx=500\nfy=510\ncx=319.5\ncy=239.5\nwidth=640\nheight=480\n"
+
+NONE, BROWN, RATIO, FISH = (
+    PINHOLE,
+    replace(PINHOLE, distortion=(*RADTAN, 0.0)),
+    replace(PINHOLE, distortion=tuple(RATIONAL)),
+    replace(PINHOLE, distortion=tuple(EQUIDISTANT), model="fisheye"),
+)
+FILES = {
+    "ros plumb_bob.yaml": (ros1("plumb_bob", [*RADTAN, 0.0]), BROWN),
+    "ros rational.yml": (ros1("rational_polynomial", RATIONAL), RATIO),
+    "ros fisheye.yaml": (ros1("equidistant", EQUIDISTANT), FISH),
+    "ros without.yaml": (ros1("''", []), NONE),
+    "ros1 echo.yaml": (ros_echo(True, "plumb_bob", [*RADTAN, 0.0]), BROWN),
+    "ros2 echo.yaml": (ros_echo(False, "rational_polynomial", RATIONAL), RATIO),
+    "kalibr radtan.yaml": (kalibr("radtan", RADTAN), BROWN),
+    "kalibr equi.yaml": (kalibr("equidistant", EQUIDISTANT), FISH),
+    "kalibr none.yaml": (kalibr("none", []), NONE),
+    "opencv.yaml": (storage(".yml", OPENCV), BROWN),
+    "opencv.yml": (storage(".yml", OTHER, numbers=RATIONAL), RATIO),
+    "opencv.xml": (storage(".xml", OPENCV), BROWN),
+    "opencv.json": (storage(".json", OPENCV), BROWN),
+    "opencv fisheye.yml": (storage(".yml", OPENCV, True, EQUIDISTANT), FISH),
+    "orb.yaml": (ORB, replace(BROWN, depth_scale=1000.0)),
+    "open3d.json": (json.dumps(OPEN3D), NONE),
+    "open3d pose.json": (json.dumps({"extrinsic": [1], "intrinsic": OPEN3D}), NONE),
+    "replica.json": (json.dumps(REPLICA), replace(NONE, depth_scale=6553.5)),
+    "own.json": (json.dumps({"fx": 500, "fy": 510, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}), NONE),
+    "own.toml": (TOML + f"distortion={RATIONAL}\nmodel='rational'\n", RATIO),
+    "own fisheye.toml": (TOML + f"distortion={EQUIDISTANT}\nmodel='fisheye'\n", FISH),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_make_leads_to_the_same_camera(tmp_path, name):
+    text, camera = FILES[name]
+    (tmp_path / name).write_text(text)
+    found = load_calibration(tmp_path / name)
+    assert found.color == camera and found.depth is None and found.origin == str(tmp_path / name)
+    assert found.states_depth_scale == (name in ("orb.yaml", "replica.json"))
+    assert load_camera(tmp_path / name) == camera
+
+
+@pytest.mark.parametrize(
+    ("text", "camera"),
+    [
+        ("500 0 319.5\n0 510 239.5\n0 0 1\n", NONE),
+        ("\n".join(" ".join(map(str, row)) for row in np.block([[MATRIX, np.zeros((3, 1))], [np.eye(4)[3:]]])), NONE),
+        ("500 510 319.5 239.5\n", NONE),
+        ("# fx fy cx cy\n500, 510, 319.5, 239.5, 0.1, -0.2, 0.001, -0.002\n", BROWN),
+    ],
+)
+def test_numbers_alone_need_the_images_size(tmp_path, text, camera):
+    (tmp_path / "intrinsics.txt").write_text(text)
+    assert load_calibration(tmp_path / "intrinsics.txt", (640, 480)).color == camera
+    with pytest.raises(GavoError, match=r"intrinsics\.txt: width: missing"):
+        load_calibration(tmp_path / "intrinsics.txt")
+
+
+def test_the_depth_scale_of_a_file_goes_before_that_of_a_kind_of_source(tmp_path):
+    (tmp_path / "a.toml").write_text(TOML)
+    (tmp_path / "b.toml").write_text(TOML + "depth_scale=2000\n")
+    assert [load_calibration(tmp_path / f"{x}.toml", None, 1000.0).color.depth_scale for x in "ab"] == [1000, 2000]
+
+
+@pytest.mark.parametrize("place", ["top", "inside", "kalibr", "american"])
+def test_two_cameras(tmp_path, place):
+    key = "color_T_depth" if place == "american" else "colour_T_depth"
+    pose = f"{key} = {COLOR_T_DEPTH.tolist()}\n"
+    depth = f"[depth]\n{TOML.replace('500', '580')}distortion={RADTAN}\n"
+    path = tmp_path / ("rig.yaml" if place == "kalibr" else "rig.toml")
+    text = TOML + depth + pose if place == "inside" else TOML + pose + depth
+    path.write_text(kalibr("radtan", RADTAN, True) if place == "kalibr" else text)
+    found = load_calibration(path)
+    assert found.depth == replace(BROWN, fx=500.0 if place == "kalibr" else 580.0)
+    assert found.color_T_depth is not None
+    np.testing.assert_allclose(found.color_T_depth, COLOR_T_DEPTH, atol=1e-12)
+
+
+def rig(pose: object) -> str:
+    return TOML + f"colour_T_depth = {pose}\n[depth]\n{TOML}"
+
+
+FAULTS = {
+    "pose without camera.toml": (TOML + f"colour_T_depth = {np.eye(4).tolist()}\n", "[depth]"),
+    "pose of three rows.toml": (rig(np.eye(4)[:3].tolist()), "four rows"),
+    "pose of text.toml": (rig('["a"]'), "four rows"),
+    "skewed pose.toml": (rig((2 * np.eye(4)).tolist()), "rigid"),
+    "mirrored pose.toml": (rig(np.diag([-1.0, 1, 1, 1]).tolist()), "rigid"),
+    "pose in mm.toml": (rig((np.eye(4) + 25 * np.eye(4, k=3)).tolist()), "metres"),
+    "depth of text.toml": ("depth = 3\n" + TOML, "[depth]"),
+    "depth without fx.toml": (TOML + "[depth]\nfy=3\n", "depth.fx: missing"),
+    "depth of odd keys.toml": (TOML + "[depth]\n" + TOML + "fz=3\n", "depth.fz"),
+    "fisheye of five.toml": (TOML + "model='fisheye'\ndistortion=[0,0,0,0,0]\n", "4 numbers"),
+    "unknown model.toml": (TOML + "model='magic'\n", "model"),
+    "model of number.toml": (TOML + "model=3\n", "model"),
+    "ros six.yaml": (ros1("plumb_bob", [0.0] * 6), "distortion"),
+    "ros other model.yaml": (ros1("thin_plate", RADTAN), "model"),
+    "ros short matrix.yaml": (ros1("plumb_bob", RADTAN).replace("500.0, 0.0, ", ""), "ROS camera_info"),
+    "ros no size.yaml": (ros1("plumb_bob", RADTAN).replace("image_width", "w"), "width"),
+    "kalibr omni.yaml": (kalibr("radtan", RADTAN).replace("pinhole", "omni"), "Kalibr"),
+    "kalibr no size.yaml": (kalibr("radtan", RADTAN).replace("resolution", "size"), "Kalibr"),
+    "open3d short.json": (json.dumps({**OPEN3D, "intrinsic_matrix": [1, 2]}), "Open3D"),
+    "open3d list.json": ("[1, 2]", "not a camera file"),
+    "torn.json": ('{"width": 3', "not JSON"),
+    "torn.yaml": ("a: [1, 2", "not YAML"),
+    "tag.yaml": ("!!python/object/apply:os.system ['true']", "not YAML"),
+    "torn opencv.yaml": (storage(".yml", OPENCV)[:90], "opencv"),
+    "rows of another matrix.yaml": (storage(".yml", OPENCV).replace("rows: 3", "rows: 2"), "rows and columns"),
+    "endless size.json": (
+        storage(".json", OPENCV).replace('"image_width": 640', '"image_size": [1e999, 3]'),
+        "endless",
+    ),
+    "opencv of text.xml": ("<opencv_storage><camera_matrix>a b</camera_matrix></opencv_storage>", "xml"),
+    "other.xml": ("<html></html>", "opencv_storage"),
+    "opencv without.json": (
+        '{"a": {"type_id": "opencv-matrix", "rows": 1, "cols": 1, "dt": "d", "data": [1.0]}}',
+        "camera_matrix",
+    ),
+    "orb without.yaml": (ORB.replace("Camera.cx", "Camera.cz"), "cx: missing"),
+    "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
+    "text.txt": ("hello\n", "neither a matrix"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faulty_files_are_refused_in_one_line(tmp_path, name, capfd):
+    text, fault = FAULTS[name]
+    (tmp_path / name).write_text(text)
+    with pytest.raises(GavoError) as caught:
+        load_calibration(tmp_path / name, (640, 480) if name.endswith(".txt") else None)
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / name)) and fault in message and len(message.splitlines()) == 1, message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_no_yaml_is_too_clever(tmp_path):
+    """Numbers as people write them, and aliases that would grow."""
+    (tmp_path / "a.yaml").write_text("fx: 5e2\nfy: 510\ncx: 319.5\ncy: 239.5\nwidth: 640\nheight: 480\nreadout: 2e-2\n")
+    assert load_camera(tmp_path / "a.yaml") == replace(PINHOLE, readout=0.02)
+    lines = ["a0: &a0 [1, 1]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 30))]
+    (tmp_path / "b.yaml").write_text("\n".join(lines) + "\n")
+    with pytest.raises(GavoError, match="unknown key"):
+        load_camera(tmp_path / "b.yaml")
+
+
+TEXTS = [text for text, _ in FILES.values()]
+
+
+@settings(max_examples=400)
+@given(
+    text=st.sampled_from(TEXTS),
+    at=st.floats(0, 1),
+    cut=st.integers(0, 40),
+    put=st.sampled_from(
+        ["", "nan", "-", "[", "{", "]", ":", "\n", "  ", "1e999", "<", ">", '"', "\t", "&a ", "*a", "%", "0"]
+    ),
+    suffix=st.sampled_from([".yaml", ".json", ".xml", ".toml", ".txt"]),
+)
+def test_damage_anywhere_raises_nothing_else(tmp_path_factory, text, at, cut, put, suffix):
+    place = int(at * len(text))
+    path: Path = tmp_path_factory.mktemp("camera") / f"camera{suffix}"
+    path.write_text(text[:place] + put + text[place + cut :])
+    try:
+        camera = load_camera(path)
+        assert np.isfinite(camera.matrix).all()
+    except GavoError as error:
+        assert len(str(error).splitlines()) == 1 and str(path) in str(error)
+
+
+def source_of(camera: Camera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Where undistorted pixels come from in the recorded image, as OpenCV projects points through the lens."""
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3)
+    project = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    if camera.model == "fisheye":
+        found, _ = project(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
+    else:
+        found, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
+    return found.reshape(*u.shape, 2)
+
+
+@pytest.mark.parametrize("camera", [BROWN, RATIO, FISH, replace(FISH, distortion=(0.0,) * 4)], ids=str)
+def test_undistortion_of_every_model_samples_where_the_lens_put_the_light(camera):
+    v, u = np.mgrid[:480, :640].astype(float)
+
+    def scene(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return 127 + 60 * np.sin(u / 40) + 60 * np.cos(v / 50)
+
+    assert camera.is_distorted and not camera.rectified().is_distorted
+    source = source_of(camera, u, v)
+    inside = (source[..., 0] > 0) & (source[..., 0] < 639) & (source[..., 1] > 0) & (source[..., 1] < 479)
+    undistorted = camera.undistort_image(np.round(scene(u, v)).astype(np.uint8))
+    assert np.abs(undistorted - scene(source[..., 0], source[..., 1]))[inside].max() < 1.6
+    columns = np.broadcast_to(np.arange(1, 641, dtype=np.uint16), (480, 640)).copy()
+    found = camera.undistort_depth(columns)
+    kept = found > 0
+    assert kept.mean() > 0.5 and np.abs(found - 1 - source[..., 0])[kept].max() < 0.55

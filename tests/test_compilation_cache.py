@@ -1,0 +1,122 @@
+"""What is kept is run as it is found: so only in a folder that nobody else can write to."""
+
+import os
+import stat
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+
+from gavo_jax import program_cache
+from gavo_jax.compilation_cache import enable_compilation_cache, why_not_private
+from gavo_jax.errors import GavoWarning
+from gavo_jax.program_cache import keep_programs_in
+
+NOBODY = 65534
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes of files mean nothing here")
+as_root = pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() != 0, reason="gives files away: needs root")
+
+
+@pytest.fixture(autouse=True)
+def own_settings(monkeypatch) -> Iterator[None]:
+    """Leave the process's caches as they were."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    kept = {name: jax.config.values[name] for name in CONFIGURED}
+    yield
+    for name, value in kept.items():
+        jax.config.update(name, value)
+    keep_programs_in(None)
+
+
+CONFIGURED = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+
+
+def give_away(path: Path) -> None:
+    os.chown(path, NOBODY, NOBODY)
+
+
+OPEN = {
+    "to all": lambda folder: folder.chmod(0o777),
+    "to the group": lambda folder: folder.chmod(0o770),
+    "sticky": lambda folder: folder.chmod(0o1777),
+    "part of it": lambda folder: ((folder / "traced").mkdir(), (folder / "traced").chmod(0o777)),
+    "the folder above": lambda folder: folder.parent.chmod(0o777),
+    "a file in it": lambda folder: (
+        (folder / "traced").mkdir(),
+        (folder / "traced" / "program").touch(),
+        (folder / "traced" / "program").chmod(0o666),
+    ),
+}
+GIVEN = {
+    "itself": lambda folder: give_away(folder),
+    "part of it": lambda folder: ((folder / "jax").mkdir(), give_away(folder / "jax")),
+    "a file in it": lambda folder: (
+        (folder / "traced").mkdir(),
+        (folder / "traced" / "program").touch(),
+        give_away(folder / "traced" / "program"),
+    ),
+}
+CASES = [pytest.param(make, id=f"open: {name}") for name, make in OPEN.items()]
+CASES += [pytest.param(make, id=f"another's: {name}", marks=as_root) for name, make in GIVEN.items()]
+
+
+@pytest.mark.parametrize("make", CASES)
+def test_where_others_can_write_nothing_is_kept_and_one_warning_says_so(tmp_path, make):
+    folder = tmp_path / "above" / "cache"
+    folder.mkdir(parents=True)
+    make(folder)
+    before = jax.config.values["jax_compilation_cache_dir"]
+    with pytest.warns(GavoWarning) as said:
+        enable_compilation_cache(folder)
+    assert len(said) == 1 and str(folder) in str(said[0].message) and "nothing is kept" in str(said[0].message)
+    assert program_cache._folder is None and jax.config.values["jax_compilation_cache_dir"] == before
+
+
+@pytest.mark.parametrize("mask", [0o000, 0o002, 0o022])
+def test_a_folder_of_ones_own_is_private_whatever_the_mask(tmp_path, mask):
+    previous = os.umask(mask)
+    try:
+        for _ in range(2):
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                enable_compilation_cache(tmp_path / "cache")
+            assert program_cache._folder == tmp_path / "cache" / "traced"
+            (tmp_path / "cache" / "traced" / "program").touch()
+    finally:
+        os.umask(previous)
+    assert stat.S_IMODE((tmp_path / "cache").stat().st_mode) == 0o700
+    assert Path(jax.config.values["jax_compilation_cache_dir"]).parent == tmp_path / "cache" / "jax"
+
+
+def test_a_link_to_ones_own_folder_will_do(tmp_path):
+    (tmp_path / "real").mkdir(0o700)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert why_not_private(tmp_path / "link") is None
+    (tmp_path / "real").chmod(0o777)
+    assert why_not_private(tmp_path / "link") == "others can write to it"
+
+
+def test_no_folder_is_no_warning(tmp_path):
+    (tmp_path / "file").touch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        enable_compilation_cache(tmp_path / "file" / "cache")
+    assert program_cache._folder is None
+
+
+def test_the_command_goes_on_with_one_line(tmp_path):
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    cache.chmod(0o777)
+    environment = {**os.environ, "GAVO_CACHE_DIR": str(cache)}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # set by JAX in this process
+    command = [sys.executable, "-m", "gavo_jax", "run", "--frames", "2", "--method", "gauss-newton", "--output", "out"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith(f"gavo: warning: {cache}: others can write to it")
+    assert not list(cache.iterdir())
