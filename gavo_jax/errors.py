@@ -107,8 +107,13 @@ def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[s
     Raises:
         GavoError: as `read_text`.
     """
+    return rows_of(read_text(path, max_bytes), path)
+
+
+def rows_of(text: str, path: str | Path) -> list[tuple[str, list[str]]]:
+    """Split the text of such a file; `path` is for the places."""
     rows = []
-    for number, line in enumerate(read_text(path, max_bytes).splitlines(), start=1):
+    for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if fields and not fields[0].startswith("#"):
             rows.append((f"{path}:{number}", fields))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, data_rows, read_text, write_bytes
+from gavo_jax.errors import GavoError, read_text, rows_of, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -84,11 +84,12 @@ class Trajectory:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, not finite, absurdly
                 large or without a rotation (zero quaternion).
         """
-        places = list(data_rows(path))
+        text = read_text(path)
+        places = rows_of(text, path)
         rows = [_parse_tum_row(place, fields) for place, fields in places]
         if not rows:
             raise GavoError(f"{path}: holds no trajectory (no rows)")
-        breaks = [n for n, line in enumerate(read_text(path).splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
+        breaks = [n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
         segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
         _, first = np.unique(table[:, 0], return_index=True)

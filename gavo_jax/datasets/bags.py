@@ -7,7 +7,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, overload
 
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files import Calibration, camera_from_table
-from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
+from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
 from gavo_jax.datasets.files import SAMPLED, Reading
@@ -28,9 +28,6 @@ from gavo_jax.trajectory import Trajectory, associate
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
 """In the folder of a ROS 2 bag."""
-
-MILLIMETRES = 1000.0
-"""Units of 16UC1, by REP 118."""
 
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
@@ -174,10 +171,8 @@ class BagSequence:
         return f"{self._bag.path}: {self._topics[topic].name} at {stamp:.6f}"
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
-        if not reading.is_auto:
-            found = reading.calibration(None, MILLIMETRES)
-        else:
-            found = self._bag.calibration(*(topic.name for topic in self._topics))
+        own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
+        found = reading.calibration(own, None, MILLIMETRES)  # units of 16UC1, by REP 118
         return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
 
 

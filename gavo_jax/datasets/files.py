@@ -20,6 +20,9 @@ from gavo_jax.datasets.images import read_color, read_depth
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 
+TRUTH = "groundtruth.txt"
+"""The true trajectory, in TUM's form, where it lies in a folder."""
+
 SAMPLED = 3
 """Frames, from the first to the last, that show what kind of images a sequence has."""
 
@@ -53,16 +56,24 @@ class Reading:
         """Whether the source has to bring its camera."""
         return isinstance(self.camera, str) and self.camera == "auto"
 
-    def calibration(self, size: Callable[[], Size] | None = None, depth_scale: float = DEPTH_SCALE) -> Calibration:
-        """The calibration that is named.
+    def calibration(
+        self,
+        own: Callable[[], Calibration],
+        size: Callable[[], Size] | None = None,
+        depth_scale: float = DEPTH_SCALE,
+    ) -> Calibration:
+        """The calibration that is named, else the source's own.
 
         Args:
+            own: reads what the source brings.
             size: finds out width and height of the images, for a file that does not say it.
             depth_scale: of a kind of source, for a file that does not say it.
 
         Raises:
             GavoError: as `load_calibration`.
         """
+        if self.is_auto:
+            return own()
         if isinstance(self.camera, Calibration):
             return self.camera
         if isinstance(self.camera, Camera):
@@ -211,6 +222,20 @@ CAMERA_FILES = (
 def own_camera_file(folder: Path) -> Path | None:
     """The camera file that lies in a folder, if one does."""
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def truth_in(folder: Path) -> Trajectory | None:
+    """The true trajectory that lies in a folder, if one does; raises `GavoError` if it cannot be read."""
+    return Trajectory.read_tum(folder / TRUTH) if (folder / TRUTH).exists() else None
+
+
+def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
+    """What of the colour and depth images makes no frame, a line each."""
+    return [
+        f"{count - frames} {one} images: no {other} image {why}"
+        for count, one, other in zip(images, ("colour", "depth"), ("depth", "colour"), strict=True)
+        if count > frames
+    ]
 
 
 def preset_by_name(folder: Path) -> Calibration:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
@@ -23,6 +24,8 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_first,
+    truth_in,
+    unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.errors import GavoError, data_rows
@@ -30,8 +33,6 @@ from gavo_jax.trajectory import Trajectory, associate, inverse
 
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
-
-MILLIMETRES = 1000.0
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
@@ -50,6 +51,10 @@ class Found(NamedTuple):
 
     color: dict[int, Path]
     depth: dict[int, Path]
+
+    def unpaired(self, frames: int) -> list[str]:
+        """What makes no frame, a line each."""
+        return unpaired((len(self.color), len(self.depth)), frames, "of the same number")
 
 
 class NumberedFolder(FileSequence):
@@ -98,10 +103,8 @@ class NumberedFolder(FileSequence):
             counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
             raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
         entries = [Entry(number / rate, found.color[number], found.depth[number]) for number in numbers]
-        if reading.is_auto:
-            calibration = cls.calibrate(path, entries[0], reading)
-        else:
-            calibration = reading.calibration(partial(size_of_first, entries), MILLIMETRES)
+        own = partial(cls.calibrate, path, entries[0], reading)
+        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
         poses = cls.poses(path)
         known = [number for number in numbers if number in poses]
         truth = None
@@ -109,7 +112,7 @@ class NumberedFolder(FileSequence):
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
             truth = Trajectory(np.array(known) / rate, np.stack([poses[number] @ posed_T_color for number in known]))
-        return cls(root.name, entries, calibration, truth, reading, _alone(found, numbers))
+        return cls(root.name, entries, calibration, truth, reading, found.unpaired(len(numbers)))
 
 
 class SevenScenes(NumberedFolder):
@@ -256,14 +259,9 @@ class PlainFolder(FileSequence):
         root = resolve_folder(path)
         color, depth = _plain_files(path)
         entries, left_out = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
-        if reading.is_auto:
-            calibration = cls.calibrate(path, entries[0], reading)
-        else:
-            calibration = reading.calibration(partial(size_of_first, entries), MILLIMETRES)
-        truth = path / "groundtruth.txt"
-        return cls(
-            root.name, entries, calibration, Trajectory.read_tum(truth) if truth.exists() else None, reading, left_out
-        )
+        own = partial(cls.calibrate, path, entries[0], reading)
+        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
+        return cls(root.name, entries, calibration, truth_in(path), reading, left_out)
 
 
 class Open3DFolder(PlainFolder):
@@ -307,15 +305,6 @@ def _numbered(files: Iterable[Path], suffixes: Sequence[str]) -> dict[int, Path]
     return found
 
 
-def _alone(found: Found, numbers: Sequence[int]) -> list[str]:
-    """What makes no frame, a line each."""
-    lines = []
-    for images, one, other in ((found.color, "colour", "depth"), (found.depth, "depth", "colour")):
-        if count := len(images) - len(numbers):
-            lines.append(f"{count} {one} images: no {other} image of the same number")
-    return lines
-
-
 def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth files, each in the order of their names."""
     for color in COLOR_FOLDERS:
@@ -345,11 +334,8 @@ def _by_stamp(
             "say --rate if the names are no stamps"
         )
     entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
-    lines = []
-    for count, one, other in ((len(color) - len(i), "colour", "depth"), (len(depth) - len(i), "depth", "colour")):
-        if count:
-            lines.append(f"{count} {one} images: no {other} image within {reading.max_difference:g} s")
-    return sorted(entries, key=lambda entry: entry.stamp), lines
+    left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s")
+    return sorted(entries, key=lambda entry: entry.stamp), left_out
 
 
 def _stamp(stem: str) -> float | None:
@@ -371,7 +357,8 @@ def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Readin
         counts = f"{len(color)} colour and {len(depth)} depth images"
         raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
     rate = reading.rate or RATE
-    return [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers], _alone(found, numbers)
+    entries = [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers]
+    return entries, found.unpaired(len(numbers))
 
 
 def _millimetres(calibration: Calibration) -> Calibration:

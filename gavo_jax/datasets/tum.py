@@ -21,9 +21,11 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_first,
+    truth_in,
+    unpaired,
 )
 from gavo_jax.errors import GavoError, data_rows
-from gavo_jax.trajectory import Trajectory, associate
+from gavo_jax.trajectory import associate
 
 MAX_DIFFERENCE = 0.02
 """Colour and depth stamps at least this far apart, in seconds, are not of one frame."""
@@ -37,7 +39,7 @@ MAX_PATH = 1000
 MAX_STAMP = 1e15
 """Seconds; beyond, microseconds are lost in double precision anyway."""
 
-COLOR_LIST, DEPTH_LIST, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+COLOR_LIST, DEPTH_LIST = "rgb.txt", "depth.txt"
 ASSOCIATIONS = "associations.txt"
 """Both lists in one, as ICL-NUIM has it: `stamp path stamp path`."""
 
@@ -104,18 +106,14 @@ class TumSequence(FileSequence):
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry) for entry in entries]
-        if reading.is_auto:
-            calibration = _own_calibration(self.folder, files)
-        else:
-            calibration = reading.calibration(partial(size_of_first, files))
-        truth = self.folder / TRUTH
+        why = f"within {max_difference:g} s that is not another's"
         super().__init__(
             name or resolved.name,
             files,
-            calibration,
-            Trajectory.read_tum(truth) if truth.exists() else None,
+            reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_first, files)),
+            truth_in(self.folder),
             reading,
-            _left_out(len(color_rows), len(depth_rows), len(entries), max_difference),
+            unpaired((len(color_rows), len(depth_rows)), len(entries), why),
         )
 
     @classmethod
@@ -141,15 +139,6 @@ def _own_calibration(folder: Path, entries: list[Entry]) -> Calibration:
     """The camera file in the folder, else the preset that its name speaks of."""
     file = own_camera_file(folder)
     return preset_by_name(folder) if file is None else load_calibration(file, partial(size_of_first, entries))
-
-
-def _left_out(colors: int, depths: int, frames: int, max_difference: float) -> list[str]:
-    """What of the lists makes no frame, a line each."""
-    lines = []
-    for count, one, other in ((colors - frames, "colour", "depth"), (depths - frames, "depth", "colour")):
-        if count > 0:
-            lines.append(f"{count} {one} images: no {other} image within {max_difference:g} s that is not another's")
-    return lines
 
 
 class _Row(NamedTuple):
