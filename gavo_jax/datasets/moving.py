@@ -71,7 +71,7 @@ class MovingBody:
 
 @dataclass(frozen=True, eq=False)
 class BodyTruth:
-    """Where a body truly is. MovingPart p's frame is the one that its boxes are given in.
+    """Where a body truly is. Part p's frame is the one that its boxes are given in.
 
     Attributes:
         name: as its `MovingBody` says.

@@ -21,7 +21,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.actors import builtin_bodies, turn
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.bodies_truth import MASKS, WithBodies, write_mask, write_truth
-from gavo_jax.datasets.moving import MovingBody, BodyTruth, Scene, body_of_part, build_scene, truths
+from gavo_jax.datasets.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
 from gavo_jax.datasets.rendering import render
 from gavo_jax.datasets.room import (
     HIGHEST_VIEW,

@@ -9,7 +9,7 @@ import pytest
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.actors import MOST_BODIES, Sway, box
 from gavo_jax.datasets.bodies_truth import MASKS, TRUTH
-from gavo_jax.datasets.moving import MovingBody, BodyTruth, MovingPart
+from gavo_jax.datasets.moving import BodyTruth, MovingBody, MovingPart
 from gavo_jax.datasets.room import Box
 from gavo_jax.datasets.synthetic import KINECT, NONE, SyntheticSequence, write_tum
 from gavo_jax.datasets.tum import TumSequence
