@@ -34,6 +34,8 @@ class Source:
     """Of the colour images of a recording."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
     """Of the depth images of a recording."""
+    moving: Annotated[int, arg(metavar="N")] = 0
+    """Bodies that move through the synthetic room: a box, a walking figure, more boxes."""
     force: bool = False
     """Go on although the depth looks as if its scale were wrong."""
 

@@ -135,6 +135,7 @@ def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, A
             "first_timestamp": float(sequence.timestamps[0]),
             "last_timestamp": float(sequence.timestamps[-1]),
             "camera": sequence.camera,
+            **({"bodies": options.moving} if options.moving else {}),
         },
         "solver": settings.solver,
         "alignment": settings.alignment,

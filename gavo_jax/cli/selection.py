@@ -2,9 +2,10 @@
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Search, Source
+from gavo_jax.datasets.actors import MOST_BODIES
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.selection import open_part
+from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
@@ -25,10 +26,15 @@ def open_sequence(source: Source, force: bool = False) -> Sequence:
     _check_at_least("--stride", source.stride, 1)
     if source.frames is not None:
         _check_at_least("--frames", source.frames, 2)
+    if source.moving and source.sequence != SYNTHETIC:
+        raise GavoError(f"--moving: is of the {SYNTHETIC} room, not of {source.sequence}")
+    if not 0 <= source.moving <= MOST_BODIES:
+        raise GavoError(f"--moving: must be from 0 to {MOST_BODIES}, not {source.moving}")
     return open_part(
         *(source.sequence, source.camera, source.start, source.frames, source.stride),
         reading=reading_of(source),
         force=force or source.force,
+        moving=source.moving,
     )
 
 

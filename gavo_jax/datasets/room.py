@@ -74,8 +74,12 @@ def build_room(seed: int, half_extent: tuple[float, float] = (3.0, 2.5), height:
         height: metres.
     """
     faces = _collect_faces(half_extent, height)
-    light = 0.82 + 0.18 * (faces.normal @ np.array([-0.45, 0.3, 0.84]))
-    return Room(half_extent, height, faces, paint(faces.textures, faces.size, light, seed))
+    return Room(half_extent, height, faces, paint(faces.textures, faces.size, shine(faces.normal), seed))
+
+
+def shine(normal: np.ndarray) -> np.ndarray:
+    """The light that falls on surfaces of some normals [F, 3] (unit, in the world): factors [F] on their albedo."""
+    return 0.82 + 0.18 * (normal @ np.array([-0.45, 0.3, 0.84]))
 
 
 def free_space(half_extent: tuple[float, float], height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -87,9 +91,9 @@ def free_space(half_extent: tuple[float, float], height: float) -> tuple[np.ndar
 def _collect_faces(half_extent: tuple[float, float], height: float) -> Faces:
     hull = Box((0.0, 0.0, 0.0), (2 * half_extent[0], 2 * half_extent[1], height), "")
     walls = ["wallpaper", "wallpaper", "wallpaper", "wallpaper", "floor", "ceiling"]
-    parts = _box_faces(hull, walls, inwards=True)
+    parts = box_faces(hull, walls, inwards=True)
     for box in _furniture(*half_extent):
-        parts += _box_faces(box, [box.texture] * 6, inwards=False)
+        parts += box_faces(box, [box.texture] * 6, inwards=False)
     low, high = free_space(half_extent, height)
     views = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     seen = [part for part in parts if np.any((views - part[0]) @ part[3] > 0)]
@@ -97,7 +101,7 @@ def _collect_faces(half_extent: tuple[float, float], height: float) -> Faces:
     return Faces(*(np.array(field) for field in (origin, u, v, normal, size, tint)), textures=textures)
 
 
-def _box_faces(box: Box, textures: list[str], inwards: bool) -> list[tuple]:
+def box_faces(box: Box, textures: list[str], inwards: bool) -> list[tuple]:
     """Rectangles of a box in the order -x, +x, -y, +y, -z, +z, seen from inside or outside; v points down walls."""
     cos, sin = math.cos(math.radians(box.yaw)), math.sin(math.radians(box.yaw))
     axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -24,6 +24,7 @@ def open_part(
     stride: int = 1,
     reading: Reading | None = None,
     force: bool = False,
+    moving: int = 0,
 ) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
 
@@ -35,6 +36,7 @@ def open_part(
         stride: Take every so-manieth frame, from 1.
         reading: What else is to be known of the source; its own camera does not count.
         force: Whether depth that looks as if its scale were wrong is taken all the same.
+        moving: How many bodies move through the synthetic room.
 
     Raises:
         GavoError: what is wrong with the source or its camera; fewer than two frames; a depth scale that is wrong by 5
@@ -42,7 +44,7 @@ def open_part(
     """
     stop = None if frames is None else start + (frames - 1) * stride + 1
     reading = replace(reading or Reading(), camera=camera)
-    whole = _synthetic(camera, stop) if source == SYNTHETIC else open_source(source, reading)
+    whole = _synthetic(camera, stop, moving) if source == SYNTHETIC else open_source(source, reading)
     chosen = whole[start:stop:stride]
     if len(chosen) < 2:
         raise GavoError(
@@ -55,8 +57,8 @@ def open_part(
     return chosen
 
 
-def _synthetic(camera: str, stop: int | None) -> SyntheticSequence:
+def _synthetic(camera: str, stop: int | None, moving: int) -> SyntheticSequence:
     frames = SYNTHETIC_FRAMES if stop is None else stop
     if frames > MAX_SYNTHETIC_FRAMES:
         raise GavoError(f"{SYNTHETIC}: has no more than {MAX_SYNTHETIC_FRAMES} frames, not {frames}")
-    return SyntheticSequence(frames, camera=None if camera == "auto" else load_camera(camera))
+    return SyntheticSequence(frames, camera=None if camera == "auto" else load_camera(camera), bodies=moving)

@@ -7,26 +7,27 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import overload
+from typing import cast, overload
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from gavo_jax.camera import Camera
+from gavo_jax.datasets.actors import builtin_bodies, turn
 from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.bodies_truth import MASKS, WithBodies, write_mask, write_truth
+from gavo_jax.datasets.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
 from gavo_jax.datasets.rendering import render
 from gavo_jax.datasets.room import (
     HIGHEST_VIEW,
     LOWEST_VIEW,
     MARGIN_X,
     MARGIN_Y,
-    Room,
-    build_room,
     free_space,
 )
 from gavo_jax.errors import GavoError
@@ -176,9 +177,13 @@ class SyntheticSequence:
         rate: frames a second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
         speed: the motion is played this many times faster.
         color: also give RGB images; grey is then computed from them as OpenCV does.
+        bodies: what moves through the room: bodies with paths of their own (`speed` is the camera's alone), or how many
+            of the built-in ones (a box, a walking figure, more boxes). `bodies_truth`, `body_labels` and `part_labels`
+            tell where they are; the camera's truth and what the bodies leave of the room are the same without them.
 
     Raises:
-        GavoError: an argument out of range, or a trajectory that cannot be read, is empty, not finite or too large.
+        GavoError: an argument out of range, a body that cannot be, or a trajectory that cannot be read, is empty, not
+            finite or too large.
     """
 
     def __init__(
@@ -191,6 +196,7 @@ class SyntheticSequence:
         rate: float | None = None,
         speed: float = 1.0,
         color: bool = False,
+        bodies: int | Iterable[MovingBody] = (),
     ) -> None:
         if frames is not None and frames < 1:
             raise GavoError(f"synthetic: frames: must be at least 1, not {frames}")
@@ -209,7 +215,12 @@ class SyntheticSequence:
             self._truth, self._half_extent, self._height = _fit_room(_play(source, frames, rate, speed))
         self._selection = np.arange(len(self._truth))
         self._phases = np.random.default_rng([seed, _EXPOSURE_STREAM]).uniform(0, 2 * np.pi, 2)
+        if isinstance(bodies, int):
+            bodies = builtin_bodies(bodies, seed, self._truth.world_T_camera[0], self._half_extent)
+        self._bodies = tuple(bodies)
+        self._bodies_truth = truths(self._bodies, self._truth.timestamps)
         self._render: Callable[[int], Frame] = lru_cache(maxsize=2)(self._render_frame)
+        self._expose: Callable[[int], tuple[np.ndarray, ...]] = lru_cache(maxsize=2)(self._expose_frame)
 
     @property
     def name(self) -> str:
@@ -230,6 +241,20 @@ class SyntheticSequence:
     def timestamps(self) -> Float[np.ndarray, " frames"]:
         """Stamp of each frame, seconds."""
         return self._truth.timestamps[self._selection]
+
+    @property
+    def bodies_truth(self) -> tuple[BodyTruth, ...]:
+        """Exact poses of every body at every frame of the whole sequence (slices keep it whole)."""
+        return self._bodies_truth
+
+    def body_labels(self, index: int) -> UInt8[np.ndarray, "height width"]:
+        """Which body each pixel's centre shows in frame `index`: its label, or 0 for the room; IndexError outside."""
+        return body_of_part(self._bodies_truth)[self.part_labels(index)]
+
+    def part_labels(self, index: int) -> UInt8[np.ndarray, "height width"]:
+        """Which body's rigid part each pixel's centre shows in frame `index`, or 0 for the room; IndexError outside."""
+        face = self._expose(int(self._selection[index]))[2]
+        return self._scene().label.astype(np.uint8)[face]
 
     def check(self) -> None:
         """Nothing is wrong with what was not read from files: never raises."""
@@ -254,15 +279,14 @@ class SyntheticSequence:
 
     def _render_frame(self, i: int) -> Frame:
         """Render frame i of the whole sequence and let the sensor disturb it."""
-        room = build_room(self._seed, self._half_extent, self._height)
-        exact_grey, exact_depth, face = self._expose(room, i)
+        exact_grey, exact_depth, face = self._expose(i)
         rng = np.random.default_rng([self._seed, _FRAME_STREAM, i])
         seconds = float(self._truth.timestamps[i] - self._truth.timestamps[0])
         grey = self._noise.disturb_grey(exact_grey, seconds, self._phases, rng)
         depth = self._noise.disturb_depth(exact_depth, float(self._camera.fx), rng)
         color = None
         if self._color:
-            color = _to_bytes(grey[..., None] * room.faces.tint.astype(np.float32)[face])
+            color = _to_bytes(grey[..., None] * self._scene().room.faces.tint.astype(np.float32)[face])
             grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         frame = Frame(
             grey=_to_bytes(grey),
@@ -275,22 +299,23 @@ class SyntheticSequence:
                 image.setflags(write=False)
         return frame
 
-    def _expose(self, room: Room, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _scene(self) -> Scene:
+        return build_scene(self._seed, self._half_extent, self._height, self._bodies)
+
+    def _expose_frame(self, i: int) -> tuple[np.ndarray, ...]:
         """Exact grey, depth and faces of frame i; with a rolling shutter in bands of rows, each at its moment."""
-        camera = self._camera
+        camera, scene, stamps = self._camera, self._scene(), self._truth.timestamps
         if not camera.readout:
-            return render(room, camera, self._truth.world_T_camera[i])
+            return render(scene.at(stamps[i] - stamps[0]), camera, self._truth.world_T_camera[i])
         tops = np.unique(np.linspace(0, camera.height, BANDS + 1).astype(int))
         middles = 0.5 * (tops[:-1] + tops[1:] - 1)
-        moments = self._truth.timestamps[i] + camera.readout * row_time(middles, camera)
-        moments = np.clip(moments, self._truth.timestamps[0], self._truth.timestamps[-1])
+        moments = np.clip(stamps[i] + camera.readout * row_time(middles, camera), stamps[0], stamps[-1])
         poses, _ = self._truth.interpolate(moments, max_gap=math.inf)
         bands = [
-            render(room, replace(camera, cy=camera.cy - top, height=int(bottom - top)), pose)
-            for top, bottom, pose in zip(tops[:-1], tops[1:], poses, strict=True)
+            render(scene.at(moment - stamps[0]), replace(camera, cy=camera.cy - top, height=int(bottom - top)), pose)
+            for top, bottom, moment, pose in zip(tops[:-1], tops[1:], moments, poses, strict=True)
         ]
-        grey, depth, face = (np.concatenate(rows) for rows in zip(*bands, strict=True))
-        return grey, depth, face
+        return tuple(np.concatenate(rows) for rows in zip(*bands, strict=True))
 
 
 def _to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
@@ -331,21 +356,11 @@ def builtin_path(frames: int, rate: float = DEFAULT_RATE, speed: float = 1.0, se
     world_T_camera = np.tile(np.eye(4), (frames, 1, 1))
     # camera axes (right, down, forward) in a body frame (forward, left, up)
     body_R_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    world_T_camera[:, :3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0) @ body_R_camera
+    world_T_camera[:, :3, :3] = turn(yaw, 2) @ turn(pitch, 1) @ turn(roll, 0) @ body_R_camera
     world_T_camera[:, 0, 3] = _FORWARD + wave(3, (0.18, 5.5), (0.015, 1.1))
     world_T_camera[:, 1, 3] = wave(4, (0.22, 6.3), (0.015, 1.3))
     world_T_camera[:, 2, 3] = _EYE_LEVEL + wave(5, (0.09, 3.9), (0.015, 1.2))
     return Trajectory(timestamps, world_T_camera)
-
-
-def _turn(angle: np.ndarray, axis: int) -> np.ndarray:
-    """Rotations [n, 3, 3] about a coordinate axis by angles [n] in radians."""
-    matrix = np.tile(np.eye(3), (len(angle), 1, 1))
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix[:, i, i] = matrix[:, j, j] = np.cos(angle)
-    matrix[:, j, i] = np.sin(angle)
-    matrix[:, i, j] = -matrix[:, j, i]
-    return matrix
 
 
 def _play(source: Trajectory, frames: int | None, rate: float | None, speed: float) -> Trajectory:
@@ -390,7 +405,8 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     """Write a sequence as a folder in TUM layout that reads back identically, with its camera as `camera.toml`.
 
     Colour images are 8-bit RGB (three equal channels where the frames have no colour), depth 16 bit in the camera's raw
-    units. The lists are written last, so that a folder left half written is not taken for a sequence.
+    units. Where bodies move, `bodies_truth.csv` and `masks/` tell where they are. The lists are written last, so that a
+    folder left half written is not taken for a sequence.
 
     Raises:
         GavoError: the folder holds a sequence already, or something cannot be written.
@@ -402,17 +418,24 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        stamps = []
-        for frame in sequence:
+        stamps, rows = [], []
+        bodies = getattr(sequence, "bodies_truth", ())
+        if bodies:
+            (folder / MASKS).mkdir(exist_ok=True)
+        for index, frame in enumerate(sequence):
             stamps.append(np.format_float_positional(frame.timestamp, unique=True, min_digits=6))
             image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
             if frame.color is not None:
                 image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
             _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
             _write_png(folder / "depth" / f"{stamps[-1]}.png", frame.depth)
+            if bodies:
+                rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamps[-1], folder)
         (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
         if sequence.ground_truth is not None:
             sequence.ground_truth.write_tum(folder / "groundtruth.txt")
+        if bodies:
+            write_truth(rows, folder)
         for part in ("depth", "rgb"):
             rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in stamps)]
             (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -9,6 +9,8 @@ from command import Done, runner
 from layouts import CAMERA, LAYOUTS, image
 from recordings import COLOR, DEPTH, KINDS, Shot, record
 
+from gavo_jax.cli.options import Source
+from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.trajectory import Trajectory
 
@@ -116,11 +118,20 @@ def test_a_recording_runs_by_its_name_alone(gavo, tmp_path, kind):
         (["--depth-scale", "-1"], ["--depth-scale"]),
         (["--depth-scale", "inf"], ["--depth-scale"]),
         (["--camera", "nonsense.json"], ["nonsense.json: no such file"]),
+        (["--moving", "1"], ["--moving", "synthetic"]),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "inspect"])
 def test_bad_options_are_refused(gavo, clip, command, arguments, words):
     assert is_refused(gavo(command, clip, *arguments), *words)
+
+
+def test_bodies_move_through_the_synthetic_room(gavo):
+    sequence = open_sequence(Source(frames=2, moving=2))
+    assert isinstance(sequence, SyntheticSequence)
+    assert [body.label for body in sequence.bodies_truth] == [1, 2]
+    assert is_refused(gavo("inspect", "synthetic", "--moving", "8"), "--moving", "7")
+    assert gavo("inspect", "synthetic", "--frames", "2", "--moving", "1").status == 0
 
 
 def test_millimetres_with_a_benchmarks_camera_are_refused(gavo, data_dir, tmp_path):
