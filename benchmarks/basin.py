@@ -1,16 +1,18 @@
 """How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
 
 A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
-stamps. Prints a row a gap: the number of pairs, their median motion, and each method's success rate (median over the
-seeds; presets as METHOD:PRESET, peers by name); then a row a method: how often its status was right about failure, as
-precision (share of the flagged pairs that had failed) and recall (share of the failed pairs that were flagged), and
-the milliseconds a pair. A peer's status is the flag that it returns.
+stamps. Prints one row per gap: the number of pairs, their median motion, and each method's success rate (median over
+the seeds; presets as METHOD:PRESET, peers by name); then the median error of the pairs that were found; then one row
+per method: how often its status was right about failure, as precision (share of the flagged pairs that had failed) and
+recall (share of the failed pairs that were flagged), and the milliseconds per pair. A peer's status is the flag that it
+returns. The gap is in frames of the clip: one that keeps every 4th frame of a sequence has four times the motion.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
+    python benchmarks/basin.py --clip fr1_desk_loop --gaps 2,3,4,8 --step 1 --methods ga:wide,sift-pnp,orb-pnp
     python benchmarks/basin.py --figure docs
 
-On 2 cores the defaults take about 5 minutes.
+On 2 cores the defaults take about 10 minutes.
 """
 
 import time
@@ -154,6 +156,19 @@ def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def median_errors(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row a gap and method: median errors of the pairs that were found, metres and degrees; None where none was."""
+    rows = []
+    for gap in dict.fromkeys(r["gap"] for r in records):
+        for name in dict.fromkeys(r["method"] for r in records):
+            found = [r for r in records if r["gap"] == gap and r["method"] == name and r["found"]]
+            metres, degrees = (
+                float(np.median([r[key] for r in found])) if found else None for key in ("error_m", "error_deg")
+            )
+            rows.append({"gap": gap, "method": name, "found": len(found), "error_m": metres, "error_deg": degrees})
+    return rows
+
+
 def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row a method: precision and recall of its status as a sign of failure; None where there is nothing to count."""
     rows = []
@@ -177,7 +192,7 @@ def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main(
     clip: str = "fr1_rpy",
-    gaps: str = "1,3,6,10,15",
+    gaps: str = "1,3,6,10,15,30",
     methods: str = METHODS,
     step: int = 4,
     seeds: int = 1,
@@ -217,6 +232,12 @@ def main(
         for row in rates
     ]
     print_table(f"success rate on {clip}", ("gap", "pairs", "motion m", "deg", *aligners), rows)
+    errors = median_errors(records)
+    rows = [
+        [gap] + [f"{number(row['error_m'], 4)} {number(row['error_deg'], 2)}" for row in errors if row["gap"] == gap]
+        for gap in dict.fromkeys(row["gap"] for row in errors)
+    ]
+    print_table("median error of the found, m and degrees", ("gap", *aligners), rows)
     rows = [
         [row["method"], row["attempts"], row["failed"], row["flagged"]]
         + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
@@ -225,7 +246,7 @@ def main(
     print_table(
         "status against failure", ("method", "tries", "failed", "flagged", "precision", "recall", "ms/pair"), rows
     )
-    results = {"clip": clip, "success": rates, "status": agreement, "attempts": records}
+    results = {"clip": clip, "success": rates, "errors": errors, "status": agreement, "attempts": records}
     common.record(json, "basin", results)
     if figure is not None:
         _draw(records, clip, figure)

@@ -2,60 +2,26 @@
 
 Every peer answers in this project's terms: `target_T_reference`, which maps points of the reference camera into the
 target camera, in metres. Each aligns two single frames from a zero guess, at its library's default settings; where one
-differs, the docstring of the class names it with the reason. Open3D is imported only when one of its peers is made.
+differs, the docstring of the class names it with the reason. A library beside OpenCV is imported only when one of its
+peers is made.
 """
 
 import importlib
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float64
 
 from gavo_jax.camera import Camera
+from gavo_jax.cloud_peers import KissIcpPeer, SmallGicpPeer
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-
-
-@dataclass(frozen=True, eq=False)
-class PeerResult:
-    """What a peer says of a pair of frames.
-
-    Attributes:
-        target_T_reference: maps points of the reference camera into the target camera, metres; the identity where the
-            peer failed.
-        success: the peer's own verdict, a weak one with all of them: each class says what it does not notice.
-    """
-
-    target_T_reference: Float64[np.ndarray, "4 4"]
-    success: bool
-
-
-class Peer(Protocol):
-    """An odometry of another library, ready for frames of one camera.
-
-    Attributes:
-        name: key in `PEERS`.
-        versions: of the libraries behind it, for the records of a run.
-    """
-
-    name: str
-    versions: dict[str, str]
-
-    def prepare(self, frame: Frame) -> Any:
-        """Do the work on one frame that is kept between its pairs.
-
-        Raises:
-            GavoError: the frame is not of the camera's size.
-        """
-        ...
-
-    def align(self, reference: Any, target: Any) -> PeerResult:
-        """Align two prepared frames from a zero guess."""
-        ...
+from gavo_jax.feature_peers import FeaturePeer
+from gavo_jax.features import FeatureKind
+from gavo_jax.peer import Peer, PeerResult, check_size, failure, result_of
 
 
 class OpenCVPeer:
@@ -81,7 +47,7 @@ class OpenCVPeer:
         self.versions = {"opencv": cv2.__version__}
         self._camera = camera
         settings = cv2.OdometrySettings()
-        settings.setCameraMatrix(_camera_matrix(camera).astype(np.float32))
+        settings.setCameraMatrix(camera.matrix.astype(np.float32))
         settings.setMaxTranslation(1e6)
         settings.setMaxRotation(360.0)
         if kind != cv2.ODOMETRY_TYPE_DEPTH:
@@ -94,7 +60,7 @@ class OpenCVPeer:
         Raises:
             GavoError: the frame is not of the camera's size.
         """
-        _check_size(frame, self._camera)
+        check_size(frame, self._camera)
         metres = frame.depth.astype(np.float32) / np.float32(self._camera.depth_scale)
         metres[metres >= self.DEPTH_LIMIT] = 0.0
         prepared = cv2.OdometryFrame(depth=metres, image=frame.grey)
@@ -104,7 +70,7 @@ class OpenCVPeer:
     def align(self, reference: cv2.OdometryFrame, target: cv2.OdometryFrame) -> PeerResult:
         """Align two prepared frames from a zero guess."""
         success, target_T_reference = self._odometry.compute(reference, target)
-        return _result(target_T_reference, success)
+        return result_of(target_T_reference, success)
 
 
 class Open3DLegacyPeer:
@@ -147,7 +113,7 @@ class Open3DLegacyPeer:
         Raises:
             GavoError: the frame is not of the camera's size.
         """
-        _check_size(frame, self._camera)
+        check_size(frame, self._camera)
         image = self._open3d.geometry.Image
         return self._open3d.geometry.RGBDImage.create_from_color_and_depth(
             image(np.ascontiguousarray(frame.grey)),
@@ -162,7 +128,7 @@ class Open3DLegacyPeer:
         success, target_T_reference, _ = self._open3d.pipelines.odometry.compute_rgbd_odometry(
             reference, target, self._intrinsic, np.eye(4), self._jacobian, self._option
         )
-        return _result(target_T_reference, success)
+        return result_of(target_T_reference, success)
 
 
 class Open3DTensorPeer:
@@ -187,7 +153,7 @@ class Open3DTensorPeer:
         odometry = self._open3d.t.pipelines.odometry
         self._method = getattr(odometry.Method, method)
         self._criteria = [odometry.OdometryConvergenceCriteria(count) for count in self.ITERATIONS]
-        self._intrinsics = self._open3d.core.Tensor(_camera_matrix(camera))
+        self._intrinsics = self._open3d.core.Tensor(camera.matrix)
 
     def prepare(self, frame: Frame) -> Any:
         """Copy one frame into Open3D's tensors; the grey becomes three equal channels, which Open3D expects.
@@ -195,7 +161,7 @@ class Open3DTensorPeer:
         Raises:
             GavoError: the frame is not of the camera's size.
         """
-        _check_size(frame, self._camera)
+        check_size(frame, self._camera)
         image, tensor = self._open3d.t.geometry.Image, self._open3d.core.Tensor
         color = np.repeat(frame.grey[..., None], 3, axis=-1)
         depth = np.ascontiguousarray(frame.depth[..., None])
@@ -215,8 +181,8 @@ class Open3DTensorPeer:
         except RuntimeError as error:
             if "Singular" not in str(error):
                 raise
-            return _failure()
-        return _result(result.transformation.numpy(), True)
+            return failure()
+        return result_of(result.transformation.numpy(), True)
 
 
 @dataclass(frozen=True)
@@ -253,17 +219,30 @@ def _tensor(name: str, method: str, what: str) -> PeerInfo:
     return PeerInfo(name, f"Open3D tensor, {what}", "open3d", lambda camera: Open3DTensorPeer(name, camera, method))
 
 
+def _features(name: str, kind: FeatureKind, what: str) -> PeerInfo:
+    return PeerInfo(name, f"OpenCV, {what}", "cv2", lambda camera: FeaturePeer(name, camera, kind))
+
+
 PEERS: dict[str, PeerInfo] = {
     info.name: info
     for info in (
         _opencv("opencv-rgb", cv2.ODOMETRY_TYPE_RGB, "photometric"),
         _opencv("opencv-rgbd", cv2.ODOMETRY_TYPE_RGB_DEPTH, "photometric and point to plane"),
         _opencv("opencv-depth", cv2.ODOMETRY_TYPE_DEPTH, "point to plane"),
+        _features("sift-pnp", "sift", "SIFT features and a pose from matches"),
+        _features("orb-pnp", "orb", "ORB features and a pose from matches"),
         _legacy("open3d-color", "RGBDOdometryJacobianFromColorTerm", 10.0, "photometric"),
         _legacy("open3d-hybrid", "RGBDOdometryJacobianFromHybridTerm", 4.0, "photometric and depth"),
         _tensor("open3d-tensor-intensity", "Intensity", "photometric"),
         _tensor("open3d-tensor-hybrid", "Hybrid", "photometric and depth"),
         _tensor("open3d-tensor-point-to-plane", "PointToPlane", "point to plane"),
+        PeerInfo(
+            "small-gicp",
+            "small_gicp, generalised ICP",
+            "small_gicp",
+            lambda camera: SmallGicpPeer("small-gicp", camera),
+        ),
+        PeerInfo("kiss-icp", "kiss-icp, point to point", "kiss_icp", lambda camera: KissIcpPeer("kiss-icp", camera)),
     )
 }
 """Every peer by the name that the command line knows."""
@@ -273,7 +252,7 @@ def make_peer(name: str, camera: Camera) -> Peer:
     """Return the peer of that name, ready for rectified frames of that camera: no peer models lens distortion.
 
     Raises:
-        GavoError: the name is not in `PEERS`, or Open3D is asked for and cannot be imported.
+        GavoError: the name is not in `PEERS`, or its library cannot be imported.
     """
     if name not in PEERS:
         raise GavoError(f"unknown method {name!r}: the peers are {', '.join(PEERS)}")
@@ -285,24 +264,3 @@ def _import_open3d() -> Any:
         return importlib.import_module("open3d")
     except ImportError as error:
         raise GavoError(f"Open3D cannot be imported ({error}): install 'gavo-jax[peers]'") from error
-
-
-def _camera_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
-    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], dtype=np.float64)
-
-
-def _check_size(frame: Frame, camera: Camera) -> None:
-    expected = (camera.height, camera.width)
-    if frame.grey.shape != expected or frame.depth.shape != expected:
-        raise GavoError(f"grey {frame.grey.shape} and depth {frame.depth.shape} for a camera of {expected}")
-
-
-def _failure() -> PeerResult:
-    return PeerResult(np.eye(4), False)
-
-
-def _result(target_T_reference: Float[np.ndarray, "4 4"], success: bool) -> PeerResult:
-    """Return the motion as float64; a failure where the peer says so or where the matrix is not finite."""
-    if not success or not np.isfinite(target_T_reference).all():
-        return _failure()
-    return PeerResult(np.array(target_T_reference, dtype=np.float64), True)
