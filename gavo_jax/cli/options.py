@@ -72,6 +72,8 @@ class Run(Search, Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    trajectory_format: Annotated[str, arg(metavar="{tum,kitti,euroc,json,bag}")] = "tum"
+    """In what else the trajectory is written, with commas between: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False

@@ -20,11 +20,13 @@ from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, comput
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import RECORDING, environment
+from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell
 from gavo_jax.output.tracked import track_visibly
+from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
@@ -38,6 +40,7 @@ CHECKPOINT_SECONDS = 2.0
 def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
     check_seed(options.seed)
+    trajectory_formats = formats(options.trajectory_format)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
     sequence = open_sequence(options)
@@ -55,12 +58,14 @@ def run(options: Run) -> int:
             tell(f"{folder.path}: the run came to its end before: nothing to resume")
         else:
             if progress is None:
+                remove_trajectories(folder.path)
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
             say(summary(sequence))
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
+        write_trajectories(Trajectory.read_tum(folder.path / TRAJECTORY), folder.path, trajectory_formats)
     print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if interrupted:
         return INTERRUPTED
