@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from gavo_jax.cli.map_file import check_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
@@ -41,9 +42,10 @@ def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
     check_seed(options.seed)
     trajectory_formats = formats(options.trajectory_format)
+    shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
-    sequence = open_sequence(options)
+    sequence = open_sequence(options, color=options.map is not None)
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
@@ -66,6 +68,8 @@ def run(options: Run) -> int:
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
         write_trajectories(Trajectory.read_tum(folder.path / TRAJECTORY), folder.path, trajectory_formats)
+        if options.map is not None:
+            save_map(options.map, sequence, folder.steps(), shape, options.voxel)
     print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if interrupted:
         return INTERRUPTED
