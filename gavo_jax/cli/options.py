@@ -74,6 +74,16 @@ class Run(Search, Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    trajectory_format: Annotated[str, arg(metavar="{tum,kitti,euroc,json,bag}")] = "tum"
+    """In what else the trajectory is written, with commas between: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
+    map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(.ply, .pcd or .obj; default: none)")] = None
+    """Write what was seen, in colour: a cloud, or into .obj a mesh; needs the extra [map]."""
+    map_shape: Annotated[
+        Literal["cloud", "mesh"] | None, arg(metavar="{cloud,mesh}", help_behavior_hint="(default: the ending's)")
+    ] = None
+    """What the map is."""
+    voxel: Annotated[float, arg(metavar="M")] = 0.01
+    """Side of the map's voxels, metres."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from gavo_jax.cli.map_file import check_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
@@ -20,11 +21,13 @@ from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, comput
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import RECORDING, environment
+from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell
 from gavo_jax.output.tracked import track_visibly
+from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
@@ -38,9 +41,11 @@ CHECKPOINT_SECONDS = 2.0
 def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
     check_seed(options.seed)
+    trajectory_formats = formats(options.trajectory_format)
+    shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
-    sequence = open_sequence(options)
+    sequence = open_sequence(options, color=options.map is not None)
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
@@ -55,12 +60,16 @@ def run(options: Run) -> int:
             tell(f"{folder.path}: the run came to its end before: nothing to resume")
         else:
             if progress is None:
+                remove_trajectories(folder.path)
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
             say(summary(sequence))
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
+        write_trajectories(Trajectory.read_tum(folder.path / TRAJECTORY), folder.path, trajectory_formats)
+        if options.map is not None:
+            save_map(options.map, sequence, folder.steps(), shape, options.voxel)
     print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if interrupted:
         return INTERRUPTED

@@ -1,5 +1,7 @@
 """From options to frames: which sequence, which of its frames, by which camera."""
 
+from dataclasses import replace
+
 from gavo_jax import presets
 from gavo_jax.cli.options import Search, Source
 from gavo_jax.datasets.actors import MOST_BODIES
@@ -12,12 +14,13 @@ from gavo_jax.settings_file import NamedSettings, assignments, load_settings, ov
 MAX_SEED = 2**32 - 1
 
 
-def open_sequence(source: Source, force: bool = False) -> Sequence:
+def open_sequence(source: Source, force: bool = False, color: bool = False) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
 
     Args:
         source: the options.
         force: as their own `force`.
+        color: whether frames carry RGB beside grey.
 
     Raises:
         GavoError: what is wrong with the options, the sequence or its camera; fewer than two frames.
@@ -32,7 +35,7 @@ def open_sequence(source: Source, force: bool = False) -> Sequence:
         raise GavoError(f"--moving: must be from 0 to {MOST_BODIES}, not {source.moving}")
     return open_part(
         *(source.sequence, source.camera, source.start, source.frames, source.stride),
-        reading=reading_of(source),
+        reading=replace(reading_of(source), color=color),
         force=force or source.force,
         moving=source.moving,
     )

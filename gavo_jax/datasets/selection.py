@@ -44,7 +44,7 @@ def open_part(
     """
     stop = None if frames is None else start + (frames - 1) * stride + 1
     reading = replace(reading or Reading(), camera=camera)
-    whole = _synthetic(camera, stop, moving) if source == SYNTHETIC else open_source(source, reading)
+    whole = _synthetic(camera, stop, moving, reading.color) if source == SYNTHETIC else open_source(source, reading)
     chosen = whole[start:stop:stride]
     if len(chosen) < 2:
         raise GavoError(
@@ -57,8 +57,9 @@ def open_part(
     return chosen
 
 
-def _synthetic(camera: str, stop: int | None, moving: int) -> SyntheticSequence:
+def _synthetic(camera: str, stop: int | None, moving: int, color: bool) -> SyntheticSequence:
     frames = SYNTHETIC_FRAMES if stop is None else stop
     if frames > MAX_SYNTHETIC_FRAMES:
         raise GavoError(f"{SYNTHETIC}: has no more than {MAX_SYNTHETIC_FRAMES} frames, not {frames}")
-    return SyntheticSequence(frames, camera=None if camera == "auto" else load_camera(camera), bodies=moving)
+    named = None if camera == "auto" else load_camera(camera)
+    return SyntheticSequence(frames, camera=named, bodies=moving, color=color)

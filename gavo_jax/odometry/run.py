@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from gavo_jax.mapping import SceneMap
+
 
 @dataclass(frozen=True)
 class OdometryRun:
@@ -24,11 +28,31 @@ class OdometryRun:
     trajectory: Trajectory
     steps: list[Step]
     metrics: RunMetrics
+    sequence: Sequence | None = field(default=None, repr=False)
+    """What was run over."""
 
     @property
     def alignments(self) -> list[Alignment]:
         """The alignment of every pair."""
         return [step.alignment for step in self.steps]
+
+    def map(self, shape: Literal["cloud", "mesh"] = "cloud", voxel: float = 0.01) -> "SceneMap":
+        """What was seen, as a cloud or a mesh in the run's world; the frames are read once more.
+
+        With `gavo.Reading(color=True)` it has colours, else it is grey. Needs the extra `[map]`.
+
+        Args:
+            shape: cloud or mesh.
+            voxel: side, metres.
+
+        Raises:
+            GavoError: Open3D cannot be imported, an absurd voxel, or the run does not hold its sequence.
+        """
+        from gavo_jax.mapping import build_map
+
+        if self.sequence is None:
+            raise GavoError("the run does not hold the sequence that it was run over: no map can be made of it")
+        return build_map(self.sequence, self.steps, shape, voxel)
 
 
 def run_odometry(
@@ -71,7 +95,7 @@ def run_odometry(
     seconds = time.perf_counter() - start
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
-    return OdometryRun(trajectory, steps, {"sequence": sequence.name, "seed": seed, **metrics})
+    return OdometryRun(trajectory, steps, {"sequence": sequence.name, "seed": seed, **metrics}, sequence)
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:

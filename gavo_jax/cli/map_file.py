@@ -1,0 +1,40 @@
+"""`gavo run --map`: the map as a file; what cannot be is refused before the run starts."""
+
+from collections.abc import Sequence as Many
+from pathlib import Path
+
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.mapping import Shape, build_map, check_map, check_voxel, import_open3d, warn_of
+from gavo_jax.odometry.driver import Step
+from gavo_jax.output.screen import say, waiting
+
+
+def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:
+    """Refuse a map that cannot be made or written; return what it is to be.
+
+    Raises:
+        GavoError: an unknown ending, no such folder, an absurd voxel, or Open3D cannot be imported.
+    """
+    if path is None:
+        return shape or "cloud"
+    shape = check_map(path, shape)
+    if not path.absolute().parent.is_dir():
+        raise GavoError(f"{path}: no such folder: {path.parent}")
+    check_voxel(voxel)
+    import_open3d()
+    return shape
+
+
+def save_map(path: Path, sequence: Sequence, steps: Many[Step], shape: Shape, voxel: float) -> None:
+    """Fuse the frames of a run and write the map.
+
+    Raises:
+        GavoError: it cannot be written.
+    """
+    with waiting(f"a map of {len(steps) + 1} frames …"):
+        scene = build_map(sequence, steps, shape, voxel)
+    scene.write(path)
+    warn_of(scene, path)
+    count = f"{len(scene.points)} points" if scene.triangles is None else f"{len(scene.triangles)} triangles"
+    say(f"map of {scene.frames} frames, {count}: {path}")

@@ -1,0 +1,274 @@
+"""A map of what a run saw: depth and colour fused into a signed distance field, out of which come a cloud or a mesh.
+
+Open3D does the work (extra `[map]`): a sparse grid of voxels (Curless and Levoy 1996; blocks in a hash map as of Nießner
+et al. 2013), into which frames go one by one, so that memory grows with the surface seen and not with the frames.
+"""
+
+import contextlib
+import ctypes
+import importlib
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
+from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import inverse
+
+Shape = Literal["cloud", "mesh"]
+
+ENDINGS: dict[str, tuple[Shape, ...]] = {".ply": ("cloud", "mesh"), ".pcd": ("cloud",), ".obj": ("mesh",)}
+"""What a file of each ending can hold; the first is written where nothing is said."""
+
+VOXEL = 0.01
+"""Metres."""
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-3, 1.0
+
+TRUNCATION = 6.0
+"""Voxels before and behind a surface that know their distance from it."""
+
+FARTHEST = 4.0
+"""Metres: beyond, the noise of a structured-light or stereo camera exceeds several voxels."""
+
+BLOCK = 8
+"""Voxels along the side of a block."""
+
+MOST_BLOCKS = 100_000
+"""Blocks that a map may have, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
+
+MIN_WEIGHT = 3.0
+"""Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMap:
+    """What a run saw, in its world: that of the first camera of its segment, metres.
+
+    Attributes:
+        points: of the cloud, or the vertices of the mesh.
+        colors: RGB of each; grey where the sequence was opened without colour.
+        normals: unit vectors, towards where the camera was.
+        triangles: three indices of vertices each; None of a cloud.
+        frames: that went into it.
+        left_out: why others did not, a line each.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    colors: UInt8[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    triangles: Int[np.ndarray, "t 3"] | None = None
+    frames: int = 0
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> Shape:
+        """What it is."""
+        return "cloud" if self.triangles is None else "mesh"
+
+    def write(self, path: str | Path) -> None:
+        """Write it, whole or not at all: a cloud as `.ply` or `.pcd`, a mesh as `.ply` or `.obj`.
+
+        Raises:
+            GavoError: another ending, or the file cannot be written.
+        """
+        path = Path(path)
+        check_map(path, self.shape)
+        open3d = import_open3d()
+        vector = open3d.utility.Vector3dVector
+        partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix.lower()}")
+        if self.triangles is None:
+            cloud: Any = open3d.geometry.PointCloud(vector(self.points))
+            cloud.colors, cloud.normals = vector(self.colors / 255.0), vector(self.normals)
+            write = open3d.io.write_point_cloud
+        else:
+            cloud = open3d.geometry.TriangleMesh(vector(self.points), open3d.utility.Vector3iVector(self.triangles))
+            cloud.vertex_colors, cloud.vertex_normals = vector(self.colors / 255.0), vector(self.normals)
+            write = open3d.io.write_triangle_mesh
+        try:
+            partial.unlink(missing_ok=True)
+            with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+                written = write(str(partial), cloud)
+            if not written:
+                raise OSError("Open3D could not write it")
+            partial.replace(path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+class MapBuilder:
+    """Takes frames with their poses, one by one; of those it keeps nothing but the field."""
+
+    def __init__(self, camera: Camera, voxel: float = VOXEL, farthest: float = FARTHEST) -> None:
+        """Make an empty field.
+
+        Args:
+            camera: of the frames, without distortion.
+            voxel: side, metres.
+            farthest: depth beyond is left out, metres.
+
+        Raises:
+            GavoError: an absurd voxel, or Open3D cannot be imported.
+        """
+        check_voxel(voxel)
+        self.camera, self.voxel, self.farthest = camera, voxel, farthest
+        self._open3d = import_open3d()
+        core = self._open3d.core
+        self._intrinsic = core.Tensor(camera.matrix)
+        types = (core.float32, core.float32, core.float32)
+        self._grid = self._open3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"), types, ((1), (1), (3)), voxel, BLOCK, 1000, core.Device("CPU:0")
+        )
+        self.frames, self.is_full = 0, False
+
+    def add(self, frame: Frame, world_T_camera: Float[np.ndarray, "4 4"]) -> None:
+        """Fuse one more frame."""
+        image, core = self._open3d.t.geometry.Image, self._open3d.core
+        metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
+        self.frames += 1
+        if not np.any((metres > 0) & (metres < self.farthest)):
+            return
+        depth = image(np.ascontiguousarray(metres))
+        rgb = np.repeat(frame.grey[..., None], 3, axis=2) if frame.color is None else frame.color
+        color = image(np.ascontiguousarray(rgb, np.float32))
+        extrinsic = core.Tensor(inverse(world_T_camera))
+        reach = (1.0, self.farthest, TRUNCATION)
+        blocks = self._grid.compute_unique_block_coordinates(depth, self._intrinsic, extrinsic, *reach)
+        blocks = self._within_memory(blocks)
+        if len(blocks):
+            self._grid.integrate(blocks, depth, color, self._intrinsic, self._intrinsic, extrinsic, *reach)
+
+    def _within_memory(self, blocks: Any) -> Any:
+        """Blocks that may be touched: from the largest number on only those that are there."""
+        table = self._grid.hashmap()
+        if table.size() + len(blocks) <= MOST_BLOCKS:
+            return blocks
+        _, known = table.find(blocks)
+        if table.size() + int((~known.numpy()).sum()) <= MOST_BLOCKS:
+            return blocks
+        self.is_full = True
+        return blocks[known]
+
+    def extract(self, shape: Shape = "cloud", left_out: Iterable[str] = ()) -> SceneMap:
+        """The surface as a cloud or a mesh; empty where nothing was seen often enough."""
+        weight = min(MIN_WEIGHT, max(0.0, self.frames - 1))
+        words = [*left_out]
+        if self.is_full:
+            words.append(f"part of the scene: more than {MOST_BLOCKS} blocks; larger voxels reach further")
+        if self.frames == 0 or self._grid.hashmap().size() == 0:
+            nothing = np.zeros((0, 3))
+            triangles = None if shape == "cloud" else np.zeros((0, 3), int)
+            return SceneMap(nothing, nothing.astype(np.uint8), nothing, triangles, self.frames, tuple(words))
+        grid = self._grid
+        extracted = (grid.extract_point_cloud if shape == "cloud" else grid.extract_triangle_mesh)(weight)
+        part = extracted.point if shape == "cloud" else extracted.vertex
+        points, colors, normals = (part[name].numpy() for name in ("positions", "colors", "normals"))
+        triangles = None if shape == "cloud" else extracted.triangle["indices"].numpy().astype(np.int32)
+        colors = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+        return SceneMap(
+            points.astype(np.float64), colors, normals.astype(np.float64), triangles, self.frames, tuple(words)
+        )
+
+
+def build_map(
+    sequence: Sequence, steps: Iterable[Step], shape: Shape = "cloud", voxel: float = VOXEL, farthest: float = FARTHEST
+) -> SceneMap:
+    """Fuse the frames of a run, read once more, one at a time.
+
+    Between two segments of a run the motion is unknown, so that they are no part of one map: that of most frames is
+    returned. A frame that was lost, or cannot be read, is left out.
+
+    Args:
+        sequence: the run's; with `Reading(color=True)` the map has colours, else it is grey.
+        steps: the run's.
+        shape: cloud or mesh.
+        voxel: side, metres.
+        farthest: depth beyond is left out, metres.
+
+    Raises:
+        GavoError: an absurd voxel, or Open3D cannot be imported.
+    """
+    poses = [(0, np.eye(4), 0), *((s.index, s.world_T_camera, s.segment) for s in steps if not s.lost)]
+    segments = np.array([segment for *_, segment in poses])
+    chosen = int(np.bincount(segments).argmax())
+    builder, unreadable = MapBuilder(sequence.camera, voxel, farthest), 0
+    for index, world_T_camera, segment in poses:
+        if segment == chosen:
+            try:
+                frame = sequence[index]
+            except FrameError:
+                unreadable += 1
+                continue
+            builder.add(frame, world_T_camera)
+    reasons = ((len(sequence) - len(poses), "lost"), (int(np.sum(segments != chosen)), "of another segment"))
+    counted = [f"{count} frames: {why}" for count, why in (*reasons, (unreadable, "unreadable")) if count > 0]
+    return builder.extract(shape, counted)
+
+
+def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
+    """What is to be written into a file, by its ending.
+
+    Args:
+        path: of the file.
+        shape: what is wanted; None: what the ending stands for.
+
+    Raises:
+        GavoError: an unknown ending, or one that cannot hold that.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise GavoError(f"{path}: a map ends in {', '.join(ENDINGS)}, not in {ending or 'nothing'!r}")
+    if shape is None:
+        return ENDINGS[ending][0]
+    if shape not in ENDINGS[ending]:
+        fit = [other for other, holds in ENDINGS.items() if shape in holds]
+        raise GavoError(f"{path}: {ending} holds no {shape}: {' or '.join(fit)} does")
+    return shape
+
+
+def check_voxel(voxel: float) -> None:
+    """Raise GavoError for a voxel that no map can have."""
+    if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+        raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel:g}")
+
+
+def import_open3d() -> Any:
+    """Open3D; where the system lacks libusb, which it links to, that of the package libusb-package is loaded first.
+
+    Raises:
+        GavoError: it cannot be imported.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                return importlib.import_module("open3d")
+            except ImportError as error:
+                if "libusb" not in str(error):
+                    raise
+                _load_libusb()
+                return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise GavoError(f"a map needs Open3D, which cannot be imported ({error}): install 'gavo-jax[map]'") from None
+
+
+def _load_libusb() -> None:
+    package = importlib.import_module("libusb_package")
+    library = package.get_library_path()
+    if library is None:
+        raise ImportError("libusb-1.0 is missing")
+    ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
+
+
+def warn_of(scene: SceneMap, path: str | Path) -> None:
+    """Warn of what a map lacks."""
+    for line in scene.left_out:
+        warnings.warn(f"{path}: left out: {line}", GavoWarning, stacklevel=2)
