@@ -1,0 +1,211 @@
+"""Results of the benchmarks as records, and pages that quote them.
+
+A record is a file of `benchmarks/records`: the tables that a benchmark printed, and with them its command, date,
+machine and versions. `python benchmarks/NAME.py --record benchmarks/records/NAME.toml` writes one. Pages hold places
+for tables, between `<!-- records NAME -->` or `<!-- summary -->` and `<!-- end -->`; this command fills them:
+
+    python benchmarks/records.py
+    python benchmarks/records.py --check
+
+With `--check` nothing is written, and the exit status is 1 where a page says something else than the records.
+"""
+
+import argparse
+import re
+import sys
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tomli_w
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "benchmarks" / "records"
+PAGES = ("README.md", "benchmarks/RESULTS.md", "docs/*.md")
+"""Files with places for tables, from the repository's root."""
+UNKNOWN = "–"
+
+
+class Table(NamedTuple):
+    """What a benchmark printed: the first column is text, the others are numbers as they were printed."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+class Record(NamedTuple):
+    """One run of a benchmark."""
+
+    benchmark: str
+    command: str
+    date: str
+    machine: str
+    versions: str
+    tables: tuple[Table, ...]
+    notes: tuple[str, ...] = ()
+    """What a reader has to know beside the tables, a sentence or two each."""
+
+
+STRING = r"\"(?:[^\"\\\n]|\\.)*\""
+"""Of TOML, on one line."""
+
+
+def write_record(path: Path, record: Record) -> None:
+    """Write a record; notes that an earlier one at that place held stay."""
+    notes = record.notes or (read_record(path).notes if path.is_file() else ())
+    entries = {name: value for name, value in record._asdict().items() if name not in ("tables", "notes")}
+    if notes:
+        entries["notes"] = list(notes)
+    tables = [
+        {"title": t.title, "columns": list(t.columns), "rows": [list(row) for row in t.rows]} for t in record.tables
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_rows_on_a_line(tomli_w.dumps({**entries, "tables": tables})), encoding="utf-8")
+
+
+def _rows_on_a_line(text: str) -> str:
+    """Have TOML's innermost lists stand on a line each: a row of a table is a line of the file."""
+    return re.sub(rf"\[\s*((?:{STRING},\s*)+)\]", lambda found: f"[{', '.join(re.findall(STRING, found[1]))}]", text)
+
+
+def read_record(path: Path) -> Record:
+    """Return what `write_record` wrote."""
+    entries: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    tables = tuple(
+        Table(table["title"], tuple(table["columns"]), tuple(tuple(row) for row in table["rows"]))
+        for table in entries.pop("tables")
+    )
+    return Record(**{**entries, "tables": tables, "notes": tuple(entries.get("notes", ()))})
+
+
+class Records:
+    """All records of a folder, in the order of their names."""
+
+    def __init__(self, folder: Path = FOLDER) -> None:
+        self.by_name = {path.stem: read_record(path) for path in sorted(folder.glob("*.toml"))}
+
+    def of(self, benchmark: str) -> list[Record]:
+        """The records of a benchmark; the one that bears its name comes first."""
+        names = sorted(
+            (name != benchmark, name) for name, record in self.by_name.items() if record.benchmark == benchmark
+        )
+        return [self.by_name[name] for _, name in names]
+
+    def cell(self, benchmark: str, table: str, row: str, column: str) -> str:
+        """A figure of the first record that has it, or a dash.
+
+        Args:
+            benchmark: Its name.
+            table: What the table's title begins with.
+            row: First cell of the row.
+            column: What the column's heading begins with.
+        """
+        for record in self.of(benchmark):
+            for found in record.tables:
+                headings = [i for i, heading in enumerate(found.columns) if i and heading.startswith(column)]
+                for cells in found.rows:
+                    if found.title.startswith(table) and cells[0] == row and headings:
+                        return cells[headings[0]]
+        return UNKNOWN
+
+
+SUMMARY = (
+    ("**gavo `ga`**", "ga"),
+    ("gavo `ga`, preset `fast`", "ga:fast"),
+    ("gavo `ga`, preset `wide`", "ga:wide"),
+    ("gavo `pso`", "pso"),
+    ("gavo `gauss-newton`", "gauss-newton"),
+    ("gavo `adam`", "adam"),
+    ("the paper's GA, as printed", "printed"),
+    ("OpenCV RGB", "opencv-rgb"),
+    ("OpenCV RGB-D", "opencv-rgbd"),
+    ("Open3D colour", "open3d-color"),
+    ("Open3D tensor, hybrid", "open3d-tensor-hybrid"),
+    ("Open3D tensor, point to plane", "open3d-tensor-point-to-plane"),
+)
+"""Rows of README's table: what they are called, and the method's name in the records."""
+CLIPS = ("fr1_xyz", "fr1_desk", "fr1_rpy")
+
+
+def summary(records: Records) -> Table:
+    """README's table: drift on each clip, motions found over a wide baseline, and time."""
+    rows = []
+    for title, method in SUMMARY:
+        if method == "printed":
+            drift = [records.cell("table1", "fr1_xyz", "ga", "printed")[:6], UNKNOWN, UNKNOWN]
+        else:
+            drift = [records.cell("drift", f"drift on {clip}", method, "m/s") for clip in CLIPS]
+        found = records.cell("basin", "success rate on fr1_rpy", method, "10 frames")
+        time = records.cell("throughput", "fr1_xyz", method, "/ opencv-rgbd")
+        rows.append((title, *drift, found, time))
+    return Table("", ("", *CLIPS, "found", "time"), tuple(rows))
+
+
+def markdown(table: Table) -> str:
+    """A table as Markdown."""
+    rule = ["---", *["---:"] * (len(table.columns) - 1)]
+    lines = [f"| {' | '.join(cells)} |" for cells in (table.columns, rule, *table.rows)]
+    return "\n".join(lines)
+
+
+def section(records: Sequence[Record]) -> str:
+    """The tables of a benchmark's records, each with where it comes from."""
+    parts = []
+    for record in records:
+        for table in record.tables:
+            parts.append(f"**{table.title}**\n\n{markdown(table)}" if table.title else markdown(table))
+        parts.append(f"*`{record.command}`. {record.date}; {record.machine}; {record.versions}.*")
+        parts += record.notes
+    return "\n\n".join(parts)
+
+
+PLACE = re.compile(r"(<!-- (records|summary) ?([\w-]*) -->)\n.*?(<!-- end -->)", re.DOTALL)
+
+
+def fill(text: str, records: Records) -> str:
+    """A page with the records' tables in their places.
+
+    Raises:
+        ValueError: a place names a benchmark that has no record.
+    """
+
+    def insert(place: re.Match[str]) -> str:
+        start, kind, name, end = place.groups()
+        if kind == "records" and not records.of(name):
+            raise ValueError(f"no record of {name!r}")
+        inside = markdown(summary(records)) if kind == "summary" else section(records.of(name))
+        return f"{start}\n\n{inside}\n\n{end}"
+
+    return PLACE.sub(insert, text)
+
+
+def pages(root: Path = ROOT) -> Iterator[Path]:
+    """The files with places for tables."""
+    for pattern in PAGES:
+        yield from (path for path in sorted(root.glob(pattern)) if PLACE.search(path.read_text(encoding="utf-8")))
+
+
+def stale_pages(root: Path = ROOT) -> dict[Path, str]:
+    """The pages that say something else than the records, with what they should say."""
+    records = Records(root / "benchmarks" / "records")
+    filled = {path: fill(path.read_text(encoding="utf-8"), records) for path in pages(root)}
+    return {path: text for path, text in filled.items() if text != path.read_text(encoding="utf-8")}
+
+
+def main() -> int:
+    """Fill the pages, or say which are out of date."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; status 1 where a page is out of date")
+    check = parser.parse_args().check
+    stale = stale_pages()
+    for path, text in stale.items():
+        print(f"{path.relative_to(ROOT)}: {'not what the records say' if check else 'filled'}")
+        if not check:
+            path.write_text(text, encoding="utf-8")
+    return int(check and bool(stale))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

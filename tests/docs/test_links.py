@@ -1,0 +1,64 @@
+"""Links between pages lead somewhere, the reference has every public name, and the pages' figures are the records'."""
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import yaml
+from pages import PAGES, ROOT, anchors, links, name
+
+import gavo_jax as gavo
+
+PUBLIC = sorted(
+    attribute
+    for attribute, value in vars(gavo).items()
+    if not attribute.startswith("_")
+    and not isinstance(value, ModuleType)
+    and attribute not in ("end_at_once", "prepare_process")
+)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_inside_lead_somewhere(page: Path) -> None:
+    for file, anchor in links(page):
+        target = page if not file else (page.parent / file).resolve()
+        assert target.exists(), file
+        assert not anchor or anchor in anchors(target), f"{file}#{anchor}"
+
+
+def test_the_reference_has_every_public_name() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
+    documented = re.findall(r"^::: gavo_jax\.(\w+)$", pages, re.MULTILINE)
+    assert sorted(documented) == sorted([*PUBLIC, "solvers"])
+    for public in PUBLIC:
+        value = getattr(gavo, public)
+        assert not callable(value) or value.__doc__, public
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"[\w/-]+\.md", str(yaml.safe_load(config)["nav"])))
+    assert {str(page.relative_to(ROOT / "docs")) for page in PAGES if "docs" in page.parts[len(ROOT.parts)]} <= listed
+
+
+def test_figures_on_pages_are_those_of_the_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    records = importlib.import_module("records")
+    assert len(list(records.pages())) >= 2
+    stale = [path.name for path in records.stale_pages()]
+    assert not stale, "python benchmarks/records.py fills them"
+
+
+def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    records = importlib.import_module("records")
+    table = records.Table('a "quoted", title', ("", "x, y"), (("[one]", "1.0"), ("two", "–")))
+    record = records.Record("b", "python b.py", "2026-01-01", "a machine", "JAX 1", (table, table), ("A note.",))
+    records.write_record(tmp_path / "b.toml", record)
+    assert records.read_record(tmp_path / "b.toml") == record
+    records.write_record(tmp_path / "b.toml", record._replace(date="2026-02-02", notes=()))
+    assert records.read_record(tmp_path / "b.toml").notes == ("A note.",)
+    assert records.Records(tmp_path).cell("b", "a", "[one]", "x") == "1.0"
+    assert records.Records(tmp_path).cell("b", "a", "three", "x") == "–"
