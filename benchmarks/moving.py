@@ -267,13 +267,22 @@ def share_of(text: str) -> float:
 
 
 def drift(trajectory: Trajectory, truth: Trajectory) -> float:
-    """RPE over 1 s, RMSE of its translation, m/s."""
-    return relative_pose_error(trajectory, truth).translation.rmse
+    """RPE over 1 s, RMSE of its translation, m/s; infinite where no stretch of known motion is as long as that.
+
+    Raises:
+        GavoError: the truth covers too little.
+    """
+    try:
+        return relative_pose_error(trajectory, truth).translation.rmse
+    except GavoError:
+        if not trajectory.segments.any():
+            raise
+        return np.inf
 
 
 def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[Score]:
     """Run every method on every case, and on its clean clip: once a seed, a peer once where that is the same clip."""
-    clean: dict[tuple[int, str, int], float] = {}
+    clean: dict[tuple[str, str, int], float] = {}
     scores = []
     for case in chosen:
         for contender in contenders:
