@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
+import cv2
 import numpy as np
 from moving_clips import LOOKS, CardClip
 
@@ -41,7 +42,6 @@ from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import number, print_table
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
-from gavo_jax.se3 import exp
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -176,7 +176,7 @@ def motion_errors(
     apart = 1e3 * float(np.linalg.norm(found.displacement - moved))
     if not truth.rigid:
         return apart, None
-    turned = np.asarray(exp(np.concatenate([np.zeros(3), found.rotation]).astype(np.float32)), np.float64)[:3, :3]
+    turned = cv2.Rodrigues(found.rotation)[0]
     return apart, float(np.degrees(rotation_angle((motion[:3, :3].T @ turned)[None])[0]))
 
 
