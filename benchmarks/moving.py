@@ -19,6 +19,7 @@ On 2 cores the defaults take about half an hour.
 """
 
 import csv
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -295,6 +296,7 @@ def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[
             trajectory = run(f"{label}, {case.body}", case.sequence, contender, seed, score)
             score.drift = drift(trajectory, case.sequence.ground_truth)
             scores.append(score)
+            print(f"{label}, {case.body}: drift {score.ratio:.2f} times the clean clip's", file=sys.stderr)
     return scores
 
 
