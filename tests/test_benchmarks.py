@@ -4,15 +4,17 @@ import importlib
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from small import CAMERA
+from small import CAMERA, NEWTON
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.se3 import log
+from gavo_jax.trajectory import inverse
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 CLIP = "small"
@@ -304,3 +306,86 @@ def test_accelerations_are_those_of_the_path(load, tmp_path: Path) -> None:
     acceleration.main(clips=CLIP, json=tmp_path / "a.json")
     rows = read(tmp_path / "a.json")["rows"]
     assert len(rows) == 3 and all(0 < row["m/s"] < 5 and 0 < row["m/s²"] < 15 for row in rows)
+
+
+def test_moving_bodies_are_scored(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    moving: ModuleType = load("moving")
+    slow = SyntheticSequence(20, camera=CAMERA, rate=10.0, speed=0.2)
+    moving.common.open_clip = lambda _: slow
+    moving.common.preset_of = lambda _: NEWTON
+    methods = "gauss-newton,opencv-depth"
+    moving.main(clips=CLIP, shares="0.2", rooms="", methods=methods, seeds=1, json=tmp_path / "moving.json")
+    record = read(tmp_path / "moving.json")
+    assert [(run["method"], run["body"]) for run in record["runs"]] == [
+        (name, "card 0.2") for name in methods.split(",")
+    ]
+    for run in record["runs"]:
+        assert run["drift"] is None or run["ratio"] == pytest.approx(run["drift"] / run["clean_drift"])
+        assert run["wrong"] + run["right"] > 10 and run["wrong_flagged"] <= run["wrong"]
+    assert record["below_peers"]["gauss-newton"][1] == 1
+    assert "below every peer" in capsys.readouterr().out
+    with pytest.raises(GavoError, match="2"):
+        moving.main(clips=CLIP, shares="2")
+    assert [case.body for case in moving.cases("", "0.1", "1,2", 2, 3)] == ["1 moving", "2 moving"] * 2
+
+
+def test_a_card_is_where_its_truth_says(load) -> None:
+    clips: ModuleType = load("moving_clips")
+    still = SyntheticSequence(16, camera=CAMERA, rate=10.0, speed=0.2, noise=NONE)
+    card = clips.CardClip(still, 0.2)
+    assert len(card) == 14 and list(card.timestamps) == list(still.timestamps[1:-1])
+    assert np.median([card.part_labels(i).mean() for i in range(len(card))]) == pytest.approx(0.2, abs=0.05)
+    [truth] = card.bodies_truth
+    rows, columns = np.nonzero(card.part_labels(5))
+    depth = card[5].depth[rows, columns] / CAMERA.depth_scale
+    points = CAMERA.back_project(np.stack([columns, rows], axis=-1).astype(float), depth)
+    card_T_camera = inverse(truth.world_T_part[0, 5]) @ card.camera_at(card.timestamps[5:6])[0]
+    height = np.abs(points @ card_T_camera[2, :3] + card_T_camera[2, 3])
+    assert np.median(height) < 3e-3
+    beside = card.part_labels(5) == 0
+    np.testing.assert_array_equal(card[5].depth[beside], still[6].depth[beside])
+    for look in clips.LOOKS:
+        assert clips.texture(look.texture, np.random.default_rng(0)).shape == (480, 640)
+    with pytest.raises(GavoError, match="granite"):
+        clips.texture("granite", np.random.default_rng(0))
+
+
+def test_found_bodies_are_compared_with_the_true_ones(load, tmp_path: Path) -> None:
+    """Rows and masks made of the truth have no error; what is made of another motion has."""
+    moving: ModuleType = load("moving")
+    room = SyntheticSequence(6, camera=CAMERA, rate=15.0, bodies=2)
+    labels, first = room.part_labels(5), room.ground_truth.world_T_camera[0]
+    masks = moving.bodies_in(room, labels)
+    assert list(masks) == [1, 2]
+    name, overlap = moving.best_match(masks[1], {"7": masks[1], "8": masks[2]})
+    assert (name, overlap) == ("7", 1.0) and moving.best_match(masks[1], {}) == (None, 0.0)
+    step = SimpleNamespace(bodies=[SimpleNamespace(identity=7, mask=masks[1])])
+    assert list(moving.masks_of(step)) == ["7"] and moving.masks_of(SimpleNamespace()) == {}
+
+    before, after = room.bodies_truth[0].world_T_part[0, [4, 5]]
+    motion = inverse(first) @ after @ inverse(before) @ first
+    centroid = (inverse(first) @ after)[:3, 3]
+    moved = centroid - (inverse(first) @ before)[:3, 3]
+    turned = np.asarray(log(motion))[3:]
+    values = ",".join(str(value) for value in (*centroid, *moved, *turned))
+    stamp = float(room.timestamps[5])
+    (tmp_path / "bodies.csv").write_text(
+        f"timestamp,body,share,x,y,z,dx,dy,dz,rx,ry,rz,status\n{stamp},7,0.1,{values},0\n{stamp},8,0.1,0,0,0,,,,,,,0\n"
+    )
+    [(key, found)] = moving.read_bodies(tmp_path).items()
+    assert key == (f"{stamp:.6f}", "7") and moving.read_bodies(tmp_path / "nowhere") == {}
+    apart, angle = moving.motion_errors(room, 5, 1, labels, found, first)
+    assert apart < 0.01 and angle < 0.01
+    apart, angle = moving.motion_errors(room, 4, 1, labels, found, first)
+    assert apart > 1 and angle > 0.05
+    assert moving.motion_errors(room, 5, 2, labels, found, first)[1] is None
+
+
+def test_pairs_that_are_wrong_and_told_so_are_counted(load) -> None:
+    moving: ModuleType = load("moving")
+    score = moving.Score("clip", "card", "x", 0, 0.3, 0.1)
+    for wrong, flagged in ((True, True), (True, False), (False, True), (False, False), (False, False)):
+        moving.count(score, wrong, flagged)
+    summary = moving.summarise("clip", "card", [score])
+    assert (summary.precision, summary.recall, summary.false_alarms) == (0.5, 0.5, pytest.approx(1 / 3))
+    assert summary.ratio_worst == pytest.approx(3.0) and summary.overlap is None

@@ -56,8 +56,9 @@ class MovingPart:
         if poses.shape != (len(seconds), 4, 4):
             raise GavoError(f"synthetic: bodies: a path gives {poses.shape} for {len(seconds)} moments, not [n, 4, 4]")
         rotations = poses[:, :3, :3]
-        if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6):
-            raise GavoError("synthetic: bodies: a path gives matrices that are no rotations, or not finite")
+        turned = np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+        if not turned or np.any(np.linalg.det(rotations) < 0) or not np.isfinite(poses).all():
+            raise GavoError("synthetic: bodies: a path gives matrices that are no rigid motions, or not finite")
         return poses
 
 

@@ -156,7 +156,11 @@ def test_a_written_folder_tells_the_truth(moving: SyntheticSequence, tmp_path) -
         (MOST_BODIES + 1, f"to {MOST_BODIES}"),
         ([MovingBody("nothing", ())], "needs a part"),
         ([MovingBody("hollow", (MovingPart((), Sway(np.eye(4))),))], "a box"),
-        ([box("bent", (1.0, 1.0, 1.0), lambda seconds: np.zeros((len(seconds), 4, 4)))], "rotations"),
+        ([box("bent", (1.0, 1.0, 1.0), lambda seconds: np.zeros((len(seconds), 4, 4)))], "rigid motions"),
+        (
+            [box("mirrored", (1.0, 1.0, 1.0), lambda seconds: np.tile(np.diag([1.0, 1, -1, 1]), (len(seconds), 1, 1)))],
+            "rigid",
+        ),
         ([box("lost", (1.0, 1.0, 1.0), lambda seconds: np.eye(4))], "path"),
         ([box("odd", (1.0, 1.0, 1.0), Sway(np.eye(4)), texture="granite")], "granite"),
         ([box("flat", (1.0, 0.0, 1.0), Sway(np.eye(4)))], "size"),

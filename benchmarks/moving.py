@@ -1,0 +1,471 @@
+"""The camera's motion among bodies that move, and theirs: clips with a card put in, and the rendered room with bodies.
+
+The card (`moving_clips.py`) covers 0.1, 0.25 and 0.4 of the image of each clip; with every seed another texture, speed
+and distance. The room has a box, then a box and a walking figure. Prints one row per clip, body and method, over the
+seeds:
+
+- drift (RPE over 1 s, RMSE) over that of the clean clip, median and worst;
+- IoU of a body's mask with the true one, in the median frame; of several bodies, each frame counts once for each;
+- error of a body's motion between two frames, medians: displacement of its centroid in mm, rotation in degrees;
+- wrong pairs (camera motion off by more than 2 cm or 1.5 degrees) whose status is not ok, and the share of the other
+  pairs whose status is not ok.
+
+Then one row per method over all clips and over all rooms, whose clean drift is near nothing: their ratios are large.
+Dashes stand where a method knows no bodies.
+
+    python benchmarks/moving.py
+    python benchmarks/moving.py --methods ga:fast,gauss-newton --bodies track --seeds 1 --json moving.json
+
+On 2 cores the defaults take about half an hour.
+"""
+
+import csv
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import common
+import cv2
+import numpy as np
+from moving_clips import LOOKS, CardClip
+
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.bodies_truth import WithBodies
+from gavo_jax.datasets.moving import body_of_part
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import relative_pose_error, rotation_angle
+from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.tracked import track_visibly
+from gavo_jax.peers import PEERS
+from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory, inverse
+
+WRONG = (0.02, 1.5)
+"""Metres and degrees: a pair whose motion is further from the truth is wrong."""
+LEAST_SHARE = 0.01
+"""Of the image: less of a body than this need not be found."""
+BODIES = "bodies.csv"
+ROOM = "room"
+"""Name of the rendered sequences; each seed has its own."""
+AXES = (("x", "y", "z"), ("dx", "dy", "dz"), ("rx", "ry", "rz"))
+PEER_NAMES = ("opencv-rgbd", "opencv-depth", "open3d-color", "open3d-hybrid")
+DEFAULT_METHODS = ",".join(["ga", "gauss-newton", *(name for name in PEER_NAMES if PEERS[name].installed)])
+
+
+class Case(NamedTuple):
+    """A sequence with bodies, and the same one without."""
+
+    clip: str
+    body: str
+    seed: int
+    sequence: Any
+    clean: FrameSequence
+
+
+class Found(NamedTuple):
+    """A row of bodies.csv: the motion of one body since the frame before, in the run's world (the first camera)."""
+
+    centroid: np.ndarray
+    """[3] m."""
+    displacement: np.ndarray
+    """[3] of the centroid, m."""
+    rotation: np.ndarray
+    """[3] rotation vector, rad."""
+
+
+@dataclass
+class Score:
+    """What came of one method on one case."""
+
+    clip: str
+    body: str
+    method: str
+    seed: int
+    drift: float
+    clean_drift: float
+    wrong: int = 0
+    wrong_flagged: int = 0
+    right: int = 0
+    right_flagged: int = 0
+    overlaps: list[float] = field(default_factory=list)
+    displacements_mm: list[float] = field(default_factory=list)
+    rotations_deg: list[float] = field(default_factory=list)
+
+    @property
+    def ratio(self) -> float:
+        """Drift over the clean clip's."""
+        return self.drift / self.clean_drift
+
+
+def with_bodies(settings: Settings, mode: str | None) -> Settings:
+    """Settings that treat bodies by a mode; None leaves them as they are.
+
+    Raises:
+        GavoError: these settings know no such thing.
+    """
+    if mode is None:
+        return settings
+    for part in ("odometry", "alignment"):
+        options = getattr(settings, part)
+        if hasattr(options, "bodies"):
+            return replace(settings, **{part: replace(options, bodies=mode)})
+    raise GavoError("--bodies: the settings know no bodies")
+
+
+def masks_of(step: Step) -> dict[str, np.ndarray]:
+    """The bodies' masks of a step by their identity, bool [H, W]; none where it knows of none."""
+    return {str(body.identity): np.asarray(body.mask, bool) for body in getattr(step, "bodies", None) or ()}
+
+
+def read_bodies(folder: Path) -> dict[tuple[str, str], Found]:
+    """Rows of bodies.csv by stamp (6 decimals) and body; those without a motion are left out, none where no file is."""
+    path, found = folder / BODIES, {}
+    if not path.exists():
+        return found
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            vectors = [[float(row[axis] or "nan") for axis in axes] for axes in AXES]
+            if np.isfinite(vectors).all():
+                found[f"{float(row['timestamp']):.6f}", row["body"]] = Found(*map(np.array, vectors))
+    return found
+
+
+def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]:
+    """The true masks of the bodies of which a frame shows enough, by label; from the labels of its parts."""
+    bodies = body_of_part(sequence.bodies_truth)[labels]
+    return {
+        truth.label: bodies == truth.label
+        for truth in sequence.bodies_truth
+        if np.mean(bodies == truth.label) >= LEAST_SHARE
+    }
+
+
+def best_match(true: np.ndarray, masks: dict[str, np.ndarray]) -> tuple[str | None, float]:
+    """The found mask of largest intersection over union with a true one, and that."""
+    best: tuple[str | None, float] = (None, 0.0)
+    for name, mask in masks.items():
+        overlap = float((mask & true).sum() / (mask | true).sum())
+        if overlap > best[1]:
+            best = name, overlap
+    return best
+
+
+def motion_errors(
+    sequence: WithBodies, index: int, label: int, labels: np.ndarray, found: Found, world_T_first: np.ndarray
+) -> tuple[float, float | None]:
+    """How far the motion of a body between frames index - 1 and index is from the truth.
+
+    Of a body of several parts the truth is the mean motion of what is seen of it, and no rotation.
+
+    Returns:
+        Millimetres of its centroid; degrees.
+    """
+    truth = next(truth for truth in sequence.bodies_truth if truth.label == label)
+    weights = np.array([np.sum(labels == part) for part in truth.part_labels], float)
+    first_T_world = inverse(world_T_first)
+    moved, motion = np.zeros(3), np.eye(4)
+    for weight, poses in zip(weights / weights.sum(), truth.world_T_part, strict=True):
+        motion = first_T_world @ poses[index] @ inverse(poses[index - 1]) @ world_T_first
+        back = inverse(motion)
+        moved += weight * (found.centroid - back[:3, :3] @ found.centroid - back[:3, 3])
+    apart = 1e3 * float(np.linalg.norm(found.displacement - moved))
+    if not truth.rigid:
+        return apart, None
+    turned = cv2.Rodrigues(found.rotation)[0]
+    return apart, float(np.degrees(rotation_angle((motion[:3, :3].T @ turned)[None])[0]))
+
+
+def is_wrong(step: Step, poses: dict[float, np.ndarray], truth: Trajectory) -> bool:
+    """Whether the recorded motion since a step's reference is far from the true one."""
+    stamps = np.array([step.reference_timestamp, step.timestamp])
+    true, valid = truth.interpolate(stamps)
+    if not valid.all() or step.reference_timestamp not in poses:
+        return False
+    error = inverse(inverse(true[0]) @ true[1]) @ inverse(poses[step.reference_timestamp]) @ step.world_T_camera
+    angle = np.degrees(rotation_angle(error[None, :3, :3])[0])
+    return bool(np.linalg.norm(error[:3, 3]) > WRONG[0] or angle > WRONG[1])
+
+
+def run(label: str, sequence: Any, contender: common.Contender, seed: int, score: Score | None = None) -> Trajectory:
+    """Track a sequence; a score, if given, takes in its statuses, masks and bodies' motions."""
+    truth, odometry = sequence.ground_truth, contender.make(sequence.camera, seed)
+    first = float(sequence.timestamps[0])
+    world_T_first = truth.interpolate(sequence.timestamps[:1], max_gap=np.inf)[0][0]
+    poses: dict[float, np.ndarray] = {first: np.eye(4)}
+    matches: list[tuple[int, str, int, str | None, np.ndarray]] = []
+
+    def on_step(step: Step) -> None:
+        folder.add(step, odometry.progress)
+        poses[step.timestamp] = step.world_T_camera
+        if score is None:
+            return
+        count(score, is_wrong(step, poses, truth), step.alignment.status != 0)
+        masks = masks_of(step)
+        if hasattr(step, "bodies"):
+            labels = sequence.part_labels(step.index)
+            for body, mask in bodies_in(sequence, labels).items():
+                name, overlap = best_match(mask, masks)
+                score.overlaps.append(overlap)
+                matches.append((step.index, f"{step.timestamp:.6f}", body, name, labels))
+
+    with tempfile.TemporaryDirectory() as scratch, RunFolder(Path(scratch) / "run") as folder:
+        folder.start({}, first)
+        steps = track_visibly(label, sequence, odometry, on_step).steps
+        rows = read_bodies(folder.path) if score is not None else {}
+    for index, stamp, body, name, labels in matches:
+        if score is not None and name is not None and (found := rows.get((stamp, name))):
+            apart, turned = motion_errors(sequence, index, body, labels, found, world_T_first)
+            score.displacements_mm.append(apart)
+            score.rotations_deg += [] if turned is None else [turned]
+    return trajectory_of(first, steps)
+
+
+def count(score: Score, wrong: bool, flagged: bool) -> None:
+    """Take one pair in."""
+    score.wrong += wrong
+    score.wrong_flagged += wrong and flagged
+    score.right += not wrong
+    score.right_flagged += flagged and not wrong
+
+
+def cases(clips: str, shares: str, rooms: str, seeds: int, frames: int) -> Iterator[Case]:
+    """All sequences with bodies, those of one clip in a row.
+
+    Raises:
+        GavoError: a clip cannot be read or has no truth; a share or a number of bodies that cannot be.
+    """
+    for name in common.names(clips):
+        whole = common.open_clip(f"{name}:{frames}")
+        for seed in range(seeds):
+            for share in map(share_of, common.names(shares)):
+                card = CardClip(whole, share, seed, LOOKS[seed % len(LOOKS)])
+                yield Case(name, f"card {share:g}", seed, card, whole)
+    for seed in range(seeds):
+        clean = SyntheticSequence(frames, seed=seed)
+        for bodies in common.counts(rooms) if rooms else []:
+            yield Case(ROOM, f"{bodies} moving", seed, SyntheticSequence(frames, seed=seed, bodies=bodies), clean)
+
+
+def share_of(text: str) -> float:
+    """The share that a text says.
+
+    Raises:
+        GavoError: it says none.
+    """
+    try:
+        share = float(text)
+    except ValueError:
+        share = 0.0
+    if not 0 < share < 1:
+        raise GavoError(f"--shares: {text}: not a share of the image between 0 and 1")
+    return share
+
+
+def drift(trajectory: Trajectory, truth: Trajectory) -> float:
+    """RPE over 1 s, RMSE of its translation, m/s; infinite where no stretch of known motion is as long as that.
+
+    Raises:
+        GavoError: the truth covers too little.
+    """
+    try:
+        return relative_pose_error(trajectory, truth).translation.rmse
+    except GavoError:
+        if not trajectory.segments.any():
+            raise
+        return np.inf
+
+
+def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[Score]:
+    """Run every method on every case, and on its clean clip: once a seed, a peer once where that is the same clip."""
+    clean: dict[tuple[str, str, int], float] = {}
+    scores = []
+    for case in chosen:
+        for contender in contenders:
+            seed = case.seed if contender.random else 0
+            key = case.clip, contender.name, case.seed if case.clip == ROOM else seed
+            label = f"{case.clip}, {contender.name}, seed {case.seed}"
+            if key not in clean:
+                clean[key] = drift(run(label, case.clean, contender, seed), case.clean.ground_truth)  # pyright: ignore[reportArgumentType]
+            score = Score(case.clip, case.body, contender.name, case.seed, np.nan, clean[key])
+            trajectory = run(f"{label}, {case.body}", case.sequence, contender, seed, score)
+            score.drift = drift(trajectory, case.sequence.ground_truth)
+            scores.append(score)
+            print(f"{label}, {case.body}: drift {score.ratio:.2f} times the clean clip's", file=sys.stderr)
+    return scores
+
+
+class Summary(NamedTuple):
+    """One method over some cases; None where there is nothing to say."""
+
+    clip: str
+    body: str
+    method: str
+    drift: float
+    """Median, m/s."""
+    ratio_median: float
+    ratio_worst: float
+    overlap: float | None
+    """Median over frames and bodies."""
+    displacement_mm: float | None
+    rotation_deg: float | None
+    wrong: int
+    flagged: int
+    """Pairs whose status is not ok, wrong or not."""
+    recall: float | None
+    """Share of the wrong pairs that are flagged."""
+    precision: float | None
+    """Share of the flagged pairs that are wrong."""
+    false_alarms: float | None
+    """Share of the right pairs that are flagged."""
+    runs: int
+
+
+def summarise(clip: str, body: str, scores: list[Score]) -> Summary:
+    """The summary of one method's scores."""
+
+    def median(values: list[float]) -> float | None:
+        return float(np.median(values)) if values else None
+
+    wrong, right = (sum(getattr(score, name) for score in scores) for name in ("wrong", "right"))
+    caught, alarms = (sum(getattr(score, name) for score in scores) for name in ("wrong_flagged", "right_flagged"))
+    ratios = [score.ratio for score in scores]
+    return Summary(
+        clip,
+        body,
+        scores[0].method,
+        float(np.median([score.drift for score in scores])),
+        float(np.median(ratios)),
+        float(max(ratios)),
+        median([value for score in scores for value in score.overlaps]),
+        median([value for score in scores for value in score.displacements_mm]),
+        median([value for score in scores for value in score.rotations_deg]),
+        wrong,
+        caught + alarms,
+        caught / wrong if wrong else None,
+        caught / (caught + alarms) if caught + alarms else None,
+        alarms / right if right else None,
+        len(scores),
+    )
+
+
+def groups(scores: list[Score], *names: str) -> list[list[Score]]:
+    """Scores that agree in some fields, in the order in which they first come."""
+    found: dict[tuple[Any, ...], list[Score]] = {}
+    for score in scores:
+        found.setdefault(tuple(getattr(score, name) for name in names), []).append(score)
+    return list(found.values())
+
+
+COLUMNS = (
+    *("clip", "body", "method", "m/s", "ratio", "worst", "IoU", "mm", "deg", "wrong", "flagged", "precision", "recall"),
+    *("others", "runs"),
+)
+
+
+def row(summary: Summary) -> list[str]:
+    """The cells of `COLUMNS`."""
+
+    def percent(share: float | None) -> str:
+        return "–" if share is None else f"{share:.1%}"
+
+    return [
+        summary.clip,
+        summary.body,
+        summary.method,
+        number(summary.drift, 4),
+        number(summary.ratio_median, 2),
+        number(summary.ratio_worst, 2),
+        number(summary.overlap, 2),
+        number(summary.displacement_mm, 1),
+        number(summary.rotation_deg, 2),
+        str(summary.wrong),
+        str(summary.flagged),
+        percent(summary.precision),
+        percent(summary.recall),
+        percent(summary.false_alarms),
+        str(summary.runs),
+    ]
+
+
+def below_peers(scores: list[Score], method: str) -> tuple[int, int]:
+    """On how many cases a method's drift is below every peer's, and on how many there are peers."""
+    below = total = 0
+    for case in groups(scores, "clip", "body", "seed"):
+        peers = [score.drift for score in case if score.method in PEERS]
+        own = [score.drift for score in case if score.method == method]
+        if peers and own:
+            total += 1
+            below += own[0] < min(peers)
+    return below, total
+
+
+def main(
+    clips: str = common.CLIPS,
+    shares: str = "0.1,0.25,0.4",
+    rooms: str = "1,2",
+    methods: str = DEFAULT_METHODS,
+    bodies: str | None = None,
+    seeds: int = 3,
+    frames: int = 60,
+    json: Path | None = None,
+) -> list[Summary]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: clips to put a card into, with commas between; none where empty.
+        shares: of the image that the card covers, median over the frames.
+        rooms: numbers of bodies in the rendered room; none where empty.
+        methods: METHOD, METHOD:PRESET or names of peers, with commas between.
+        bodies: how our own methods treat bodies: off, mask or track; their settings' own choice if left out.
+        seeds: runs of each, each with a card, or a room, of its own.
+        frames: of each clip, the first ones.
+        json: file for the figures.
+    """
+    contenders = [
+        common.preset_contender(name, with_bodies(common.preset_of(name), bodies))
+        if name not in PEERS
+        else common.parse_methods(name)[0]
+        for name in common.names(methods)
+    ]
+    scores = measure(cases(clips, shares, rooms, seeds, frames), contenders)
+    if not scores:
+        raise GavoError("nothing to measure: no clips and no rooms, or no methods")
+    parts = [summarise(group[0].clip, group[0].body, group) for group in groups(scores, "clip", "body", "method")]
+    whole = [
+        summarise(name, "all", group)
+        for name, some in (
+            ("all clips", [score for score in scores if score.clip != ROOM]),
+            ("all rooms", [score for score in scores if score.clip == ROOM]),
+        )
+        for group in groups(some, "method")
+    ]
+    title = f"{frames} frames, {seeds} seeds, bodies {bodies or 'as by default'}"
+    print_table(title, COLUMNS, [row(summary) for summary in [*parts, *whole]])
+    standing = {}
+    for method in dict.fromkeys(summary.method for summary in whole):
+        below, total = standing[method] = below_peers(scores, method)
+        if method not in PEERS and total:
+            print(f"{method}: below every peer in {below} of {total} runs")
+    common.record(
+        json,
+        "moving",
+        {
+            "bodies": bodies,
+            "frames": frames,
+            "summary": [summary._asdict() for summary in [*parts, *whole]],
+            "below_peers": standing,
+            "runs": [{**vars(score), "ratio": score.ratio} for score in scores],
+        },
+    )
+    return [*parts, *whole]
+
+
+if __name__ == "__main__":
+    common.command(main)
