@@ -1,10 +1,10 @@
 """How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
 
 A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
-stamps. Prints a row a gap: the number of pairs, their median motion, and each method's success rate (median over the
-seeds; presets as METHOD:PRESET, peers by name); then a row a method: how often its status was right about failure, as
-precision (share of the flagged pairs that had failed) and recall (share of the failed pairs that were flagged), and
-the milliseconds a pair. A peer's status is the flag that it returns.
+stamps. Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
+seeds; a last row has the number of pairs and their median motion. A second table says how often a method's status was
+right about failure, as precision (share of the flagged pairs that had failed) and recall (share of the failed pairs that
+were flagged), and the milliseconds per pair. A peer's status is the flag that it returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
@@ -28,7 +28,7 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.output import plots
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -211,18 +211,16 @@ def main(
     if not records:
         raise GavoError(f"{clip}: no two frames with ground truth lie {gaps} frames apart")
     rates, agreement = success_rates(records), status_agreement(records)
-    rows = [
-        [row["gap"], row["pairs"], number(row["motion_m"], 3), number(row["motion_deg"], 1)]
-        + [number(rate, 2) for rate in row["success"].values()]
-        for row in rates
-    ]
-    print_table(f"success rate on {clip}", ("gap", "pairs", "motion m", "deg", *aligners), rows)
+    columns = ("method", *(f"{row['gap']} frame{'s' * (row['gap'] > 1)}, {row['motion_deg']:.0f}°" for row in rates))
+    rows: list[list[Any]] = [[name, *(number(row["success"][name], 2) for row in rates)] for name in aligners]
+    motions = [f"{row['pairs']}, {row['motion_m']:.3f} m" for row in rates]
+    common.print_table(f"success rate on {clip}", columns, [*rows, ["(pairs, motion)", *motions]])
     rows = [
         [row["method"], row["attempts"], row["failed"], row["flagged"]]
         + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
         for row in agreement
     ]
-    print_table(
+    common.print_table(
         "status against failure", ("method", "tries", "failed", "flagged", "precision", "recall", "ms/pair"), rows
     )
     results = {"clip": clip, "success": rates, "status": agreement, "attempts": records}

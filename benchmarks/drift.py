@@ -23,7 +23,7 @@ import numpy as np
 
 from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output import plots
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.peers import PEERS
 
 METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers()
@@ -104,14 +104,14 @@ def main(
     summaries = common.summarise(runs)
     for clip in common.names(clips):
         rows = [common.drift_row(summary) for summary in summaries if summary.clip == clip]
-        print_table(f"drift on {clip}, {runs[0]['device']}", common.DRIFT_COLUMNS, rows)
+        common.print_table(f"drift on {clip}, {runs[0]['device']}", common.DRIFT_COLUMNS, rows)
     compared = ratios(summaries)
     if compared:
         rows = [
             [r.name, *(number(value, 3) for value in r.by_clip.values()), number(r.mean, 3), number(r.worst, 3)]
             for r in compared
         ]
-        print_table("ratios of the medians", ("", *common.names(clips), "geometric mean", "worst"), rows)
+        common.print_table("ratios of the medians", ("", *common.names(clips), "geometric mean", "worst"), rows)
     results = {
         "runs": runs,
         "summary": [summary._asdict() for summary in summaries],

@@ -31,7 +31,7 @@ from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.objective.error import Objective
 from gavo_jax.objective.preconditioning import preconditioner, reference_curvature
 from gavo_jax.objective.problem import Problem
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -153,7 +153,7 @@ def main(clips: str = common.CLIPS, preset: str = "default", seed: int = 0, json
     ]
     shares = (f"share <= {TOLERANCE} %", "Gauss-Newton's share")
     columns = ("clip", "pairs", "median %", "p90", "p95", "max", *shares)
-    print_table(f"excess of E over the minimum, GA preset {preset}", columns, cells)
+    common.print_table(f"excess of E over the minimum, GA preset {preset}", columns, cells)
     results = {"preset": preset, "seed": seed, "summary": rows, "pairs": pairs}
     common.record(json, "optimality", results)
     return results

@@ -33,7 +33,7 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.run import run_odometry
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import Settings
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
@@ -68,7 +68,7 @@ def main(
     rows = [_row(name, results[name]) for name in common.names(methods)]
     columns = ("", "programs", "more", "run_odometry, s", "bare, s", "together, s", "ratio", "to bare")
     columns += ("bare, core-ms", "together, core-ms", "equal")
-    print_table(f"{runs} runs over {len(sequence)} frames of {clip}", columns, rows)
+    common.print_table(f"{runs} runs over {len(sequence)} frames of {clip}", columns, rows)
     common.record(json, "together", results)
     return results
 

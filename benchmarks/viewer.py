@@ -20,7 +20,7 @@ import numpy as np
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.output.files import RECORDING
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.viewer.base import ViewerMode
 from gavo_jax.viewer.live import make_viewer
@@ -95,7 +95,7 @@ def main(
                 )
             )
     columns = ("method", "ms/frame without", "with", "ratio", "on cores, ms/frame more", "MB/frame")
-    print_table(f"{len(sequence)} frames of {clip}, median of {rounds}", columns, rows)
+    common.print_table(f"{len(sequence)} frames of {clip}, median of {rounds}", columns, rows)
     common.record(json, "viewer", results)
     return results
 

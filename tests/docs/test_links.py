@@ -55,7 +55,9 @@ def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     records = importlib.import_module("records")
     table = records.Table('a "quoted", title', ("", "x, y"), (("[one]", "1.0"), ("two", "–")))
-    record = records.Record("b", "python b.py", "2026-01-01", "a machine", "JAX 1", (table, table), ("A note.",))
+    record = records.Record(
+        "b", "python b.py", "2026-01-01", "a machine", "JAX 1", (table, table), ("Two.",), ("A note.",)
+    )
     records.write_record(tmp_path / "b.toml", record)
     assert records.read_record(tmp_path / "b.toml") == record
     records.write_record(tmp_path / "b.toml", record._replace(date="2026-02-02", notes=()))
