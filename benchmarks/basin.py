@@ -1,10 +1,12 @@
 """How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
 
 A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
-stamps. Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
-seeds; a last row has the number of pairs and their median motion. A second table says how often a method's status was
-right about failure, as precision (share of the flagged pairs that had failed) and recall (share of the failed pairs that
-were flagged), and the milliseconds per pair. A peer's status is the flag that it returns.
+stamps.
+
+Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
+seeds. A last row has the number of pairs and their median motion. A second table says how often a method's status was
+right about failure: precision (share of the flagged pairs that had failed), recall (share of the failed pairs that
+were flagged), and milliseconds per pair. A peer's status is the flag that it returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
