@@ -136,6 +136,10 @@ class Evaluate:
     """Span of the relative pose error."""
     unit: Literal["s", "frames"] = "s"
     """Unit of the span."""
+    json: bool = False
+    """Print the errors as JSON."""
+    plot: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: no figures)")] = None
+    """Folder for figures of both trajectories and of the distance between them."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, environment
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell
+from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.settings import Settings
 from gavo_jax.viewer.base import Viewer
@@ -55,6 +55,8 @@ def run(options: Run) -> int:
             tell(f"{folder.path}: the run came to its end before: nothing to resume")
         else:
             if progress is None:
+                if folder.has_run():
+                    say(f"the earlier run in {folder.path} is replaced")
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
@@ -106,7 +108,8 @@ def _track(
         draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, tracked.steps)
 
-    interruptible(draw_figures)
+    with waiting("drawing figures …"):
+        interruptible(draw_figures)
     return metrics, tracked.interrupted
 
 
