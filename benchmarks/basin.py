@@ -11,18 +11,20 @@ were flagged), and milliseconds per pair. A peer's status is the flag that it re
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
     python benchmarks/basin.py --figure docs
+    python benchmarks/basin.py --recorded benchmarks/records/basin.toml,benchmarks/records/basin-wide.toml --figure docs
 
 On 2 cores the defaults take about 5 minutes.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
 import jax
 import numpy as np
+from records import Record, read_record
 
 from gavo_jax.alignment.pairs import align
 from gavo_jax.camera import Camera
@@ -36,6 +38,7 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.installed_peers()
+TITLE = "success rate on "
 MAX_TRANSLATION, MAX_ROTATION = 0.05, 3.0
 """Metres and degrees: errors of a found motion stay below."""
 
@@ -197,8 +200,12 @@ def main(
         seeds: tries of each of our methods.
         json: file for every attempt and the rates.
         figure: folder for basin.png and basin.svg.
-        recorded: files of earlier `json`, with commas between, to draw together; nothing is measured.
+        recorded: files of earlier `json`, or of earlier `--record`, with commas between, to draw together; nothing is
+            measured.
     """
+    if recorded.endswith(".toml"):
+        _draw_records([read_record(Path(name)) for name in common.names(recorded)], figure or Path())
+        return {}
     if recorded:
         found = common.read_records(recorded, "basin")
         attempts = [attempt for one in found for attempt in one["attempts"]]
@@ -216,7 +223,7 @@ def main(
     columns = ("method", *(f"{row['gap']} frame{'s' * (row['gap'] > 1)}, {row['motion_deg']:.0f}°" for row in rates))
     rows: list[list[Any]] = [[name, *(number(row["success"][name], 2) for row in rates)] for name in aligners]
     motions = [f"{row['pairs']}, {row['motion_m']:.3f} m" for row in rates]
-    common.print_table(f"success rate on {clip}", columns, [*rows, ["(pairs, motion)", *motions]])
+    common.print_table(f"{TITLE}{clip}", columns, [*rows, ["(pairs, motion)", *motions]])
     rows = [
         [row["method"], row["attempts"], row["failed"], row["flagged"]]
         + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
@@ -236,7 +243,25 @@ def _draw(records: list[dict[str, Any]], clip: str, folder: Path) -> None:
     rates = success_rates(records)
     motion = np.array([row["motion_deg"] for row in rates])
     success = {name: np.array([row["success"][name] for row in rates]) for name in rates[0]["success"]}
-    common.save_figure(plots.plot_basin(motion, success, clip), folder, "basin")
+    ours = [name for name in success if name not in PEERS]
+    common.save_figure(plots.plot_basin(motion, success, clip, ours), folder, "basin")
+
+
+def _draw_records(found: Iterable[Record], folder: Path) -> None:
+    """Draw the success rates of records; a method was not tried at every gap."""
+    tables = [table for record in found for table in record.tables if table.title.startswith(TITLE)]
+    gaps = sorted({float(heading.split(", ")[1].rstrip("°")) for table in tables for heading in table.columns[1:]})
+    success: dict[str, np.ndarray] = {}
+    for table in tables:
+        angles = [float(heading.split(", ")[1].rstrip("°")) for heading in table.columns[1:]]
+        for name, *cells in table.rows:
+            if not name.startswith("("):
+                rates = dict(zip(angles, map(float, cells), strict=True))
+                success[name] = np.array([rates.get(gap, np.nan) for gap in gaps])
+    ours = sorted((name for name in success if name not in PEERS), key=METHODS.split(",").index)
+    success = {name: success[name] for name in (*ours, *(name for name in success if name in PEERS))}
+    clip = tables[0].title.removeprefix(TITLE)
+    common.save_figure(plots.plot_basin(np.array(gaps), success, clip, ours), folder, "basin")
 
 
 if __name__ == "__main__":

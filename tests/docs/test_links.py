@@ -50,6 +50,18 @@ def test_figures_on_pages_are_those_of_the_records(monkeypatch: pytest.MonkeyPat
     assert not stale, "python benchmarks/records.py fills them"
 
 
+def test_figures_are_drawn_from_the_records(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    folder = ROOT / "benchmarks" / "records"
+    for benchmark in ("drift", "basin"):
+        files = ",".join(map(str, sorted(folder.glob(f"{benchmark}*.toml"))))
+        importlib.import_module(benchmark).main(recorded=files, figure=tmp_path)
+        assert (tmp_path / f"{benchmark}.png").stat().st_size > 10_000
+    records = importlib.import_module("records").Records()
+    drawn = importlib.import_module("drift").medians(records.of("drift"))
+    assert drawn["fr1_xyz"]["ga"][0, 0] == float(records.cell("drift", "drift on fr1_xyz", "ga", "m/s"))
+
+
 def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     records = importlib.import_module("records")
