@@ -1,7 +1,7 @@
 """What each ingredient buys: a preset of the GA with one ingredient switched off at a time.
 
 Prints, for each clip, a row a variant: drift of translation (m/s) and rotation (deg/s), median over the seeds with its
-spread, lost pairs of the worst run, milliseconds a pair; then a row a variant with the ratios of its medians to those
+spread, lost pairs of the worst run, milliseconds per pair; then a row a variant with the ratios of its medians to those
 of the full preset, as geometric means over the clips and as the best and the worst clip. An ingredient whose ratio
 without it is 1 buys nothing.
 

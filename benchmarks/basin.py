@@ -142,7 +142,7 @@ def attempt_pairs(
 
 
 def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a gap: pairs, median motion and each method's success rate, median over the seeds."""
+    """One row per gap: pairs, median motion and each method's success rate, median over the seeds."""
     rows = []
     for gap in dict.fromkeys(r["gap"] for r in records):
         of_gap = [r for r in records if r["gap"] == gap]
@@ -160,7 +160,9 @@ def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a method: precision and recall of its status as a sign of failure; None where there is nothing to count."""
+    """One row per method: precision and recall of its status as a sign of failure; None where there is nothing to
+    count.
+    """
     rows = []
     for name in dict.fromkeys(r["method"] for r in records):
         own = [r for r in records if r["method"] == name]

@@ -1,8 +1,8 @@
 """Whether the covariance of a motion tells its error: eᵀΣ⁻¹e over pairs of synthetic sequences and of real clips.
 
 With e the twist between the true and the estimated motion, in the tangent that Σ is stated in, eᵀΣ⁻¹e of an honest
-covariance has a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints a row a sequence: the pairs, the
-mean and median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the error is against
+covariance has a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints one row per sequence: the pairs,
+the mean and median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the error is against
 motion capture, whose own errors and time offset count as the odometry's.
 
     python benchmarks/calibration.py

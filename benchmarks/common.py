@@ -238,7 +238,7 @@ class Summary(NamedTuple):
     lost: int
     """Lost pairs of the worst run."""
     milliseconds: float
-    """Median over the runs of the median time a pair."""
+    """Median over the runs of the median time per pair."""
     runs: int
 
 

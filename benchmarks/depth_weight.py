@@ -1,7 +1,7 @@
 """How much depth is worth beside grey: what either channel alone says of the motion, and how far the two disagree.
 
 Tracks with Gauss-Newton. At each pair and level the optimum of the grey cost alone and that of the depth cost alone are
-found. Prints, for each clip, a row a level, with medians over the pairs:
+found. Prints, for each clip, one row per level, with medians over the pairs:
 
 - weight by scatter: the weight of depth that each channel's own scatter from tile to tile of the image would justify;
 - disagreement: how far apart the two optima lie, squared, in units of the covariance that those scatters promise for

@@ -1,8 +1,8 @@
 """Drift of every method on every clip: ours with their presets, the peers beside them.
 
-Prints, for each clip, a row a method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s, each
-as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
-milliseconds a pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
+Prints, for each clip, one row per method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s,
+each as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
+milliseconds per pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
 which need not be the same one) and of the GA to Gauss-Newton, clip by clip, with their geometric mean and the worst.
 
     python benchmarks/drift.py

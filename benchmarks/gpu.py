@@ -1,4 +1,4 @@
-"""What an accelerator makes of it: pairs a second, latency, share of the memory's speed, agreement with the CPU.
+"""What an accelerator makes of it: pairs per second, latency, share of the memory's speed, agreement with the CPU.
 
 Prints four tables: `align_batch` by the size of the batch, from arrays on the host to results there; the latency of
 one pair alone, by `align` and by the driver from decoded images; scoring against the limit that memory sets; and how

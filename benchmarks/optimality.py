@@ -3,8 +3,9 @@
 For each pair the GA and Gauss-Newton are run coarse to fine from the identity. Then one objective is made for the
 finest level, its brightness model and scales estimated at the GA's result, and everything is judged by that E: the two
 motions as they were found, and the minima that Gauss-Newton, run to convergence on this very E, reaches from either.
-The lower of the two minima is the reference. Prints a row a clip: the excess of the GA's E over it (median, 90th and
-95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own result.
+The lower of the two minima is the reference. Prints one row per clip: the excess of the GA's E over it (median, 90th
+and 95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own
+result.
 
     python benchmarks/optimality.py
     python benchmarks/optimality.py --clips fr1_desk:31 --preset fast --json optimality.json

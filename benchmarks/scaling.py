@@ -3,7 +3,7 @@
 The first table has the milliseconds of one call of `Objective.score` (robust grey and depth error, every pixel a
 point), a row an image size, a column a population, and below it the exponent of (pixels x candidates) fitted to all
 calls of more than a million of them: 1 is linear. The second has the milliseconds of `align_batch`, from arrays on the
-host to the results there, and the pairs a second. Each figure is the median of calls in turn.
+host to the results there, and the pairs per second. Each figure is the median of calls in turn.
 
     python benchmarks/scaling.py
     python benchmarks/scaling.py --populations 64,256,1024,4096 --batches 16,64,256,1024 --json scaling.json

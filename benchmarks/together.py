@@ -3,7 +3,7 @@
 The runs differ in their seeds and in a rate of the solver (`ga`: mutation_decay, `pso`: constriction, `gauss-newton`:
 damping, `adam`: decay). For each method: programs compiled for one run and then for all the others, seconds of the 64
 runs as 64 calls of `run_odometry`, as bare loops over the frames (without its warm-up and figures), and together; the
-ratios of these times; milliseconds a pair on the processor (all cores' time added up) bare and together; and how many
+ratios of these times; milliseconds per pair on the processor (all cores' time added up) bare and together; and how many
 of the trajectories are the same bit for bit.
 
     python benchmarks/together.py

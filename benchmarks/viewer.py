@@ -1,7 +1,7 @@
 """What it costs to watch: a run with the viewer that saves to a file against one without, in turn.
 
 Prints, for each method, the median time of a run without and with `--viewer save`, their ratio, the processor's
-milliseconds a frame that the viewer adds (all cores' time added up) and the recording's size a frame.
+milliseconds per frame that the viewer adds (all cores' time added up) and the recording's size a frame.
 
     python benchmarks/viewer.py
     python benchmarks/viewer.py --clip synthetic:20 --methods gauss-newton --rounds 2 --json viewer.json

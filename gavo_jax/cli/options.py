@@ -1,4 +1,4 @@
-"""What the command takes: a dataclass a subcommand, from which tyro makes parser and help."""
+"""What the command takes: one dataclass per subcommand, from which tyro makes parser and help."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -19,7 +19,7 @@ from gavo_jax.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class OdometryRun:
-    """A whole run: `trajectory` (camera to world, first camera = world), a step a pair, and the run's figures."""
+    """A whole run: `trajectory` (camera to world, first camera = world), a step per pair, and the run's figures."""
 
     trajectory: Trajectory
     steps: list[Step]
