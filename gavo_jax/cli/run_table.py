@@ -34,8 +34,8 @@ COUNTS = (
     ("frames", "frames", 0, ""),
     ("lost pairs", "lost_pairs", 0, ""),
     ("compilation", COMPILE_SECONDS, 1, "s"),
-    ("time per pair, from decoded images, median", MILLISECONDS, 1, "ms"),
-    ("speed, from files to poses, decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
+    ("time per pair, decoded images, median", MILLISECONDS, 1, "ms"),
+    ("speed, reading and decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
 )
 
 Row = tuple[str, str, str]
