@@ -75,3 +75,16 @@ def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, 
     assert records.read_record(tmp_path / "b.toml").notes == ("A note.",)
     assert records.Records(tmp_path).cell("b", "a", "[one]", "x") == "1.0"
     assert records.Records(tmp_path).cell("b", "a", "three", "x") == "–"
+
+
+def test_troubleshooting_quotes_messages_that_there_are() -> None:
+    source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "gavo_jax").rglob("*.py"))
+    source = re.sub(r'"\s*\n\s*f?"', "", source)
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    quoted = [
+        span for entry in re.findall(r"^\*\*(.+?)\*\*", page, re.MULTILINE) for span in re.findall(r"`(.+?)`", entry)
+    ]
+    assert len(quoted) > 10
+    for message in quoted:
+        for words in re.split(r"…|'NAME'|\.\.\.", message):
+            assert words.strip() in source, message
