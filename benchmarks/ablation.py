@@ -1,7 +1,7 @@
 """What each ingredient buys: a preset of the GA with one ingredient switched off at a time.
 
 Prints, for each clip, a row a variant: drift of translation (m/s) and rotation (deg/s), median over the seeds with its
-spread, lost pairs of the worst run, milliseconds a pair; then a row a variant with the ratios of its medians to those
+spread, lost pairs of the worst run, milliseconds per pair; then a row a variant with the ratios of its medians to those
 of the full preset, as geometric means over the clips and as the best and the worst clip. An ingredient whose ratio
 without it is 1 buys nothing.
 
@@ -22,7 +22,7 @@ import common
 from gavo_jax import presets
 from gavo_jax.errors import GavoError
 from gavo_jax.objective.losses import l2
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.presets import PAPER_OBJECTIVE
 from gavo_jax.settings import Settings
 
@@ -127,7 +127,7 @@ def main(
     summaries = common.summarise(runs)
     for clip in common.names(clips):
         rows = [common.drift_row(summary) for summary in summaries if summary.clip == clip]
-        print_table(f"GA without one ingredient, {clip}", ("without", *common.DRIFT_COLUMNS[1:]), rows)
+        common.print_table(f"GA without one ingredient, {clip}", ("without", *common.DRIFT_COLUMNS[1:]), rows)
     compared = compare(summaries)
     rows = [
         [
@@ -138,7 +138,7 @@ def main(
         for entry in compared
     ]
     columns = ("without", "m/s", "best clip", "worst", "deg/s", "best clip", "worst", "ms")
-    print_table("ratios to the full preset, geometric mean over the clips", columns, rows)
+    common.print_table("ratios to the full preset, geometric mean over the clips", columns, rows)
     results = {"runs": runs, "summary": [summary._asdict() for summary in summaries], "ratios": compared}
     common.record(json, "ablation", results)
     return results

@@ -15,7 +15,6 @@ import numpy as np
 
 from gavo_jax import se3
 from gavo_jax.errors import GavoError
-from gavo_jax.output.screen import print_table
 from gavo_jax.trajectory import inverse
 
 INTERVALS = (1 / 30, 2 / 30, 4 / 30)
@@ -44,7 +43,7 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
             rows.append((clip, interval, *speeds, *largest))
     columns = ("clip", "interval, s", "m/s", "rad/s", "m/s²", "rad/s²")
     cells = [[row[0], f"{row[1]:.3f}", *(f"{value:.2f}" for value in row[2:])] for row in rows]
-    print_table("largest speeds and accelerations", columns, cells)
+    common.print_table("largest speeds and accelerations", columns, cells)
     results = {"rows": [dict(zip(columns, row, strict=True)) for row in rows]}
     common.record(json, "acceleration", results)
     return results

@@ -1,28 +1,32 @@
 """How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
 
 A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
-stamps. Prints one row per gap: the number of pairs, their median motion, and each method's success rate (median over
-the seeds; presets as METHOD:PRESET, peers by name); then the median error of the pairs that were found; then one row
-per method: how often its status was right about failure, as precision (share of the flagged pairs that had failed) and
-recall (share of the failed pairs that were flagged), and the milliseconds per pair. A peer's status is the flag that it
-returns. The gap is in frames of the clip: one that keeps every 4th frame of a sequence has four times the motion.
+stamps. A gap is in frames of the clip: one that keeps every 4th frame of a sequence has four times the motion.
+
+Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
+seeds. A last row has the number of pairs and their median motion. A second table has the median errors of the pairs
+that were found. A third says how often a method's status was right about failure: precision (share of the flagged pairs
+that had failed), recall (share of the failed pairs that were flagged), and milliseconds per pair. A peer's status is
+the flag that it returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
     python benchmarks/basin.py --clip fr1_desk_loop --gaps 2,3,4,8 --step 1 --methods ga:wide,sift-pnp,orb-pnp
     python benchmarks/basin.py --figure docs
+    python benchmarks/basin.py --recorded benchmarks/records/basin.toml,benchmarks/records/basin-wide.toml --figure docs
 
 On 2 cores the defaults take about 10 minutes.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
 import jax
 import numpy as np
+from records import Record, read_record
 
 from gavo_jax.alignment.pairs import align
 from gavo_jax.camera import Camera
@@ -30,12 +34,13 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.output import plots
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.installed_peers()
+TITLE = "success rate on "
 MAX_TRANSLATION, MAX_ROTATION = 0.05, 3.0
 """Metres and degrees: errors of a found motion stay below."""
 
@@ -139,7 +144,7 @@ def attempt_pairs(
 
 
 def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a gap: pairs, median motion and each method's success rate, median over the seeds."""
+    """One row per gap: pairs, median motion and each method's success rate, median over the seeds."""
     rows = []
     for gap in dict.fromkeys(r["gap"] for r in records):
         of_gap = [r for r in records if r["gap"] == gap]
@@ -170,7 +175,9 @@ def median_errors(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a method: precision and recall of its status as a sign of failure; None where there is nothing to count."""
+    """One row per method: precision and recall of its status as a sign of failure; None where there is nothing to
+    count.
+    """
     rows = []
     for name in dict.fromkeys(r["method"] for r in records):
         own = [r for r in records if r["method"] == name]
@@ -210,8 +217,12 @@ def main(
         seeds: tries of each of our methods.
         json: file for every attempt and the rates.
         figure: folder for basin.png and basin.svg.
-        recorded: files of earlier `json`, with commas between, to draw together; nothing is measured.
+        recorded: files of earlier `json`, or of earlier `--record`, with commas between, to draw together; nothing is
+            measured.
     """
+    if recorded.endswith(".toml"):
+        _draw_records([read_record(Path(name)) for name in common.names(recorded)], figure or Path())
+        return {}
     if recorded:
         found = common.read_records(recorded, "basin")
         attempts = [attempt for one in found for attempt in one["attempts"]]
@@ -226,24 +237,23 @@ def main(
     if not records:
         raise GavoError(f"{clip}: no two frames with ground truth lie {gaps} frames apart")
     rates, agreement = success_rates(records), status_agreement(records)
-    rows = [
-        [row["gap"], row["pairs"], number(row["motion_m"], 3), number(row["motion_deg"], 1)]
-        + [number(rate, 2) for rate in row["success"].values()]
-        for row in rates
-    ]
-    print_table(f"success rate on {clip}", ("gap", "pairs", "motion m", "deg", *aligners), rows)
+    gap_names = [f"{row['gap']} frame{'s' * (row['gap'] > 1)}, {row['motion_deg']:.0f}°" for row in rates]
+    rows: list[list[Any]] = [[name, *(number(row["success"][name], 2) for row in rates)] for name in aligners]
+    motions = [f"{row['pairs']}, {row['motion_m']:.3f} m" for row in rates]
+    common.print_table(f"{TITLE}{clip}", ("method", *gap_names), [*rows, ["(pairs, motion)", *motions]])
     errors = median_errors(records)
     rows = [
-        [gap] + [f"{number(row['error_m'], 4)} {number(row['error_deg'], 2)}" for row in errors if row["gap"] == gap]
-        for gap in dict.fromkeys(row["gap"] for row in errors)
+        [name]
+        + [f"{number(row['error_m'], 4)} {number(row['error_deg'], 2)}" for row in errors if row["method"] == name]
+        for name in aligners
     ]
-    print_table("median error of the found, m and degrees", ("gap", *aligners), rows)
+    common.print_table("median error of the found, m and degrees", ("method", *gap_names), rows)
     rows = [
         [row["method"], row["attempts"], row["failed"], row["flagged"]]
         + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
         for row in agreement
     ]
-    print_table(
+    common.print_table(
         "status against failure", ("method", "tries", "failed", "flagged", "precision", "recall", "ms/pair"), rows
     )
     results = {"clip": clip, "success": rates, "errors": errors, "status": agreement, "attempts": records}
@@ -257,7 +267,25 @@ def _draw(records: list[dict[str, Any]], clip: str, folder: Path) -> None:
     rates = success_rates(records)
     motion = np.array([row["motion_deg"] for row in rates])
     success = {name: np.array([row["success"][name] for row in rates]) for name in rates[0]["success"]}
-    common.save_figure(plots.plot_basin(motion, success, clip), folder, "basin")
+    ours = [name for name in success if name not in PEERS]
+    common.save_figure(plots.plot_basin(motion, success, clip, ours), folder, "basin")
+
+
+def _draw_records(found: Iterable[Record], folder: Path) -> None:
+    """Draw the success rates of records; a method was not tried at every gap."""
+    tables = [table for record in found for table in record.tables if table.title.startswith(TITLE)]
+    gaps = sorted({float(heading.split(", ")[1].rstrip("°")) for table in tables for heading in table.columns[1:]})
+    success: dict[str, np.ndarray] = {}
+    for table in tables:
+        angles = [float(heading.split(", ")[1].rstrip("°")) for heading in table.columns[1:]]
+        for name, *cells in table.rows:
+            if not name.startswith("("):
+                rates = dict(zip(angles, map(float, cells), strict=True))
+                success[name] = np.array([rates.get(gap, np.nan) for gap in gaps])
+    ours = sorted((name for name in success if name not in PEERS), key=METHODS.split(",").index)
+    success = {name: success[name] for name in (*ours, *(name for name in success if name in PEERS))}
+    clip = tables[0].title.removeprefix(TITLE)
+    common.save_figure(plots.plot_basin(np.array(gaps), success, clip, ours), folder, "basin")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Whether the covariance of a motion tells its error: eᵀΣ⁻¹e over pairs of synthetic sequences and of real clips.
 
 With e the twist between the true and the estimated motion, in the tangent that Σ is stated in, eᵀΣ⁻¹e of an honest
-covariance has a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints a row a sequence: the pairs, the
-mean and median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the error is against
+covariance has a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints one row per sequence: the pairs,
+the mean and median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the error is against
 motion capture, whose own errors and time offset count as the odometry's.
 
     python benchmarks/calibration.py
@@ -24,7 +24,7 @@ from gavo_jax.alignment.pairs import align
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.se3 import log
 from gavo_jax.trajectory import inverse
 
@@ -105,7 +105,7 @@ def main(
     columns = ("", "pairs", "mean", "median", "share within 95 %", "mm", "mrad")
     keys = ("mean", "median", "share_within", "millimetres", "milliradians")
     cells = [[row["sequence"], row["pairs"], *(number(row[key], 2) for key in keys)] for row in rows]
-    print_table(f"normalised error of {method}; 6 and 0.95 are ideal", columns, cells)
+    common.print_table(f"normalised error of {method}; 6 and 0.95 are ideal", columns, cells)
     results = {"method": method, "frames": frames, "seeds": seeds, "rows": rows}
     common.record(json, "calibration", results)
     return results

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import records
 import tyro
 
 from gavo_jax import presets
@@ -23,7 +25,7 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS, ROTATION_DRIFT
-from gavo_jax.output import plots
+from gavo_jax.output import plots, screen
 from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
@@ -36,13 +38,73 @@ CLIP_FRAMES = {"fr1_xyz": 90}
 
 
 def command(main: Callable[..., Any]) -> None:
-    """Run a benchmark's `main` as a command: its arguments are the options, the module's docstring the help text."""
+    """Run a benchmark's `main` as a command: its arguments are the options, the module's docstring the help text.
+
+    Beside them there is `--record FILE`.
+    """
     enable_compilation_cache()
     try:
-        tyro.cli(main, description=sys.modules[main.__module__].__doc__)
+        arguments, file = take_record(sys.argv[1:])
+        tyro.cli(main, args=arguments, description=f"{sys.modules[main.__module__].__doc__}\n{RECORD_HELP}")
+        if file is not None:
+            records.write_record(file, printed_record(Path(sys.argv[0]).stem, arguments))
+            print(f"recorded in {file}; `python benchmarks/records.py` puts it onto the pages")
     except GavoError as error:
         print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+RECORD_HELP = "With --record FILE the tables that are printed are written as a record, too (benchmarks/records.py)."
+
+_printed: list[records.Table] = []
+_told: list[str] = []
+"""Tables and sentences of this process, in the order in which they were printed."""
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table whose first column is text and whose others are numbers, and keep it for the record."""
+    screen.print_table(title, columns, rows)
+    cells = tuple(tuple(str(cell) or records.UNKNOWN for cell in row) for row in rows)
+    _printed.append(records.Table(title, tuple(columns), cells))
+
+
+def tell(sentence: str) -> None:
+    """Print a sentence, and keep it for the record."""
+    print(f"{sentence}\n")
+    _told.append(f"{sentence[:1].upper()}{sentence[1:]}.")
+
+
+def take_record(arguments: Sequence[str]) -> tuple[list[str], Path | None]:
+    """The arguments without `--record FILE`, and that file.
+
+    Raises:
+        GavoError: no file is named.
+    """
+    rest = list(arguments)
+    if "--record" not in rest:
+        return rest, None
+    place = rest.index("--record")
+    if place + 1 == len(rest):
+        raise GavoError("--record: name the file, as benchmarks/records/drift.toml")
+    file = Path(rest[place + 1])
+    del rest[place : place + 2]
+    return rest, file
+
+
+def printed_record(benchmark: str, arguments: Sequence[str]) -> records.Record:
+    """What this process printed, as a record."""
+    here = machine()
+    versions = here["versions"]
+    named = {"JAX": "jax", "NumPy": "numpy", "OpenCV": "opencv"}
+    return records.Record(
+        benchmark,
+        shlex.join(["python", f"benchmarks/{benchmark}.py", *arguments]),
+        here["date"][:10],
+        f"{here['processor']}, {here['cores']} cores, {here['device']}",
+        ", ".join(f"{name} {versions[key]}" for name, key in named.items()),
+        tuple(_printed),
+        told=tuple(_told),
+    )
 
 
 def names(text: str) -> list[str]:
@@ -176,7 +238,7 @@ class Summary(NamedTuple):
     lost: int
     """Lost pairs of the worst run."""
     milliseconds: float
-    """Median over the runs of the median time a pair."""
+    """Median over the runs of the median time per pair."""
     runs: int
 
 

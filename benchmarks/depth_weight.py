@@ -1,7 +1,7 @@
 """How much depth is worth beside grey: what either channel alone says of the motion, and how far the two disagree.
 
 Tracks with Gauss-Newton. At each pair and level the optimum of the grey cost alone and that of the depth cost alone are
-found. Prints, for each clip, a row a level, with medians over the pairs:
+found. Prints, for each clip, one row per level, with medians over the pairs:
 
 - weight by scatter: the weight of depth that each channel's own scatter from tile to tile of the image would justify;
 - disagreement: how far apart the two optima lie, squared, in units of the covariance that those scatters promise for
@@ -34,7 +34,7 @@ from gavo_jax.objective.error import Objective
 from gavo_jax.objective.problem import Problem
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.tracking import TrackerState
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 
@@ -131,7 +131,7 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
     found = {clip: measure(clip) for clip in common.names(clips)}
     for clip, levels in found.items():
         cells = [[str(level), *(number(row[name], 3) for name in FIGURES)] for level, row in levels.items()]
-        print_table(
+        common.print_table(
             f"what depth is worth, {clip}", ("level", "weight by scatter", "disagreement", "by disagreement"), cells
         )
     results = {"clips": found}

@@ -1,31 +1,35 @@
 """Drift of every method on every clip: ours with their presets, the peers beside them.
 
-Prints, for each clip, a row a method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s, each
-as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
-milliseconds a pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
+Prints, for each clip, one row per method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s,
+each as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
+milliseconds per pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
 which need not be the same one) and of the GA to Gauss-Newton, clip by clip, with their geometric mean and the worst.
 
     python benchmarks/drift.py
     python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
     python benchmarks/drift.py --figure docs
     python benchmarks/drift.py --recorded ours.json,peers.json --figure docs
+    python benchmarks/drift.py --recorded benchmarks/records/drift.toml --figure docs
 
 Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
 METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
 is run at the full resolution as printed; without it, ten minutes.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
 import numpy as np
+from records import Record, read_record
 
 from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output import plots
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.peers import PEERS
 
+TITLE = "drift on "
 METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers()
 
 
@@ -78,6 +82,16 @@ def drifts(runs: list[dict[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
     return found
 
 
+def medians(records: Sequence[Record]) -> dict[str, dict[str, np.ndarray]]:
+    """The same as records tell it: one row for each method, the median."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for table in (table for record in records for table in record.tables if table.title.startswith(TITLE)):
+        clip = found.setdefault(table.title.removeprefix(TITLE).partition(",")[0], {})
+        places = [table.columns.index(name) for name in ("m/s", "deg/s")]
+        clip.update({row[0]: np.array([[float(row[i]) for i in places]]) for row in table.rows})
+    return found
+
+
 def main(
     clips: str = common.CLIPS,
     methods: str = METHODS,
@@ -94,24 +108,28 @@ def main(
         seeds: runs of each of our methods.
         json: file for all runs and the summary.
         figure: folder for drift.png and drift.svg.
-        recorded: files of earlier `json`, with commas between, to draw together; nothing is measured.
+        recorded: files of earlier `json`, or of earlier `--record`, with commas between, to draw together; nothing is
+            measured.
     """
+    if recorded.endswith(".toml"):
+        _draw(medians([read_record(Path(name)) for name in common.names(recorded)]), figure or Path())
+        return {}
     if recorded:
         earlier = [run for found in common.read_records(recorded, "drift") for run in found["runs"]]
-        _draw(earlier, figure or Path())
+        _draw(drifts(earlier), figure or Path())
         return {"runs": earlier}
     runs = common.measure_drift(common.names(clips), common.parse_methods(methods), seeds)
     summaries = common.summarise(runs)
     for clip in common.names(clips):
         rows = [common.drift_row(summary) for summary in summaries if summary.clip == clip]
-        print_table(f"drift on {clip}, {runs[0]['device']}", common.DRIFT_COLUMNS, rows)
+        common.print_table(f"{TITLE}{clip}, {runs[0]['device']}", common.DRIFT_COLUMNS, rows)
     compared = ratios(summaries)
     if compared:
         rows = [
             [r.name, *(number(value, 3) for value in r.by_clip.values()), number(r.mean, 3), number(r.worst, 3)]
             for r in compared
         ]
-        print_table("ratios of the medians", ("", *common.names(clips), "geometric mean", "worst"), rows)
+        common.print_table("ratios of the medians", ("", *common.names(clips), "geometric mean", "worst"), rows)
     results = {
         "runs": runs,
         "summary": [summary._asdict() for summary in summaries],
@@ -119,13 +137,13 @@ def main(
     }
     common.record(json, "drift", results)
     if figure is not None:
-        _draw(runs, figure)
+        _draw(drifts(runs), figure)
     return results
 
 
-def _draw(runs: list[dict[str, Any]], folder: Path) -> None:
-    ours = [name for name in dict.fromkeys(run["name"] for run in runs) if name not in PEERS]
-    common.save_figure(plots.plot_drift(drifts(runs), ours), folder, "drift")
+def _draw(clips: dict[str, dict[str, np.ndarray]], folder: Path) -> None:
+    ours = [name for methods in clips.values() for name in methods if name not in PEERS]
+    common.save_figure(plots.plot_drift(clips, ours), folder, "drift")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
 from gavo_jax.odometry.driver import Step, track
 from gavo_jax.odometry.run import trajectory_of
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory, inverse
 
 PLACES = 5
@@ -397,9 +397,9 @@ def main(
         for row in rows
     ]
     columns = ("clip", "fault", "run", "flagged", "others", "wrong ok", "m/s", "ratio", "statuses")
-    print_table(f"{PLACES} places of each clip, {contender.name}", columns, cells)
+    common.print_table(f"{PLACES} places of each clip, {contender.name}", columns, cells)
     wrong, silent = sum(row.wrong for row in rows), sum(row.silent for row in rows)
-    print(f"{silent} of {wrong} wrong pairs are ok")
+    common.tell(f"{silent} of {wrong} wrong pairs are ok")
     alarms = []
     for name in common.names(clips):
         counts = Counter(step.alignment.status.name.lower() for step in follow(common.open_clip(name), contender, 0)[0])
@@ -408,7 +408,7 @@ def main(
             {"clip": name, "pairs": pairs, "false_alarms": 1 - counts["ok"] / pairs, "statuses": dict(counts)}
         )
     cells = [[row["clip"], row["pairs"], f"{row['false_alarms']:.1%}", str(row["statuses"])] for row in alarms]
-    print_table("clean clips", ("clip", "pairs", "flagged", "statuses"), cells)
+    common.print_table("clean clips", ("clip", "pairs", "flagged", "statuses"), cells)
     results = {"faults": [{**row._asdict(), "ratio": row.ratio} for row in rows], "clean": alarms}
     common.record(json, "faults", results)
     return results

@@ -25,7 +25,7 @@ import numpy as np
 
 from gavo_jax.datasets.synthetic import write_tum
 from gavo_jax.errors import GavoError
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 
 RATE = 30.0
 """Frames a second of what is played."""
@@ -64,14 +64,14 @@ def main(
     rows = [
         (name, *(number(float(np.median(times)), 1) for times in f["start"].values())) for name, f in figures.items()
     ]
-    print_table(f"seconds to the first pose of {clip}", ("", "empty cache", "filled cache"), rows)
+    common.print_table(f"seconds to the first pose of {clip}", ("", "empty cache", "filled cache"), rows)
     rows = []
     for name, row in figures.items():
         peaks = list(row["megabytes"].values())
         row["ratio"] = peaks[-1] / peaks[0]
         rows.append((name, *(number(peak, 0) for peak in peaks), number(row["ratio"], 3)))
     columns = ("", *(f"{count} frames" for count in counts), "last / first")
-    print_table(f"peak of resident memory, MB, frames of {clip}", columns, rows)
+    common.print_table(f"peak of resident memory, MB, frames of {clip}", columns, rows)
     results = {"clip": clip, "methods": figures}
     common.record(json, "footprint", results)
     return results

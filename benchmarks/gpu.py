@@ -1,4 +1,4 @@
-"""What an accelerator makes of it: pairs a second, latency, share of the memory's speed, agreement with the CPU.
+"""What an accelerator makes of it: pairs per second, latency, share of the memory's speed, agreement with the CPU.
 
 Prints four tables: `align_batch` by the size of the batch, from arrays on the host to results there; the latency of
 one pair alone, by `align` and by the driver from decoded images; scoring against the limit that memory sets; and how
@@ -32,7 +32,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.driver import Odometry
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.trajectory import inverse
 
 BYTES = 7 * 4
@@ -65,7 +65,7 @@ def main(
     """
     device = jax.devices()[0].device_kind
     if jax.default_backend() == "cpu":
-        print("no GPU here: the figures are this CPU's, and the agreement is its own with itself\n")
+        common.tell("no GPU here: the figures are this CPU's, and the agreement is its own with itself")
     sequence = common.open_clip(clip)
     frames, camera = [sequence[i] for i in range(len(sequence))], sequence.camera
     results: dict[str, Any] = {"clip": clip, "batches": {}, "latency": {}, "agreement": {}}
@@ -80,19 +80,19 @@ def main(
         for name, measured in results["batches"].items()
         for row in measured
     ]
-    print_table(f"align_batch, {device}", ("", "pairs", "ms", "pairs/s"), rows)
+    common.print_table(f"align_batch, {device}", ("", "pairs", "ms", "pairs/s"), rows)
     rows = [(name, *(number(value, 2) for value in row.values())) for name, row in results["latency"].items()]
-    print_table(f"ms of a pair alone, {device}", ("", "align", "driver"), rows)
+    common.print_table(f"ms of a pair alone, {device}", ("", "align", "driver"), rows)
     rows = [
         (f"{row['size']}, {row['candidates']} candidates", *(number(row[key], 3) for key in KEYS_OF_MEMORY))
         for row in results["memory"]["scoring"]
     ]
     gigabytes = number(results["memory"]["gigabytes_per_second"], 0)
     columns = ("", "ms", "limit, ms", "share of the limit")
-    print_table(f"scoring at {BYTES} bytes a pixel and candidate and {gigabytes} GB/s, {device}", columns, rows)
+    common.print_table(f"scoring at {BYTES} bytes a pixel and candidate and {gigabytes} GB/s, {device}", columns, rows)
     rows = [(name, *(number(value, 4) for value in row.values())) for name, row in results["agreement"].items()]
     columns = ("", "mm, median", "mm, largest", "deg, median", "deg, largest")
-    print_table(f"{len(frames) - 1} pairs: distance from the CPU's result, {device}", columns, rows)
+    common.print_table(f"{len(frames) - 1} pairs: distance from the CPU's result, {device}", columns, rows)
     common.record(json, "gpu", results)
     return results
 

@@ -38,7 +38,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import Pyramid, build_pyramid
 from gavo_jax.objective.error import Objective, Residuals, lane_sum
 from gavo_jax.objective.losses import l2
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 
@@ -280,12 +280,12 @@ def main(levels: str = "0,1,2,3,4", population: int = 64, rounds: int = 7, json:
         by_size[size] = measure(formulations(scene, objective, full), scene.grey.size, rounds)
     rows = [[name, *(number(times[name], 2) for times in by_size.values())] for name in next(iter(by_size.values()))]
     device = jax.devices()[0].device_kind
-    print_table(f"ns per pixel and candidate, {population} candidates, {device}", ("", *by_size), rows)
+    common.print_table(f"ns per pixel and candidate, {population} candidates, {device}", ("", *by_size), rows)
     ratios = {f"{PLAIN} / {SCORE}": {size: times[PLAIN] / times[SCORE] for size, times in by_size.items()}}
     if all(NUMBA in times for times in by_size.values()):
         ratios[f"{SCORE} / {NUMBA}"] = {size: times[SCORE] / times[NUMBA] for size, times in by_size.items()}
     rows = [[name, *(number(value, 2) for value in values.values())] for name, values in ratios.items()]
-    print_table("ratios", ("", *by_size), rows)
+    common.print_table("ratios", ("", *by_size), rows)
     results = {"population": population, "rounds": rounds, "nanoseconds": by_size, "ratios": ratios}
     common.record(json, "kernel", results)
     return results

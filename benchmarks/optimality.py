@@ -3,8 +3,9 @@
 For each pair the GA and Gauss-Newton are run coarse to fine from the identity. Then one objective is made for the
 finest level, its brightness model and scales estimated at the GA's result, and everything is judged by that E: the two
 motions as they were found, and the minima that Gauss-Newton, run to convergence on this very E, reaches from either.
-The lower of the two minima is the reference. Prints a row a clip: the excess of the GA's E over it (median, 90th and
-95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own result.
+The lower of the two minima is the reference. Prints one row per clip: the excess of the GA's E over it (median, 90th
+and 95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own
+result.
 
     python benchmarks/optimality.py
     python benchmarks/optimality.py --clips fr1_desk:31 --preset fast --json optimality.json
@@ -31,7 +32,7 @@ from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.objective.error import Objective
 from gavo_jax.objective.preconditioning import preconditioner, reference_curvature
 from gavo_jax.objective.problem import Problem
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.base import Bounds, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -153,7 +154,7 @@ def main(clips: str = common.CLIPS, preset: str = "default", seed: int = 0, json
     ]
     shares = (f"share <= {TOLERANCE} %", "Gauss-Newton's share")
     columns = ("clip", "pairs", "median %", "p90", "p95", "max", *shares)
-    print_table(f"excess of E over the minimum, GA preset {preset}", columns, cells)
+    common.print_table(f"excess of E over the minimum, GA preset {preset}", columns, cells)
     results = {"preset": preset, "seed": seed, "summary": rows, "pairs": pairs}
     common.record(json, "optimality", results)
     return results

@@ -44,8 +44,10 @@ class Record(NamedTuple):
     machine: str
     versions: str
     tables: tuple[Table, ...]
+    told: tuple[str, ...] = ()
+    """Sentences that the benchmark printed beside its tables."""
     notes: tuple[str, ...] = ()
-    """What a reader has to know beside the tables, a sentence or two each."""
+    """What a reader has to know beside these, written by hand."""
 
 
 STRING = r"\"(?:[^\"\\\n]|\\.)*\""
@@ -55,9 +57,9 @@ STRING = r"\"(?:[^\"\\\n]|\\.)*\""
 def write_record(path: Path, record: Record) -> None:
     """Write a record; notes that an earlier one at that place held stay."""
     notes = record.notes or (read_record(path).notes if path.is_file() else ())
-    entries = {name: value for name, value in record._asdict().items() if name not in ("tables", "notes")}
-    if notes:
-        entries["notes"] = list(notes)
+    entries = {**record._asdict(), "notes": notes}
+    del entries["tables"]
+    entries = {name: list(value) if isinstance(value, tuple) else value for name, value in entries.items() if value}
     tables = [
         {"title": t.title, "columns": list(t.columns), "rows": [list(row) for row in t.rows]} for t in record.tables
     ]
@@ -77,7 +79,8 @@ def read_record(path: Path) -> Record:
         Table(table["title"], tuple(table["columns"]), tuple(tuple(row) for row in table["rows"]))
         for table in entries.pop("tables")
     )
-    return Record(**{**entries, "tables": tables, "notes": tuple(entries.get("notes", ()))})
+    told, notes = (tuple(entries.pop(name, ())) for name in ("told", "notes"))
+    return Record(**entries, tables=tables, told=told, notes=notes)
 
 
 class Records:
@@ -98,7 +101,7 @@ class Records:
 
         Args:
             benchmark: Its name.
-            table: What the table's title begins with.
+            table: What the table's title holds.
             row: First cell of the row.
             column: What the column's heading begins with.
         """
@@ -106,7 +109,7 @@ class Records:
             for found in record.tables:
                 headings = [i for i, heading in enumerate(found.columns) if i and heading.startswith(column)]
                 for cells in found.rows:
-                    if found.title.startswith(table) and cells[0] == row and headings:
+                    if table in found.title and cells[0] == row and headings:
                         return cells[headings[0]]
         return UNKNOWN
 
@@ -157,7 +160,7 @@ def section(records: Sequence[Record]) -> str:
         for table in record.tables:
             parts.append(f"**{table.title}**\n\n{markdown(table)}" if table.title else markdown(table))
         parts.append(f"*`{record.command}`. {record.date}; {record.machine}; {record.versions}.*")
-        parts += record.notes
+        parts += (*record.told, *record.notes)
     return "\n\n".join(parts)
 
 

@@ -3,7 +3,7 @@
 The first table has the milliseconds of one call of `Objective.score` (robust grey and depth error, every pixel a
 point), a row an image size, a column a population, and below it the exponent of (pixels x candidates) fitted to all
 calls of more than a million of them: 1 is linear. The second has the milliseconds of `align_batch`, from arrays on the
-host to the results there, and the pairs a second. Each figure is the median of calls in turn.
+host to the results there, and the pairs per second. Each figure is the median of calls in turn.
 
     python benchmarks/scaling.py
     python benchmarks/scaling.py --populations 64,256,1024,4096 --batches 16,64,256,1024 --json scaling.json
@@ -28,7 +28,7 @@ from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.objective.error import Objective
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import AlignmentOptions
 
 LARGE = 1e6
@@ -61,9 +61,9 @@ def main(
     sizes = dict.fromkeys(row["size"] for row in scoring)
     rows = [[size, *(number(row["milliseconds"], 3) for row in scoring if row["size"] == size)] for size in sizes]
     columns = ("", *(f"{count} candidates" for count in common.counts(populations)))
-    print_table(f"ms of a call of score, {jax.devices()[0].device_kind}", columns, rows)
+    common.print_table(f"ms of a call of score, {jax.devices()[0].device_kind}", columns, rows)
     slope = exponent(scoring)
-    print(f"exponent above {LARGE:.0e} pixels x candidates: {number(slope, 3)}\n")
+    common.tell(f"exponent above {LARGE:.0e} pixels x candidates: {number(slope, 3)}")
     results = {"scoring": scoring, "exponent": slope, "batches": {}}
     for name in common.names(methods) if batches else ():
         settings = partial(align_batch, camera=sequence.camera, settings=common.preset_of(name))
@@ -72,7 +72,7 @@ def main(
     for name, measured in results["batches"].items():
         rows += [(name, row["pairs"], number(row["milliseconds"], 1), number(row["per_second"], 1)) for row in measured]
     if rows:
-        print_table("align_batch", ("", "pairs", "ms", "pairs/s"), rows)
+        common.print_table("align_batch", ("", "pairs", "ms", "pairs/s"), rows)
     common.record(json, "scaling", results)
     return results
 

@@ -21,7 +21,7 @@ import numpy as np
 from gavo_jax import presets
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 
 
@@ -63,7 +63,7 @@ def main(clips: str = common.CLIPS, readouts: str = "0,12,16,20,24,28,32", json:
             [str(row["readout_ms"]), number(row["error"], 3), number(row["translation"], 4), number(row["rotation"], 2)]
             for row in rows
         ]
-        print_table(f"rolling shutter of {clip}", ("readout, ms", "E", "m/s", "deg/s"), cells)
+        common.print_table(f"rolling shutter of {clip}", ("readout, ms", "E", "m/s", "deg/s"), cells)
     results = {"clips": found}
     common.record(json, "shutter", results)
     return results

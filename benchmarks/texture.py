@@ -27,7 +27,6 @@ from gavo_jax import se3
 from gavo_jax.alignment.pairs import align_batch
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
-from gavo_jax.output.screen import print_table
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -236,13 +235,13 @@ def main(
         worst = max((case.translation for case in group if case.status == "ok"), default=0.0)
         text = ", ".join(f"{count} {name}" for name, count in statuses.items())
         cells.append([method, scene, f"{sum(case.fine for case in group)} of {len(group)}", f"{worst * 1e3:.1f}", text])
-    print_table("surfaces that tell little", ("method", "scene", "fine", "worst ok, mm", "statuses"), cells)
+    common.print_table("surfaces that tell little", ("method", "scene", "fine", "worst ok, mm", "statuses"), cells)
     for case in cases:
         if not case.fine:
             error = f"{case.translation * 1e3:.1f} mm, {np.degrees(case.rotation):.2f} degrees off"
             kind = f"{case.method}, {case.scene}, noise {case.noise:g}, {'Kinect' if case.kinect else 'true'} depth"
             print(f"not fine: {kind}: {error}, {case.status} {case.undetermined}")
-    print(f"{sum(case.fine for case in cases)} of {len(cases)} are fine")
+    common.tell(f"{sum(case.fine for case in cases)} of {len(cases)} are fine")
     results = {"cases": [case._asdict() for case in cases]}
     common.record(json, "texture", results)
     return results

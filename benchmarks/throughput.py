@@ -28,7 +28,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, track
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 
 METHODS = "ga,ga:fast,ga:wide,ga:paper,pso,gauss-newton,adam"
 OVER = "opencv-rgb,opencv-rgbd,open3d-color"
@@ -72,18 +72,18 @@ def main(
         cells += [number(figures[key], 1) for key in COLUMNS_OF_TIME.values()]
         rows.append((name, *cells, *(number(ratio, 2) for ratio in ratios.values())))
     columns = ("", "frames/s", *COLUMNS_OF_TIME, *(f"/ {name}" for name in references))
-    print_table(f"{len(sequence)} frames of {clip}, from files to poses", columns, rows)
+    common.print_table(f"{len(sequence)} frames of {clip}, from files to poses", columns, rows)
     results = {"clip": clip, "frames": len(sequence), "rounds": rounds, "contenders": measured, **_reading(sequence)}
     megabytes, milliseconds = results["frame_MB"], results["frame_ms"]
     row = ("read, decoded, undistorted", number(megabytes, 2), number(milliseconds, 1))
-    print_table("a frame", ("", "MB", "ms on a core"), [row])
+    common.print_table("a frame", ("", "MB", "ms on a core"), [row])
     if together:
         own = [name for name in common.names(methods) if name not in common.PEERS]
         results |= {"together": {name: _together(sequence, name, together) for name in own}, **_row()}
         rows = [(name, *(number(value, 1) for value in times.values())) for name, times in results["together"].items()]
-        print_table(f"{together} runs together, decoding included", ("", "ms/pair", "on cores"), rows)
+        common.print_table(f"{together} runs together, decoding included", ("", "ms/pair", "on cores"), rows)
         row = ("", number(results["row_kB"], 1), number(results["row_ms"], 1))
-        print_table("a row of results", ("", "kB", "ms"), [row])
+        common.print_table("a row of results", ("", "kB", "ms"), [row])
     common.record(json, "throughput", results)
     return results
 

@@ -3,7 +3,7 @@
 The runs differ in their seeds and in a rate of the solver (`ga`: mutation_decay, `pso`: constriction, `gauss-newton`:
 damping, `adam`: decay). For each method: programs compiled for one run and then for all the others, seconds of the 64
 runs as 64 calls of `run_odometry`, as bare loops over the frames (without its warm-up and figures), and together; the
-ratios of these times; milliseconds a pair on the processor (all cores' time added up) bare and together; and how many
+ratios of these times; milliseconds per pair on the processor (all cores' time added up) bare and together; and how many
 of the trajectories are the same bit for bit.
 
     python benchmarks/together.py
@@ -33,7 +33,7 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.run import run_odometry
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import Settings
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
@@ -68,7 +68,7 @@ def main(
     rows = [_row(name, results[name]) for name in common.names(methods)]
     columns = ("", "programs", "more", "run_odometry, s", "bare, s", "together, s", "ratio", "to bare")
     columns += ("bare, core-ms", "together, core-ms", "equal")
-    print_table(f"{runs} runs over {len(sequence)} frames of {clip}", columns, rows)
+    common.print_table(f"{runs} runs over {len(sequence)} frames of {clip}", columns, rows)
     common.record(json, "together", results)
     return results
 

@@ -1,7 +1,7 @@
 """What it costs to watch: a run with the viewer that saves to a file against one without, in turn.
 
 Prints, for each method, the median time of a run without and with `--viewer save`, their ratio, the processor's
-milliseconds a frame that the viewer adds (all cores' time added up) and the recording's size a frame.
+milliseconds per frame that the viewer adds (all cores' time added up) and the recording's size a frame.
 
     python benchmarks/viewer.py
     python benchmarks/viewer.py --clip synthetic:20 --methods gauss-newton --rounds 2 --json viewer.json
@@ -20,7 +20,7 @@ import numpy as np
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.output.files import RECORDING
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.viewer.base import ViewerMode
 from gavo_jax.viewer.live import make_viewer
@@ -95,7 +95,7 @@ def main(
                 )
             )
     columns = ("method", "ms/frame without", "with", "ratio", "on cores, ms/frame more", "MB/frame")
-    print_table(f"{len(sequence)} frames of {clip}, median of {rounds}", columns, rows)
+    common.print_table(f"{len(sequence)} frames of {clip}, median of {rounds}", columns, rows)
     common.record(json, "viewer", results)
     return results
 

@@ -1,4 +1,4 @@
-"""What `mkdocs build` does beside what mkdocs.yml says: entries of the navigation whose page is not there are left out."""
+"""What `mkdocs build` does beside mkdocs.yml: entries of the navigation whose page is not there are left out."""
 
 from pathlib import Path
 from typing import Any

@@ -161,9 +161,9 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
 
     Args:
         settings: What the others are taken from.
-        values: Value by dotted name. A list gives a schedule an entry a pyramid level (level 0 first); a single number
-            stands for every level of a schedule of rates; `solver.population.4` names the entry of level 4. The word
-            `none` switches an optional number off; losses and optax's optimisers go by their names.
+        values: Value by dotted name. A list gives a schedule an entry per pyramid level (level 0 first); a single
+            number stands for every level of a schedule of rates; `solver.population.4` names the entry of level 4. The
+            word `none` switches an optional number off; losses and optax's optimisers go by their names.
         place: Where the values stand, for the message.
 
     Raises:

@@ -1,6 +1,7 @@
 """Every benchmark runs, on a few small frames, and its figures follow from what it measured."""
 
 import importlib
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ from small import CAMERA, NEWTON
 
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
+from gavo_jax.odometry.metrics import DRIFT
 from gavo_jax.se3 import log
 from gavo_jax.trajectory import inverse
 
@@ -389,3 +392,33 @@ def test_pairs_that_are_wrong_and_told_so_are_counted(load) -> None:
     summary = moving.summarise("clip", "card", [score])
     assert (summary.precision, summary.recall, summary.false_alarms) == (0.5, 0.5, pytest.approx(1 / 3))
     assert summary.ratio_worst == pytest.approx(3.0) and summary.overlap is None
+
+
+def test_table_1_is_made_of_the_experiment_and_recorded(
+    load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    load("table1")
+    table, labels = Table(tmp_path), ("ga", "pso")
+    for i, (label, seed) in enumerate(itertools.product(labels, range(6))):
+        blank = {name: {TEXT: "{}", REAL: 1.0, FLAG: False}.get(kind, 0) for name, kind in COLUMNS.items()}
+        figures = {DRIFT: 0.01 * (1 + 0.1 * i), "run": str(i), "sequence": "clip", "label": label, "seed": seed}
+        table.append({**blank, **figures, "runs_together": 1, "pixels": 1})
+    plan = {
+        "printed": [{"sequence": "clip", "label": "ga", "drift": 0.04}],
+        "order": [["clip", name] for name in labels],
+    }
+    (tmp_path / "experiment.json").write_text(json.dumps(plan))
+    file = tmp_path / "table1.toml"
+    monkeypatch.setattr(sys, "argv", ["benchmarks/table1.py", "--results", str(tmp_path), "--record", str(file)])
+    monkeypatch.setattr(sys.modules["common"], "_printed", [])
+    sys.modules["common"].command(sys.modules["table1"].main)
+    record = load("records").read_record(file)
+    assert record.command == f"python benchmarks/table1.py --results {tmp_path}" and "JAX" in record.versions
+    means, tests = record.tables
+    assert [row[:3] for row in means.rows] == [("ga", "6", "0.01250"), ("pso", "6", "0.01850")]
+    assert means.rows[0][5] == "0.04000" and means.rows[1][5] == "–"
+    assert tests.rows[0][0] == "ga / pso" and "recorded in" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["benchmarks/table1.py", "--record"])
+    with pytest.raises(SystemExit):
+        sys.modules["common"].command(sys.modules["table1"].main)
+    assert "--record: name the file" in capsys.readouterr().err

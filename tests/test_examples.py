@@ -6,6 +6,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from PIL import Image
+from small import CAMERA, GENETIC
 
 import gavo_jax as gavo
 from gavo_jax import presets
@@ -42,6 +44,17 @@ def test_sequence(capsys: pytest.CaptureFixture[str]) -> None:
     assert run.metrics["lost_pairs"] == 0
     assert run.metrics["distance_error_final_m"] < 0.01
     assert len(capsys.readouterr().out.splitlines()) == 4 + len(run.metrics)
+
+
+def test_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    module, room = load("film"), gavo.SyntheticSequence
+    monkeypatch.setattr(gavo, "SyntheticSequence", lambda frames, color: room(frames, camera=CAMERA, color=color))
+    monkeypatch.setattr(gavo, "preset", lambda _: GENETIC)
+    pictures = module.main(str(tmp_path / "film.webp"), frames=2, stride=2)
+    with Image.open(tmp_path / "film.webp") as film:
+        assert film.format == "WEBP" and getattr(film, "n_frames", 1) == len(pictures) > 5
+    assert pictures[0].size == (900, 310)
+    assert "film.webp" in capsys.readouterr().out
 
 
 def test_own_dataset(capsys: pytest.CaptureFixture[str]) -> None:

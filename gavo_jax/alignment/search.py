@@ -93,7 +93,7 @@ def align_views(
         target: Of `prepare_target`, for the same solver.
         camera: Camera of level 0.
         levels: Of `levels_of`.
-        solver: Any `solvers.base.Solver` with an entry a level.
+        solver: Any `solvers.base.Solver` with an entry per level.
         options: What is minimised.
         key: Random key.
         guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.

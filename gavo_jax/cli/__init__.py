@@ -38,7 +38,7 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
-    "or Adam, on one compiled photometric objective."
+    "or Adam, on one compiled photometric objective. `gavo --version` says which version this is."
 )
 
 

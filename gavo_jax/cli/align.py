@@ -1,19 +1,24 @@
 """`gavo align`: one pair of images, the motion between them as JSON."""
 
 import json
+import sys
 
 import jax
+import numpy as np
 
 from gavo_jax.alignment.pairs import align as align_pair
+from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import preset_for_sequence
 from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.selection import check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.files import open_pair
+from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.files import describe
-from gavo_jax.output.screen import waiting
+from gavo_jax.output.screen import say, waiting
+from gavo_jax.trajectory import inverse
 
 
 def align(options: Align) -> int:
@@ -37,7 +42,26 @@ def align(options: Align) -> int:
         "status_sentence": found.sentence,
     }
     print(json.dumps(describe(answer), indent=2, allow_nan=False))
+    if sys.stdout.isatty():
+        say(in_words(found))
     return 0
+
+
+def in_words(found: Alignment) -> str:
+    """How the camera moved, and what is known of that, in sentences."""
+    reference_T_target = inverse(np.asarray(found.target_T_reference, np.float64))
+    right, down, forward = 1e3 * reference_T_target[:3, 3]
+    ways = (
+        f"{abs(right):.1f} mm {'right' if right >= 0 else 'left'}",
+        f"{abs(down):.1f} mm {'down' if down >= 0 else 'up'}",
+        f"{abs(forward):.1f} mm {'forward' if forward >= 0 else 'back'}",
+    )
+    length = float(np.linalg.norm(reference_T_target[:3, 3])) * 1e3
+    angle = float(np.degrees(rotation_angle(reference_T_target[None, :3, :3])[0]))
+    return (
+        f"The camera moved by {length:.1f} mm ({', '.join(ways)}) and turned by {angle:.2f} degrees. {found.sentence} "
+        f"{float(found.overlap):.0%} of the points are in view."
+    )
 
 
 def _calibration(options: Align) -> Calibration:

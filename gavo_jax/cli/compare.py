@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Compare
+from gavo_jax.cli.run_table import why_no_drift
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -28,8 +29,8 @@ from gavo_jax.odometry.metrics import (
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
-from gavo_jax.output.report import REPORT, Table, write_report
-from gavo_jax.output.screen import number, print_table, say
+from gavo_jax.output.report import REPORT, Picture, Table, write_report
+from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
@@ -37,21 +38,26 @@ from gavo_jax.trajectory import Trajectory
 COMPARISON = "comparison.json"
 
 COLUMNS = (
-    ("drift m/s", DRIFT, 4),
+    ("m/s", DRIFT, 4),
     ("deg/s", ROTATION_DRIFT, 3),
     ("ATE m", ABSOLUTE_ERROR, 4),
-    ("distance m", FINAL_DISTANCE, 4),
+    ("end m", FINAL_DISTANCE, 4),
     ("lost", "lost_pairs", 0),
     ("ms/pair", MILLISECONDS, 1),
     ("frames/s", FRAMES_PER_SECOND, 1),
 )
 """Columns of the table: heading, key in comparison.json, decimals."""
-HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "drift from", "to")
+HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
 TABLE_CAPTION = (
-    "Each method's run of median drift. Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, "
-    "fixed delta), translation in m/s and rotation in deg/s. ATE: root mean square distance of associated positions "
-    "after the best rigid alignment. Distance: from the true position at the end, both relative to the first pose. "
-    "Times: from decoded images to the result on the host (median a pair), and end to end with decoding (frames/s)."
+    "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
+    "evaluate_rpe.py, fixed delta). ATE: root mean square distance of associated positions after the best rigid "
+    "alignment. End: distance from the true position at the end, both relative to the first pose. "
+    "ms/pair: from two decoded images to their motion on the host, median. frames/s: from files to poses, decoding "
+    "included."
+)
+LEGEND = (
+    "m/s, deg/s: drift (relative pose error over 1 s). ATE: after alignment. end: off at the last frame.",
+    "ms/pair: from two decoded images to their motion. frames/s: from files to poses, decoding included.",
 )
 
 
@@ -73,6 +79,8 @@ def compare(options: Compare) -> int:
     peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):
+        if (folder / COMPARISON).exists():
+            say(f"the earlier comparison in {folder} is replaced")
         remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
         remove_figures(folder)
         entries, status = _run_methods(options, methods, sequence, peers, folder)
@@ -116,12 +124,13 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
     title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
     rows = _rows(entries, typical)
-    print_table(title, HEADINGS, rows)
-    pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
-    drifts = _drifts(entries)
-    if plots.available() and drifts:
-        figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
-        pictures.append(save_figure(figure, folder, "drift"))
+    _print(title, rows, options.seeds)
+    for entry in typical:
+        if reason := why_no_drift(entry.metrics, entry.trajectory, sequence.ground_truth is not None):
+            say(reason)
+            break
+    with waiting("drawing figures …"):
+        pictures = _draw(entries, typical, sequence, folder)
     write_report(
         folder / REPORT,
         f"gavo compare: {title}",
@@ -132,6 +141,24 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
         f"First frame at {sequence.timestamps[0]:.6f} s, last at {sequence.timestamps[-1]:.6f} s; "
         f"device {entries[0].metrics['device']}.",
     )
+
+
+def _print(title: str, rows: list[list[Any]], seeds: int) -> None:
+    """Print the table; what tells seeds apart only where there are several."""
+    shown = len(HEADINGS) if seeds > 1 else 1 + len(COLUMNS)
+    print_table(title, HEADINGS[:shown], [row[:shown] for row in rows])
+    for line in LEGEND:
+        say(line)
+
+
+def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder: Path) -> list[Picture]:
+    """Write the figures, where matplotlib is installed."""
+    pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    drifts = _drifts(entries)
+    if plots.available() and drifts:
+        figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
+        pictures.append(save_figure(figure, folder, "drift"))
+    return pictures
 
 
 def _parse_methods(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""What the command takes: a dataclass a subcommand, from which tyro makes parser and help."""
+"""What the command takes: one dataclass per subcommand, from which tyro makes parser and help."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,6 +148,10 @@ class Evaluate:
     """Span of the relative pose error."""
     unit: Literal["s", "frames"] = "s"
     """Unit of the span."""
+    json: bool = False
+    """Print the errors as JSON."""
+    plot: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: no figures)")] = None
+    """Folder for figures of both trajectories and of the distance between them."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell
+from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
@@ -61,6 +61,8 @@ def run(options: Run) -> int:
         else:
             if progress is None:
                 remove_trajectories(folder.path)
+                if folder.has_run():
+                    say(f"the earlier run in {folder.path} is replaced")
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
@@ -115,7 +117,8 @@ def _track(
         draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, tracked.steps)
 
-    interruptible(draw_figures)
+    with waiting("drawing figures …"):
+        interruptible(draw_figures)
     return metrics, tracked.interrupted
 
 

@@ -34,8 +34,8 @@ COUNTS = (
     ("frames", "frames", 0, ""),
     ("lost pairs", "lost_pairs", 0, ""),
     ("compilation", COMPILE_SECONDS, 1, "s"),
-    ("time a pair, median", MILLISECONDS, 1, "ms"),
-    ("speed, decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
+    ("time per pair, decoded images, median", MILLISECONDS, 1, "ms"),
+    ("speed, reading and decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
 )
 
 Row = tuple[str, str, str]
@@ -61,7 +61,7 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     if metrics.get("unknown_motions"):
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
     print_table(name, ("", "", "unit"), rows)
-    if reason := _why_no_drift(metrics, trajectory, has_truth):
+    if reason := why_no_drift(metrics, trajectory, has_truth):
         say(reason)
     say(f"files in {folder}")
 
@@ -81,7 +81,7 @@ def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[R
     ]
 
 
-def _why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: bool) -> str | None:
+def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: bool) -> str | None:
     """One sentence where there is no drift over a second."""
     if metrics.get(DRIFT) is not None:
         return None

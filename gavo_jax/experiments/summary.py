@@ -26,7 +26,7 @@ class Summary(NamedTuple):
     lost: int
     """Lost pairs of the worst run."""
     milliseconds: float
-    """Median over the runs of the machine's time a frame, decoding included."""
+    """Median over the runs of the machine's time per frame, decoding included."""
     together: int
     """Most runs that shared the machine, and its time."""
 

@@ -1,4 +1,4 @@
-"""The results table: a folder of Parquet files, a row a run.
+"""The results table: a folder of Parquet files, one row per run.
 
 A run's file is named by the run's hash, is written beside its place and renamed into it. So a row is there whole or not
 at all, writers at the same time need no lock, and a run that is done twice, by whomever, is in the table once.

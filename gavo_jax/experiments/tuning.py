@@ -63,7 +63,7 @@ class Choice(NamedTuple):
     drift: float
     """Geometric mean over sequences and seeds, m/s."""
     milliseconds: float
-    """Geometric mean of the median time a pair."""
+    """Geometric mean of the median time per pair."""
     settings: dict[str, Any]
 
 
@@ -197,7 +197,7 @@ def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> 
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:
-    """Geometric means of drift (m/s) and of the median time a pair (ms), run by run: nothing shares the machine.
+    """Geometric means of drift (m/s) and of the median time per pair (ms), run by run: nothing shares the machine.
 
     Raises:
         GavoError: no ground truth over a second of a sequence.

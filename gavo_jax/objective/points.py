@@ -47,7 +47,7 @@ def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"]
 
 
 def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Reference:
-    """Points of some levels, [L, N]: one a square block of pixels, that of the steepest grey with a reading.
+    """Points of some levels, [L, N]: one per square block of pixels, that of the steepest grey with a reading.
 
     The choice is stratified, so its cost in accuracy is small, and N is static. Shorter levels are filled up with
     points without a reading.

@@ -88,7 +88,7 @@ class Odometry:
 
     Attributes:
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
-        candidates: Of the last frame's search, an entry a level, coarsest first; empty unless they are recorded.
+        candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OdometryRun:
-    """A whole run: `trajectory` (camera to world, first camera = world), a step a pair, and the run's figures."""
+    """A whole run: `trajectory` (camera to world, first camera = world), a step per pair, and the run's figures."""
 
     trajectory: Trajectory
     steps: list[Step]

@@ -62,9 +62,11 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
         trimmed = [population.trimmed() for population in odometry.candidates]
         errors = {int(population.level): np.asarray(population.error) for population in trimmed}
         save_figure(plots.plot_population(errors), folder, "population")
-    landscape = _landscape_of(sequence, odometry, good[len(good) // 2])
+    middle = good[len(good) // 2]
+    landscape = _landscape_of(sequence, odometry, middle)
     if landscape is not None:
-        save_figure(plots.plot_landscape(landscape), folder, "landscape")
+        pair = f"frame {middle.index} against the one at {middle.reference_timestamp:.3f} s, the middle pair of the run"
+        save_figure(plots.plot_landscape(landscape, pair), folder, "landscape")
 
 
 def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landscape | None:
@@ -86,4 +88,4 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Picture:
         GavoError: a file cannot be written.
     """
     _, vector = plots.save(figure, folder, name)
-    return Picture(plots.CAPTIONS[name], vector)
+    return Picture(" ".join(figure.get_supxlabel().split()), vector)

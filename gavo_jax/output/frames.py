@@ -20,10 +20,10 @@ FRAME_COLUMNS = (
     + DEVIATIONS
     + ("milliseconds", "segment", "statuses")
 )
-"""Of frames.csv, a row a pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction that
-a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations of
-the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from 0,
-every status that holds, with blanks between."""
+"""Of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction
+that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations
+of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
+0, every status that holds, with blanks between."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:

@@ -46,22 +46,30 @@ CAPTION_WIDTH = 18
 """Letters of a caption an inch of the figure."""
 
 CAPTIONS = {
-    "trajectory": "Estimated and true camera positions, all seen from their first camera. The truth is interpolated at "
-    "the frames' stamps and laid on the first estimate's first pose that it covers.",
+    "trajectory": "Estimated camera positions, all seen from their first camera; a square marks the start.",
     "distance_error": "Distance error of each frame: distance between the estimated and the true position of the "
     "camera, both relative to the first pose; the truth is interpolated at the frames' stamps.",
     "drift": "Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, fixed delta); translation "
-    "in m/s, rotation in deg/s. Bars: median over the runs; whiskers: smallest and largest.",
+    "in m/s, rotation in deg/s. Bars: median over the runs; whiskers, where they are given: smallest and largest.",
     "convergence": "By how much the best error E so far exceeds the last one of the same level, over the iterations of "
-    "its search: median over the pairs of the run, and the range of their middle 80 %. Levels from coarse to fine.",
+    "its search: median over the pairs of the run, and the range of their middle 80 %. Levels from coarse to fine. An "
+    f"excess below {SMALLEST_EXCESS:g} % is drawn as that.",
     "population": "Root of E over the iterations of each level's search of one pair: best and median of the "
     "population, and the range of its middle 80 %. Levels from coarse to fine; their errors are not comparable.",
     "landscape": "Root of E around the motion that was found, along the eigenvectors of its covariance with the "
-    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left.",
+    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left. The "
+    "motion was found with a keyframe and the shutter's readout, too: the minimum of this pair alone may lie "
+    "millimetres away.",
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
 """By the name of the figure's files."""
+WITH_TRUTH = (
+    " The truth is interpolated at the frames' stamps and laid on the first estimate's first pose that it covers."
+)
+"""Of the trajectories' caption."""
+SMALL = 0.1
+"""Metres: what is smaller is drawn in millimetres."""
 
 
 def plot_distance_error(errors: Mapping[str, ErrorSeries]) -> Figure:
@@ -71,11 +79,12 @@ def plot_distance_error(errors: Mapping[str, ErrorSeries]) -> Figure:
     stamps = np.unique(np.concatenate([series.timestamps for series in errors.values()])) - min(
         series.timestamps[0] for series in errors.values()
     )
+    scale, unit = _unit(max(float(np.max(series.values)) for series in errors.values()))
     for (name, series), style in zip(errors.items(), _styles(), strict=False):
         seconds = series.timestamps - series.timestamps[0] + stamps[0]
-        axes.plot(seconds, series.values, label=name, **style, markevery=_marks(len(series.values)))
-    axes.set(xlabel="time (s)", ylabel="distance error (m)", ylim=(0, None))
-    axes.margins(x=0.01)
+        axes.plot(seconds, scale * series.values, label=name, **style, markevery=_marks(len(series.values)))
+    axes.set(xlabel="time (s)", ylabel=f"distance error ({unit})", ylim=(0, None))
+    axes.margins(x=0)
     if len(stamps) > 1:
         _number_frames(axes, stamps)
     axes.grid(alpha=0.3)
@@ -89,24 +98,32 @@ def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | N
     The truth, where there is any, is taken at the stamps of the first estimate that it covers; its first such pose is
     laid on that estimate's.
     """
-    figure = _figure(10.0, 5.2, "trajectory")
+    true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
+    figure = _figure(10.0, 5.2, "trajectory", "" if true_path is None else WITH_TRUTH)
     above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
     paths = {name: _path(estimate) for name, estimate in estimates.items()}
-    styles = dict(zip(paths, _styles(), strict=False))
-    true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
+    shown = [*paths.values(), *([] if true_path is None else [true_path])]
+    scale, unit = _unit(
+        float(np.max(np.ptp(np.concatenate([path[np.isfinite(path[:, 0])] for path in shown]), axis=0)))
+    )
     if true_path is not None:
-        above.plot(true_path[:, 0], true_path[:, 2], **TRUTH_STYLE)
-        space.plot(true_path[:, 0], true_path[:, 2], -true_path[:, 1], **TRUTH_STYLE)
-    for name, path in paths.items():
-        style = {**styles[name], "markevery": _marks(len(path))}
-        above.plot(path[:, 0], path[:, 2], label=name, **style)
-        space.plot(path[:, 0], path[:, 2], -path[:, 1], label=name, **style)
-    above.set(xlabel="x, right (m)", ylabel="z, forward (m)", title="From above", aspect="equal")
-    above.set_adjustable("datalim")
+        x, y, z = scale * true_path.T
+        above.plot(x, z, **TRUTH_STYLE)
+        space.plot(x, z, -y, **TRUTH_STYLE)
+    for i, ((name, path), style) in enumerate(zip(paths.items(), _styles(), strict=False)):
+        # those below show beside those above where methods coincide
+        style |= {"linewidth": 1.2 + 2.0 * (1 - i / max(len(paths) - 1, 1)) * (len(paths) > 1)}
+        x, y, z = scale * path.T
+        above.plot(x, z, label=name, **style, markevery=_marks(len(path)))
+        space.plot(x, z, -y, label=name, **style, markevery=_marks(len(path)))
+    above.scatter([0], [0], marker="s", color="black", s=30, zorder=3)
+    space.scatter([0], [0], zs=0, marker="s", color="black", s=20)
+    above.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})", title="From above", aspect="equal")
     above.grid(alpha=0.3)
-    above.legend()
-    space.set(xlabel="x, right (m)", ylabel="z, forward (m)", zlabel="−y, up (m)", title="In space")
-    _limit_to_cube(space, [*paths.values(), *([] if true_path is None else [true_path])])
+    above.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize="small")
+    space.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})", zlabel=f"−y, up ({unit})", title="In space")
+    _fit_above(above, [scale * path for path in shown])
+    _fit_in_space(space, [scale * path for path in shown])
     return figure
 
 
@@ -157,9 +174,15 @@ def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> 
     return figure
 
 
-def plot_landscape(landscape: Landscape) -> Figure:
-    """Draw the error around the optimum along the worst- and the best-conditioned direction, level by level."""
-    figure = _figure(8.0, 4.6, "landscape")
+def plot_landscape(landscape: Landscape, pair: str = "") -> Figure:
+    """Draw the error around the optimum along the worst- and the best-conditioned direction, level by level.
+
+    Args:
+        landscape: the errors.
+        pair: which frames it is of, for the title.
+    """
+    figure = _figure(8.0, 4.8, "landscape")
+    figure.suptitle(pair, fontsize="medium")
     titles = ("worst-conditioned direction", "best-conditioned direction")
     for i, (axes, title) in enumerate(zip(_panels(figure, 2), titles, strict=True)):
         for (level, errors), style in zip(landscape.errors.items(), _styles(), strict=False):
@@ -172,21 +195,31 @@ def plot_landscape(landscape: Landscape) -> Figure:
     return figure
 
 
-def plot_basin(motion: Float[np.ndarray, " n"], success: Mapping[str, Float[np.ndarray, " n"]], title: str) -> Figure:
+def plot_basin(
+    motion: Float[np.ndarray, " n"],
+    success: Mapping[str, Float[np.ndarray, " n"]],
+    title: str,
+    ours: Sequence[str] = (),
+) -> Figure:
     """Draw how often each method still finds a motion, over the motion's size.
 
     Args:
         motion: median rotation of the pairs, degrees, in any order.
-        success: share of the pairs found, by method.
+        success: share of the pairs found, by method; NaN where it was not tried.
         title: what the pairs are of.
+        ours: methods in colour; the others are grey. All of them where none is named.
     """
     figure = _figure(9.0, 4.6, "basin")
     axes = figure.add_subplot()
     order = np.argsort(motion)
+    greys = iter(np.linspace(0.35, 0.75, max(len(success) - len(ours), 1)))
     for (name, rates), style in zip(success.items(), _styles(), strict=False):
-        axes.plot(motion[order], rates[order], label=name, **style)
+        tried = [i for i in order if np.isfinite(rates[i])]
+        if ours and name not in ours:
+            style |= {"color": str(next(greys)), "linewidth": 1.0, "markersize": 3}
+        axes.plot(motion[tried], rates[tried], label=name, **style)
     axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
-    axes.set(ylim=(-0.03, 1.03), xlim=(0, None))
+    axes.set(ylim=(-0.03, 1.03), xlim=(0, 1.02 * float(np.max(motion))))
     axes.grid(alpha=0.3)
     figure.legend(fontsize="small", loc="outside right upper")
     return figure
@@ -255,12 +288,12 @@ def _words(name: str) -> str:
     return printable(name).replace("$", r"\$")
 
 
-def _figure(width: float, height: float, name: str) -> Figure:
+def _figure(width: float, height: float, name: str, more: str = "") -> Figure:
     """Return a figure (inches) with a caption and nothing else, that belongs to no window and to no global state."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.supxlabel(textwrap.fill(CAPTIONS[name], int(CAPTION_WIDTH * width)), fontsize=7, x=0.01, ha="left")
+    figure.supxlabel(textwrap.fill(CAPTIONS[name] + more, int(CAPTION_WIDTH * width)), fontsize=7, x=0.01, ha="left")
     return figure
 
 
@@ -299,15 +332,34 @@ def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarra
     return np.take_along_axis(history, last, axis=1)
 
 
-def _limit_to_cube(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
-    """Give the three axes of a drawing in space the same scale and a few ticks each."""
+def _fit_above(axes: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
+    """Have a panel hold the paths seen from above, with one scale, and half as wide as it is high at least."""
+    points = np.concatenate(paths)[:, [0, 2]]
+    low, high = _limits(points)
+    middle, half = (low + high) / 2, 0.55 * np.maximum(high - low, 0.6 * max(float(np.max(high - low)), 1e-3))
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+
+
+def _fit_in_space(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
+    """Give the three axes of a drawing in space the same scale, a few ticks each, and no more room than is needed."""
     points = np.concatenate(paths)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    half = max(0.55 * float(np.max(high - low)), 1e-3)
-    for axis, middle in zip("xyz", (low + high) / 2, strict=True):
-        getattr(space, f"set_{axis}lim")(middle - half, middle + half)
-        space.locator_params(axis=axis, nbins=4)
-    space.set_box_aspect((1, 1, 1), zoom=0.85)
+    low, high = _limits(points)
+    half = 0.55 * np.maximum(high - low, 0.35 * max(float(np.max(high - low)), 1e-3))
+    for i, (axis, middle) in enumerate(zip("xyz", (low + high) / 2, strict=True)):
+        getattr(space, f"set_{axis}lim")(middle - half[i], middle + half[i])
+        space.locator_params(axis=axis, nbins=4 if half[i] > 0.7 * np.max(half) else 1)
+    space.tick_params(labelsize="x-small")
+    space.set_box_aspect(tuple(half / np.max(half)), zoom=0.85)
+
+
+def _limits(points: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Smallest and largest coordinates, places without a number left out."""
+    return np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+
+
+def _unit(extent: float) -> tuple[float, str]:
+    """Values a metre and their unit, for what is so many metres large."""
+    return (1e3, "mm") if extent < SMALL else (1.0, "m")
 
 
 def _styles() -> Iterator[dict[str, Any]]:

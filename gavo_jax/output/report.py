@@ -22,7 +22,7 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff; m
 h1 { font-size: 1.6rem; line-height: 1.2; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; margin: 1.5rem 0; font-variant-numeric: tabular-nums; font-size: 0.9rem; }
-caption, figcaption { text-align: left; color: #444; font-size: 0.9rem; padding: 0.3rem 0; max-width: 60rem; }
+caption { text-align: left; color: #444; font-size: 0.9rem; padding: 0.3rem 0; max-width: 60rem; }
 th, td { padding: 0.3rem 0.8rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 thead th { border-bottom: 2px solid #444; }
@@ -124,7 +124,4 @@ def _figure(picture: Picture) -> str:
     except OSError as error:
         raise GavoError(f"{path}: cannot be read: {error.strerror or error}") from None
     caption = html.escape(picture.caption)
-    return (
-        f'<figure>\n<img alt="{caption}" src="data:{media_type};base64,{data}">\n'
-        f"<figcaption>{caption}</figcaption>\n</figure>"
-    )
+    return f'<figure>\n<img alt="{caption}" src="data:{media_type};base64,{data}">\n</figure>'

@@ -127,6 +127,10 @@ class RunFolder:
         self._whole: tuple[dict[str, Mark], str, Progress | None] = ({}, "", None)
         """The growing files after the last frame that is in both, the images seen and the driver's progress then."""
 
+    def has_run(self) -> bool:
+        """Whether an earlier run left its configuration here."""
+        return (self.path / CONFIG).exists()
+
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
 

@@ -70,16 +70,46 @@ def waiting(words: str) -> Iterator[None]:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table whose first column is text and whose others are numbers; it is never cut to the screen's width."""
+    """Print a table whose first column is text and whose others are numbers.
+
+    Nothing of it is cut: columns that the screen has no room for follow below, the first column beside them once more.
+    """
+    say(title)
+    width = Console().width
+    for table in _parts(columns, rows, width):
+        Console(width=max(width, _width(table))).print(table)
+
+
+def _parts(columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> Iterator[Table]:
+    """A table as one that fits the width or, the first column in each, as several."""
+    start = 1
+    while start < len(columns):
+        end = len(columns)
+        while _width(table := _table(*_columns(columns, rows, start, end))) > width and end > start + 1:
+            end -= 1
+        yield table
+        start = end
+
+
+def _columns(
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], start: int, end: int
+) -> tuple[list[str], list[list[Any]]]:
+    """The first column, and those from start to before end."""
+    return [columns[0], *columns[start:end]], [[row[0], *row[start:end]] for row in rows]
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
     table = Table()
     for i, name in enumerate(columns):
         table.add_column(Text(printable(name)), justify="right" if i else "left", no_wrap=True)
     for row in rows:
         table.add_row(*(Text(printable(str(cell))) for cell in row))
+    return table
+
+
+def _width(table: Table) -> int:
     unlimited = Console(width=10_000)
-    needed = Measurement.get(unlimited, unlimited.options, table).maximum
-    say(title)
-    Console(width=max(Console().width, needed)).print(table)
+    return Measurement.get(unlimited, unlimited.options, table).maximum
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -16,7 +16,7 @@ def static(default: Any) -> Any:
 
 
 Schedule = Any
-"""A tuple with an entry a pyramid level, level 0 first, or one number for all."""
+"""A tuple with an entry per pyramid level, level 0 first, or one number for all."""
 
 
 class Bounds(NamedTuple):
@@ -102,11 +102,11 @@ class Solver(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PerLevel:
-    """Base of the solvers: resolves fields that hold an entry a level.
+    """Base of the solvers: resolves fields that hold an entry per level.
 
     Attributes:
         progress: An iteration that lowers the best error by no more than this share counts as one without progress;
-            an entry a level.
+            an entry per level.
         level: The level that is being searched; an input of the compiled program.
     """
 

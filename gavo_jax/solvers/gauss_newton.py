@@ -34,7 +34,7 @@ class GaussNewton(PerLevel):
     A robust loss makes it the re-weighted least squares of Kerl et al. 2013; with L2 it is the classic method.
 
     Attributes:
-        iterations: Largest number of steps (static, an entry a level; 0 skips the level).
+        iterations: Largest number of steps (static, an entry per level; 0 skips the level).
         patience: Steps without progress that end a level (static).
         damping: First damping, relative to the Hessian's diagonal.
     """

@@ -45,14 +45,14 @@ class GeneticAlgorithm(PerLevel):
     """The paper's genetic algorithm.
 
     Attributes:
-        population: Chromosomes (static, an entry a level).
-        iterations: Largest number of generations (static, an entry a level; 0 skips the level).
+        population: Chromosomes (static, an entry per level).
+        iterations: Largest number of generations (static, an entry per level; 0 skips the level).
         patience: Generations without progress that end a level (static).
         mutants: Share of the offspring that are mutants, 0.3 in the paper; the rest are crossed.
         surrogate: Whether one offspring is bred from a quadratic fit to the population (static).
-        spread: Standard deviation of the first population about the guess, search units, an entry a level; None
+        spread: Standard deviation of the first population about the guess, search units, an entry per level; None
             draws it uniformly within the bounds, as the paper does.
-        mutation_step: First standard deviation of a mutation, search units, an entry a level; None takes
+        mutation_step: First standard deviation of a mutation, search units, an entry per level; None takes
             δ = mutation_rate (ξ^U − ξ^L), as the paper does.
         mutation_decay: Factor on the step from generation to generation; 1 in the paper.
         mutation_rate: p_m, 0.1 in the paper.

@@ -32,9 +32,9 @@ class GradientDescent(PerLevel):
     The gradient is that of the sampled images (`Problem.linearize`), not reverse-mode through the gather.
 
     Attributes:
-        iterations: Largest number of steps (static, an entry a level; 0 skips the level).
+        iterations: Largest number of steps (static, an entry per level; 0 skips the level).
         patience: Steps without progress that end a level (static).
-        learning_rate: First step in search units, an entry a level.
+        learning_rate: First step in search units, an entry per level.
         decay: Factor on the rate from step to step.
         optimizer: optax's constructor, called with a learning rate of 1 (static).
     """

@@ -29,8 +29,8 @@ class ParticleSwarm(PerLevel):
     """Global-best particle swarm: v' = χ (v + c₁ r₁ (memory − x) + c₂ r₂ (best − x)).
 
     Attributes:
-        population: Particles (static, an entry a level).
-        iterations: Largest number of iterations (static, an entry a level; 0 skips the level).
+        population: Particles (static, an entry per level).
+        iterations: Largest number of iterations (static, an entry per level; 0 skips the level).
         patience: Iterations without progress that end a level (static).
         spread: Standard deviation of the first particles about the guess, search units; None draws them uniformly
             within the bounds.

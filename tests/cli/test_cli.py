@@ -14,12 +14,15 @@ import pytest
 from command import Done, runner
 from small import CAMERA
 
+from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli import options
+from gavo_jax.cli.align import in_words
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.output import tracked
 from gavo_jax.output.frames import FRAME_COLUMNS
 from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_translation_rmse_m_per_s
@@ -295,6 +298,13 @@ def test_align_prints_json(gavo, clip):
     assert np.linalg.norm((reference_T_target @ target_T_reference)[:3, 3]) < 0.01
 
 
+def test_align_says_the_motion_in_words():
+    target_T_reference = np.eye(4)
+    target_T_reference[:3, 3] = -0.003, 0.0, 0.004
+    words = in_words(no_alignment(AlignmentStatus.OK)._replace(target_T_reference=target_T_reference))
+    assert "moved by 5.0 mm (3.0 mm right, 0.0 mm down, 4.0 mm back) and turned by 0.00 degrees" in words
+
+
 @pytest.mark.parametrize("role", range(4))
 @pytest.mark.parametrize("fault", ["missing", "text", "other kind", "folder"])
 def test_align_refuses_a_bad_image(gavo, clip, role, fault):
@@ -319,11 +329,25 @@ def test_evaluate_refuses(gavo, clip):
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100")
 
 
+def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
+    truth = clip / "groundtruth.txt"
+    done = gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames", "--json", "--plot", tmp_path / "figures")
+    assert done.status == 0, done.err
+    answer = json.loads(done.out)
+    assert answer["ate"]["rmse"] < 1e-9 and answer["rpe_rotation"]["unit"] == "deg" and answer["delta"] == 1
+    assert (tmp_path / "figures" / "trajectory.png").exists() and (tmp_path / "figures" / "distance_error.svg").exists()
+
+
 def test_compare(gavo, pristine, tmp_path):
     arguments = ("compare", pristine, "--camera", pristine / "camera.toml", "--output", tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "comparison.json").write_text("[]")
     done = gavo(*arguments, "--methods", "gauss-newton,opencv-rgb", "--frames", 34)
     assert done.status == 0, done.err
     assert "gauss-newton" in done.out and "opencv-rgb" in done.out
+    lines = done.out.splitlines()
+    assert max(len(line) for line in lines if line.startswith(("┃", "│"))) <= 80 and "decoding included" in lines[-2]
+    assert "the earlier comparison in" in lines[0]
     table = read_json(tmp_path / "out" / "comparison.json")
     assert [row["method"] for row in table] == ["gauss-newton", "opencv-rgb"]
     assert all(set(METRICS) <= set(row) and row["frames"] == 34 for row in table)
@@ -343,8 +367,10 @@ def test_compare(gavo, pristine, tmp_path):
 def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ("run", "clip", "--camera", "clip/camera.toml", *FAST, "--output", "out", "--viewer", "save")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "config.json").write_text("{}")
     done = gavo(*arguments)
-    assert done.status == 0, done.err
+    assert done.status == 0 and "the earlier run in out is replaced" in done.out, done
     assert (tmp_path / "out" / "run.rrd").stat().st_size and (tmp_path / "out" / "population.svg").exists()
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")

@@ -210,6 +210,7 @@ def test_without_a_truth_it_is_said_what_the_trajectory_tells(gavo, clip, truth)
     done = gavo("run", clip, *FAST, "--output", "out")
     assert done.status == 0, done.err
     assert ("No ground truth" if truth == "none" else "covers no two") in done.out
+    assert done.out.count("┏") == 1 and max(map(len, (x for x in done.out.splitlines() if x[:1] in "┃│"))) <= 80
     table = {
         line.split("\u2502")[1].strip(): line.split("\u2502")[2] for line in done.out.splitlines() if "\u2502" in line
     }

@@ -1,6 +1,7 @@
 """Links between pages lead somewhere, the reference has every public name, and the pages' figures are the records'."""
 
 import importlib
+import inspect
 import re
 from pathlib import Path
 from types import ModuleType
@@ -11,13 +12,11 @@ from pages import PAGES, ROOT, anchors, links, name
 
 import gavo_jax as gavo
 
-PUBLIC = sorted(
-    attribute
-    for attribute, value in vars(gavo).items()
-    if not attribute.startswith("_")
-    and not isinstance(value, ModuleType)
-    and attribute not in ("end_at_once", "prepare_process")
-)
+
+def names_of(module: ModuleType) -> list[str]:
+    """What a module offers: names that it imports as themselves."""
+    imported = re.findall(r"^from \S+ import (\w+) as \1$", inspect.getsource(module), re.MULTILINE)
+    return [imported_name for imported_name in imported if not isinstance(getattr(module, imported_name), ModuleType)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -30,9 +29,9 @@ def test_links_inside_lead_somewhere(page: Path) -> None:
 
 def test_the_reference_has_every_public_name() -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
-    documented = re.findall(r"^::: gavo_jax\.(\w+)$", pages, re.MULTILINE)
-    assert sorted(documented) == sorted([*PUBLIC, "solvers"])
-    for public in PUBLIC:
+    documented = re.findall(r"^::: gavo_jax\.([\w.]+)$", pages, re.MULTILINE)
+    assert sorted(documented) == sorted([*names_of(gavo), *(f"solvers.{name}" for name in names_of(gavo.solvers))])
+    for public in names_of(gavo):
         value = getattr(gavo, public)
         assert not callable(value) or value.__doc__, public
 
@@ -51,14 +50,41 @@ def test_figures_on_pages_are_those_of_the_records(monkeypatch: pytest.MonkeyPat
     assert not stale, "python benchmarks/records.py fills them"
 
 
+def test_figures_are_drawn_from_the_records(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    folder = ROOT / "benchmarks" / "records"
+    for benchmark in ("drift", "basin"):
+        files = ",".join(map(str, sorted(folder.glob(f"{benchmark}*.toml"))))
+        importlib.import_module(benchmark).main(recorded=files, figure=tmp_path)
+        assert (tmp_path / f"{benchmark}.png").stat().st_size > 10_000
+    records = importlib.import_module("records").Records()
+    drawn = importlib.import_module("drift").medians(records.of("drift"))
+    assert drawn["fr1_xyz"]["ga"][0, 0] == float(records.cell("drift", "drift on fr1_xyz", "ga", "m/s"))
+
+
 def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     records = importlib.import_module("records")
     table = records.Table('a "quoted", title', ("", "x, y"), (("[one]", "1.0"), ("two", "–")))
-    record = records.Record("b", "python b.py", "2026-01-01", "a machine", "JAX 1", (table, table), ("A note.",))
+    record = records.Record(
+        "b", "python b.py", "2026-01-01", "a machine", "JAX 1", (table, table), ("Two.",), ("A note.",)
+    )
     records.write_record(tmp_path / "b.toml", record)
     assert records.read_record(tmp_path / "b.toml") == record
     records.write_record(tmp_path / "b.toml", record._replace(date="2026-02-02", notes=()))
     assert records.read_record(tmp_path / "b.toml").notes == ("A note.",)
     assert records.Records(tmp_path).cell("b", "a", "[one]", "x") == "1.0"
     assert records.Records(tmp_path).cell("b", "a", "three", "x") == "–"
+
+
+def test_troubleshooting_quotes_messages_that_there_are() -> None:
+    source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "gavo_jax").rglob("*.py"))
+    source = re.sub(r'"\s*\n\s*f?"', "", source)
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    quoted = [
+        span for entry in re.findall(r"^\*\*(.+?)\*\*", page, re.MULTILINE) for span in re.findall(r"`(.+?)`", entry)
+    ]
+    assert len(quoted) > 10
+    for message in quoted:
+        for words in re.split(r"…|'NAME'|\.\.\.", message):
+            assert words.strip() in source, message

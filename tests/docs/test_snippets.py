@@ -20,14 +20,17 @@ from small import ALONE, CAMERA, GENETIC, NEWTON, PLAIN_ERROR
 
 import gavo_jax as gavo
 from gavo_jax import presets
-from gavo_jax.cli import _parse
-from gavo_jax.cli.options import Align, Command, Compare, Download, Run
+from gavo_jax.cli import _parse, main
+from gavo_jax.cli.options import Align, Command, Compare, Download, Inspect, Run
 from gavo_jax.cli.selection import choose_settings
 from gavo_jax.datasets.download import folder_of
+from gavo_jax.experiments.plan import read_plan
+from gavo_jax.experiments.tuning import read_tuning
 from gavo_jax.peers import PEERS
 
 FRAMES = 6
 WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
+WITH_SETTINGS = [page for page in PAGES if blocks(page, "toml")]
 WITH_COMMANDS = [page for page in PAGES if commands(page) or inline_commands(page)]
 SUBCOMMANDS = tuple(get_args(one)[1].name for one in get_args(Command))
 OTHER_PROGRAMS = ("cd", "git", "mkdocs", "pre-commit", "pyright", "rerun", "ruff", ".ci/run")
@@ -37,7 +40,7 @@ OTHER_PROGRAMS = ("cd", "git", "mkdocs", "pre-commit", "pyright", "rerun", "ruff
 def sequences(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sequences that the pages name."""
     folder = tmp_path_factory.mktemp("sequences")
-    for sequence in ("rgbd_dataset_freiburg1_xyz", "my_sequence"):
+    for sequence in ("rgbd_dataset_freiburg1_xyz", "my_sequence", "data/rgbd_dataset_freiburg1_desk"):
         gavo.write_tum(gavo.SyntheticSequence(FRAMES, camera=CAMERA, speed=0.2), folder / sequence)
     return folder
 
@@ -71,10 +74,24 @@ def test_blocks_of_python_run(page: Path, small: None, sequences: Path, monkeypa
         exec(compile("\n" * (block.line - 1) + block.code, str(page), "exec"), names)
 
 
+@pytest.mark.parametrize("page", WITH_SETTINGS, ids=name)
+def test_files_of_settings_are_read(page: Path, sequences: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(sequences)
+    for block in blocks(page, "toml"):
+        file = sequences / "page.toml"
+        file.write_text(block.code)
+        if "[[methods]]" in block.code:
+            assert read_plan(file).runs
+        elif "[space]" in block.code:
+            assert read_tuning(file).space
+        else:
+            assert gavo.load_camera(file).width == 640
+
+
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=name)
-def test_commands_are_understood(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_are_understood(page: Path, sequences: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(sequences)
     gavo.save_settings("own.toml", gavo.preset("ga", "fast"))
     for command in [*commands(page), *inline_commands(page)]:
         program, *arguments = shlex.split(command)
@@ -87,7 +104,7 @@ def test_commands_are_understood(page: Path, tmp_path: Path, monkeypatch: pytest
             if arguments[0].startswith("benchmarks/") and arguments[0] != "benchmarks/records.py":
                 check_benchmark(Path(arguments[0]).stem, arguments[1:])
         else:
-            assert program in OTHER_PROGRAMS or [program, *arguments[:2]] == ["python", "-m", "pytest"], command
+            assert program in OTHER_PROGRAMS or [program, arguments[0]] == ["python", "-m"], command
 
 
 def check_gavo(arguments: list[str]) -> None:
@@ -103,12 +120,15 @@ def check_gavo(arguments: list[str]) -> None:
         assert set(parsed.methods.split(",")) <= {*presets.methods(), *PEERS}
     if isinstance(parsed, Download):
         folder_of(parsed.name)
+    if isinstance(parsed, Inspect) and Path(parsed.sequence).is_dir():
+        assert main(arguments) == 0
 
 
 def check_benchmark(benchmark: str, arguments: list[str]) -> None:
     """The benchmark's parser takes them."""
-    main = importlib.import_module(benchmark).main
-    tyro.cli(functools.wraps(main)(lambda **_: None), args=arguments)
+    run = importlib.import_module(benchmark).main
+    arguments, _ = importlib.import_module("common").take_record(arguments)
+    tyro.cli(functools.wraps(run)(lambda **_: None), args=arguments)
 
 
 def check_extras(command: str) -> None:

@@ -49,6 +49,18 @@ def test_truth_that_covers_nothing_is_left_out():
     assert [line.get_label() for line in above.get_lines()] == ["ga"]
 
 
+def test_what_is_small_is_drawn_in_millimetres_and_truth_is_named_only_where_it_is():
+    small, truth = straight(0.02), straight(0.03)
+    figure = plots.plot_trajectories({"ga": small}, truth)
+    above = figure.axes[0]
+    assert above.get_ylabel() == "z, forward (mm)" and "truth" in str(figure.get_supxlabel())
+    assert np.asarray(above.get_lines()[1].get_ydata())[-1] == pytest.approx(20.0)
+    assert above.get_ylim()[1] < 40
+    (axes,) = plots.plot_distance_error({"ga": distance_error(small, truth)}).axes
+    assert axes.get_ylabel() == "distance error (mm)" and np.asarray(axes.get_lines()[0].get_ydata())[-1] > 9
+    assert "truth" not in str(plots.plot_trajectories({"ga": small}, None).get_supxlabel())
+
+
 def test_save(tmp_path):
     figure = plots.plot_trajectories({"ga": straight(1.0)}, None)
     paths = plots.save(figure, tmp_path, "trajectory")
@@ -128,6 +140,8 @@ def test_drift_bars_are_medians_and_others_are_hatched():
 
 
 def test_basin_curves_run_from_small_to_large_motions():
-    (axes,) = plots.plot_basin(np.array([20.0, 7.0]), {"ga": np.array([0.5, 1.0])}, "clip").axes
+    success = {"ga": np.array([0.5, 1.0]), "opencv-rgb": np.array([np.nan, 0.5])}
+    (axes,) = plots.plot_basin(np.array([20.0, 7.0]), success, "clip", ["ga"]).axes
+    assert np.asarray(axes.get_lines()[1].get_xdata()).tolist() == [7.0]  # the other one was not tried
     assert np.asarray(axes.get_lines()[0].get_xdata()).tolist() == [7.0, 20.0]
     assert np.asarray(axes.get_lines()[0].get_ydata()).tolist() == [1.0, 0.5]
