@@ -207,6 +207,23 @@ class Inspect(Source):
     """Print it as JSON."""
 
 
+@dataclass(frozen=True)
+class Calibrate(Source):
+    """Find from the images alone what a source does not say of its camera, and write a camera file.
+
+    Shutter readout, delay of depth and depth scale; the source's camera is what the search starts from.
+    """
+
+    focal_length: bool = False
+    """Find the focal length, too."""
+    principal_point: bool = False
+    """Find the principal point, too."""
+    output: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="(default: camera.toml)")] = None
+    """The camera file, for --camera."""
+    json: bool = False
+    """Print what was found as JSON."""
+
+
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
@@ -218,4 +235,5 @@ Command = (
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Calibrate, subcommand("calibrate")]
 )
