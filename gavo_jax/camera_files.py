@@ -93,9 +93,9 @@ def load_calibration(
 
     TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
     "fisheye"), depth_scale, readout and depth_delay (seconds). Depth that is not registered to colour: a table [depth]
-    with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr. OpenCV
-    FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a matrix of
-    3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
+    with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr.
+    OpenCV FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a
+    matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
 
     Args:
         path_or_name: fr1, fr2, fr3, bonn, icl, or a file.

@@ -52,7 +52,7 @@ class Unknowns(NamedTuple):
         """What a camera says of itself."""
         return cls(camera.readout, 0.0, camera.fx, camera.fy, camera.cx, camera.cy)
 
-    def of_camera(self, camera: Camera) -> Camera:
+    def on(self, camera: Camera) -> Camera:
         """A camera with these values."""
         return replace(camera, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, readout=self.readout)
 
@@ -63,21 +63,40 @@ class Stretch(NamedTuple):
     grey: Float[Array, "f h w"]
     inverse_depth: Float[Array, "f h w"]
     stamps: Float[Array, " f"]
-    """Of colour, seconds after the first."""
+    """Of colour, seconds after the first; of an even clock where they are such with jitter."""
     delays: Float[Array, " f"]
     """Of depth after colour, by the stamps, seconds."""
 
     @classmethod
     def of(cls, frames: Iterable[Frame], camera: Camera) -> "Stretch":
         """Frames side by side, on the device."""
-        levels, stamps, delays = [], [], []
+        levels, stamps, depth_stamps = [], [], []
         for frame in frames:
             levels.append(_half(frame.grey, frame.depth, camera.depth_scale))
             stamps.append(frame.timestamp)
-            delays.append(0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp)
+            depth_stamps.append(frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp)
         grey, inverse_depth = (jnp.stack(images) for images in zip(*levels, strict=True))
-        seconds = np.array(stamps) - stamps[0]
-        return cls(grey, inverse_depth, jnp.asarray(seconds, jnp.float32), jnp.asarray(delays, jnp.float32))
+        start = stamps[0]
+        colour, depth = evened(np.array(stamps) - start), evened(np.array(depth_stamps) - start)
+        return cls(grey, inverse_depth, jnp.asarray(colour, jnp.float32), jnp.asarray(depth - colour, jnp.float32))
+
+
+MOST_JITTER = 0.3
+"""Of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
+
+
+def evened(stamps: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Stamps of an even clock, where these are such with jitter; frames may be missing.
+
+    A camera exposes evenly; a stamp says when an image arrived. A jitter of milliseconds, against 33 between frames,
+    would make the speed jump by a tenth from frame to frame, and so hide how the camera really speeds up.
+    """
+    intervals = np.diff(stamps)
+    ticks = np.concatenate([[0.0], np.cumsum(np.round(intervals / np.median(intervals)))])
+    interval, start = np.polyfit(ticks, stamps, 1)
+    even = start + interval * ticks
+    fits = len(np.unique(ticks)) == len(ticks) and np.abs(stamps - even).max() < MOST_JITTER * interval
+    return even if fits else stamps
 
 
 @jax.jit
@@ -138,7 +157,7 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         unknowns: What is supposed.
         camera: Of the full images; only its size counts.
     """
-    seen = unknowns.of_camera(camera).level(1)
+    seen = unknowns.on(camera).level(1)
     levels = levels_of(seen, SOLVER, OPTIONS)
 
     def prepare(frame: Array) -> tuple[Reference, Target]:

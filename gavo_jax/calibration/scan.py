@@ -42,24 +42,23 @@ def refine(score: Score, start: float, step: float, low: float, high: float, rou
         rounds: how often the values are moved to the least found, at most.
     """
     reach = step * (POINTS // 2)
-    middle = float(np.clip(start, low + reach, high - reach))
+    middle, least = float(np.clip(start, low + reach, high - reach)), Least(start, np.inf)
     for _ in range(rounds):
         values = middle + step * (np.arange(POINTS) - POINTS // 2)
         costs, counted = _evaluate(score, values)
         if not counted.any():
             return Least(middle, np.inf)
-        least = _vertex(values, costs[:, counted].mean(axis=1))
-        target = float(
-            np.clip(values[np.argmin(costs[:, counted].mean(axis=1))] if least is None else least, low, high)
-        )
-        moved = float(np.clip(target, middle - reach, middle + reach))
-        moved = float(np.clip(moved, low + reach, high - reach))
+        means = costs[:, counted].mean(axis=1)
+        vertex = _vertex(values, means)
+        if vertex is not None and low <= vertex <= high:
+            least = Least(vertex, _deviation(values, costs[:, counted]))
+        else:
+            least = Least(float(values[np.argmin(means)]), np.inf)
+        moved = float(np.clip(least.value, max(middle, low + 2 * reach) - reach, min(middle, high - 2 * reach) + reach))
         if abs(moved - middle) < 0.5 * step:
             break
         middle = moved
-    if least is None or not low <= least <= high:
-        return Least(float(np.clip(middle if least is None else least, low, high)), np.inf)
-    return Least(least, _deviation(values, costs[:, counted]))
+    return least
 
 
 def _evaluate(score: Score, values: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:

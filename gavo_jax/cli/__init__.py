@@ -207,19 +207,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = (
-        "run",
-        "compare",
-        "view",
-        "align",
-        "evaluate",
-        "experiment",
-        "download",
-        "tune",
-        "doctor",
-        "inspect",
-        "calibrate",
-    )
+    known = "run compare view align evaluate experiment download tune doctor inspect calibrate".split()
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 

@@ -25,7 +25,10 @@ def calibrate(options: Calibrate) -> int:
     if not output.absolute().parent.is_dir():
         raise GavoError(f"{output}: no such folder: {output.parent}")
     wanted: list[Wanted] = [*ALWAYS]
-    wanted += ["focal_length"] * options.focal_length + ["principal_point"] * options.principal_point
+    if options.focal_length:
+        wanted.append("focal_length")
+    if options.principal_point:
+        wanted.append("principal_point")
     sequence = open_sequence(options, force=True)
     enable_compilation_cache()
     with waiting("looking at the frames …"):
@@ -66,4 +69,4 @@ def _comments(estimate: CameraEstimate) -> list[str]:
 
 
 def _facts(estimate: CameraEstimate) -> dict[str, object]:
-    return {"pairs": estimate.pairs} | {name: found._asdict() for name, found in estimate.found.items()}
+    return {"pairs": estimate.pairs, **{name: found._asdict() for name, found in estimate.found.items()}}

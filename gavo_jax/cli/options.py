@@ -16,7 +16,8 @@ class Source:
     """Which frames."""
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
-    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package."""
+    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package. For
+    `gavo run` also realsense: the first camera of that line, live."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
     """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML, ROS, Kalibr,
     OpenCV or Open3D."""
