@@ -118,13 +118,17 @@ class _Trial:
 
 
 def estimate_camera(
-    sequence: Sequence, wanted: Iterable[Wanted] = ALWAYS, on_progress: Callable[[str], None] = lambda _: None
+    sequence: Sequence,
+    wanted: Iterable[Wanted] = ALWAYS,
+    rounds: int = ROUNDS,
+    on_progress: Callable[[str], None] = lambda _: None,
 ) -> CameraEstimate:
     """Find what a camera does not say of itself.
 
     Args:
         sequence: at least a dozen frames, of a camera that moves; a second or more of quick motion tells most.
         wanted: the names of what is asked for.
+        rounds: how often each number is found, the others held.
         on_progress: is told what is being found.
 
     Raises:
@@ -150,10 +154,10 @@ def estimate_camera(
         raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned: nothing can be found from them")
     interval = min(float(np.median(np.diff(times))) for times in stamps)
     leasts: dict[str, Least] = {}
-    for number in range(ROUNDS):
+    for number in range(rounds):
         for name, find in _STAGES.items():
             if name in wanted:
-                on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {ROUNDS}")
+                on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {rounds}")
                 leasts |= find(trial, interval, number == 0)
                 trial.settle()
     found |= _judged(leasts, trial)

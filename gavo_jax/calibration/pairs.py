@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import fit_objective, levels_of, prepare_target, stack_levels
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
 from gavo_jax.image.sampling import Target
-from gavo_jax.image.warp import synchronise_depth
+from gavo_jax.image.warp import Points, moved
 from gavo_jax.objective.estimates import estimate_scales
 from gavo_jax.objective.points import Reference, make_references, settle_reference
-from gavo_jax.se3 import exp
+from gavo_jax.se3 import exp, rigid_inverse
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -163,8 +163,8 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
     def prepare(frame: Array) -> tuple[Reference, Target]:
         late = stretch.delays[frame] + unknowns.delay
         twist = late * kinematics.velocity[frame] + 0.5 * late**2 * kinematics.acceleration[frame]
-        moved = synchronise_depth(stretch.inverse_depth[frame], seen, exp(twist))
-        pyramid = [PyramidLevel(stretch.grey[frame], moved)]
+        depth = depth_moved(stretch.inverse_depth[frame], seen, exp(twist))
+        pyramid = [PyramidLevel(stretch.grey[frame], depth)]
         for _ in levels.numbers[1:]:
             pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
         return make_references(tuple(pyramid), seen, levels), prepare_target(tuple(pyramid), levels)
@@ -191,3 +191,35 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         return Matched(jnp.log(scales.grey), jnp.log(scales.depth), found.xi, found.target_T_reference, usable)
 
     return jax.lax.map(pair, jnp.arange(stretch.stamps.shape[0] - 1))
+
+
+ONE_SURFACE = 0.03
+"""Neighbouring readings whose inverse depths differ by no more, as a share, are interpolated."""
+
+
+def depth_moved(
+    inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
+) -> Float[Array, "h w"]:
+    """As `image.warp.synchronise_depth`, interpolated: what is looked up at the nearest pixel does not change for moves
+    of less than half a pixel, and here it is the small changes that count.
+
+    Args:
+        inverse_depth: 1/m, 0 = no reading, seen by the camera where it stood when depth was read.
+        camera: camera of the image.
+        depth_T_colour: maps points of the camera at the colour image's moment into the camera at the depth image's.
+    """
+    height, width = inverse_depth.shape
+    x, y = to_ray(camera, jnp.arange(width), jnp.arange(height)[:, None])
+    x, y, z = moved(Points(x, y, inverse_depth), depth_T_colour)
+    u, v = to_pixels(camera, x, y, 1.0 / jnp.maximum(z, 1e-3))
+    inside = (z > 1e-3) & (inverse_depth > 0) & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
+    column, row = (jnp.where(inside, jnp.floor(at), 0).astype(jnp.int32) for at in (u, v))
+    across, down = u - column, v - row
+    flat, place = inverse_depth.reshape(-1), row * width + column
+    corners = jnp.stack([flat.at[place + step].get(mode="promise_in_bounds") for step in (0, 1, width, width + 1)])
+    shares = jnp.stack([(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down])
+    nearest, farthest = jnp.max(corners, axis=0), jnp.min(corners, axis=0)
+    smooth = inside & (farthest > nearest * (1.0 - ONE_SURFACE))
+    read = jnp.where(smooth, jnp.sum(shares * corners, axis=0), 0.0)
+    _, _, back = moved(Points(*to_ray(camera, u, v), read), rigid_inverse(depth_T_colour))
+    return jnp.where(smooth & (back > 1e-3), read / back, 0.0)
