@@ -25,7 +25,11 @@ from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence
 from gavo_jax.datasets.base import TimestampError as TimestampError
+from gavo_jax.datasets.devices import register_device as register_device
 from gavo_jax.datasets.files import Reading as Reading
+from gavo_jax.datasets.live import LiveImages as LiveImages
+from gavo_jax.datasets.live import Newest as Newest
+from gavo_jax.datasets.live import frame_of as frame_of
 from gavo_jax.datasets.moving import BodyTruth as BodyTruth
 from gavo_jax.datasets.moving import MovingBody as MovingBody
 from gavo_jax.datasets.moving import MovingPart as MovingPart

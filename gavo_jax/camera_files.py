@@ -27,6 +27,7 @@ ROTATION_TOLERANCE = 1e-3
 """How far a rotation, printed with a few digits, may be off one."""
 
 CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model", "depth_scale", "readout")
+DEVICE_KEYS = ("depth_delay",)
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
 
@@ -60,6 +61,7 @@ class Calibration:
         origin: where the numbers are from, for people.
         states_depth_scale: whether that source says the depth scale; else `color.depth_scale` is only an assumption.
         preset: the preset's name, if it is one: the sensor is known then.
+        depth_delay: seconds that depth is taken after what its stamp says, or the colour image's where it has none.
     """
 
     color: Camera
@@ -68,6 +70,7 @@ class Calibration:
     origin: str = "as given"
     states_depth_scale: bool = True
     preset: str | None = None
+    depth_delay: float = 0.0
 
     def with_depth_scale(self, scale: float) -> "Calibration":
         """The same with a depth scale that is known."""
@@ -89,10 +92,10 @@ def load_calibration(
     """Return the calibration that a preset's name stands for or a file holds.
 
     TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
-    "fisheye"), depth_scale and readout (seconds). Depth that is not registered to colour: a table [depth] with the same
-    keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr. OpenCV
-    FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a matrix of
-    3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
+    "fisheye"), depth_scale, readout and depth_delay (seconds). Depth that is not registered to colour: a table [depth]
+    with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr.
+    OpenCV FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a
+    matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
 
     Args:
         path_or_name: fr1, fr2, fr3, bonn, icl, or a file.
@@ -116,14 +119,16 @@ def load_calibration(
         width, height = size() if callable(size) else size
         table = {"width": width, "height": height, **table}
     for key in table:
-        if key not in CAMERA_KEYS + RIG_KEYS:
-            raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(CAMERA_KEYS + RIG_KEYS[:2])})")
+        if key not in CAMERA_KEYS + DEVICE_KEYS + RIG_KEYS:
+            known = CAMERA_KEYS + DEVICE_KEYS + RIG_KEYS[:2]
+            raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(known)})")
     depth, color_T_depth = _depth_camera(path, table)
-    own = {key: value for key, value in table.items() if key not in RIG_KEYS}
+    own = {key: value for key, value in table.items() if key not in DEVICE_KEYS + RIG_KEYS}
+    delay = _number(f"{path}: depth_delay", table.get("depth_delay", 0.0), -1, 1)
     if isinstance(table.get("depth"), dict) and "depth_scale" in table["depth"]:
         own["depth_scale"] = table["depth"]["depth_scale"]
     color = camera_from_table(path, own, depth_scale)
-    return Calibration(color, depth, color_T_depth, str(path), states_depth_scale="depth_scale" in own)
+    return Calibration(color, depth, color_T_depth, str(path), "depth_scale" in own, depth_delay=delay)
 
 
 def camera_from_table(path: Path | str, values: Table, depth_scale: float, part: str = "") -> Camera:

@@ -1,12 +1,10 @@
 """A map of what a run saw: depth and colour fused into a signed distance field, out of which come a cloud or a mesh.
 
-Open3D does the work (extra `[map]`): a sparse grid of voxels (Curless and Levoy 1996; blocks in a hash map as of Nießner
-et al. 2013), into which frames go one by one, so that memory grows with the surface seen and not with the frames.
+Open3D does the work (extra `[map]`): a sparse grid of voxels (Curless and Levoy 1996; blocks in a hash map, as of
+Nießner et al. 2013), into which frames go one by one, so that memory grows with the surface seen, not with the frames.
 """
 
 import contextlib
-import ctypes
-import importlib
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
+from gavo_jax.libusb import import_with_libusb
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import inverse
 
@@ -241,31 +240,15 @@ def check_voxel(voxel: float) -> None:
 
 
 def import_open3d() -> Any:
-    """Open3D; where the system lacks libusb, which it links to, that of the package libusb-package is loaded first.
+    """Open3D.
 
     Raises:
         GavoError: it cannot be imported.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                return importlib.import_module("open3d")
-            except ImportError as error:
-                if "libusb" not in str(error):
-                    raise
-                _load_libusb()
-                return importlib.import_module("open3d")
+        return import_with_libusb("open3d")
     except (ImportError, OSError) as error:
         raise GavoError(f"a map needs Open3D, which cannot be imported ({error}): install 'gavo-jax[map]'") from None
-
-
-def _load_libusb() -> None:
-    package = importlib.import_module("libusb_package")
-    library = package.get_library_path()
-    if library is None:
-        raise ImportError("libusb-1.0 is missing")
-    ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
 
 
 def warn_of(scene: SceneMap, path: str | Path) -> None:

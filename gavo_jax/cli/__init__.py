@@ -15,6 +15,7 @@ import tyro
 from gavo_jax import compiler, interrupts
 from gavo_jax.cli.options import (
     Align,
+    Calibrate,
     Command,
     Compare,
     Doctor,
@@ -170,6 +171,10 @@ def _execute(command: Command) -> int:
             from gavo_jax.cli.inspect import inspect
 
             return inspect(command)
+        case Calibrate():
+            from gavo_jax.cli.calibrate import calibrate
+
+            return calibrate(command)
 
 
 def _parse(arguments: list[str]) -> Command | None:
@@ -202,7 +207,7 @@ def _first_paragraph(box: str) -> str:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor", "inspect")
+    known = "run compare view align evaluate experiment download tune doctor inspect calibrate".split()
     return f"{arguments[0]} " if arguments and arguments[0] in known else ""
 
 

@@ -16,7 +16,8 @@ class Source:
     """Which frames."""
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
-    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package."""
+    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package. For
+    `gavo run` also realsense: the first camera of that line, live."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
     """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML, ROS, Kalibr,
     OpenCV or Open3D."""
@@ -213,6 +214,23 @@ class Inspect(Source):
     """Print it as JSON."""
 
 
+@dataclass(frozen=True)
+class Calibrate(Source):
+    """Find from the images alone what a source does not say of its camera, and write a camera file.
+
+    Shutter readout, delay of depth and depth scale; the source's camera is what the search starts from.
+    """
+
+    focal_length: bool = False
+    """Find the focal length, too."""
+    principal_point: bool = False
+    """Find the principal point, too."""
+    output: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="(default: camera.toml)")] = None
+    """The camera file, for --camera."""
+    json: bool = False
+    """Print what was found as JSON."""
+
+
 Command = (
     Annotated[Run, subcommand("run")]
     | Annotated[Compare, subcommand("compare")]
@@ -224,4 +242,5 @@ Command = (
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Calibrate, subcommand("calibrate")]
 )

@@ -13,6 +13,7 @@ from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
@@ -40,6 +41,10 @@ CHECKPOINT_SECONDS = 2.0
 
 def run(options: Run) -> int:
     """Track the sequence, write its files as it goes, print a table; return the exit status."""
+    if is_live(options.sequence):
+        from gavo_jax.cli.live import run_live
+
+        return run_live(options)
     check_seed(options.seed)
     trajectory_formats = formats(options.trajectory_format)
     shape = check_options(options.map, options.map_shape, options.voxel)

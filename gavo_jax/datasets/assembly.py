@@ -131,6 +131,9 @@ class FrameAssembler:
             FrameError: an image is not of its camera's size.
         """
         camera = self.recorded
+        if self.calibration.depth_delay:
+            stamped = timestamp if depth_timestamp is None else depth_timestamp
+            depth_timestamp = stamped + self.calibration.depth_delay
         _check_size(bgr, camera, name, "camera")
         image = to_8_bits(bgr, self.white)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

@@ -7,7 +7,7 @@ the next frame meanwhile.
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -18,6 +18,7 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.tracking import Clock
@@ -79,7 +80,7 @@ class Odometry:
     """Frame-by-frame tracking: it holds an aligner, and between two frames all it knows is its `progress`.
 
     Args:
-        camera: Camera of the frames, without distortion.
+        camera: Camera of the frames; where it has lens distortion, that is taken out of every frame.
         settings: What searches, what is minimised, how it is used; the `default` preset's if left out.
         seed: Every random number follows from it and the frames' indices.
         record: Whether every frame's candidates are kept until the next frame, for people to look at.
@@ -87,6 +88,7 @@ class Odometry:
         aligner: Takes the place of the search that the settings describe.
 
     Attributes:
+        camera: Without distortion: that of the frames as they are aligned.
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
         candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
     """
@@ -101,8 +103,8 @@ class Odometry:
         solver: Solver | None = None,
         aligner: Aligner | None = None,
     ):
-        self.camera, self.settings = camera, as_settings(settings, solver)
-        self.aligner = aligner or make_aligner(camera, self.settings, jax.random.key(seed), record)
+        self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
+        self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
 
@@ -124,7 +126,12 @@ class Odometry:
 
         Raises:
             FrameError: There is no first frame to start from.
+            GavoError: What is given is no frame, or its images are not of the camera's size or no grey and depth.
         """
+        if isinstance(frame, Frame):
+            frame = rectified(frame, self.recorded)
+        elif not (frame is None or isinstance(frame, FrameError)):
+            raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
         if self.progress.last_index < 0 and not isinstance(frame, Frame):
             raise frame or FrameError("the first frame could not be read")
         start = time.perf_counter()
@@ -257,12 +264,30 @@ def track(
                 return
 
 
+def rectified(frame: Frame, camera: Camera) -> Frame:
+    """A frame without the camera's lens distortion.
+
+    Raises:
+        FrameError: An image is not of the camera's size, or not one number per pixel.
+    """
+    size = (camera.height, camera.width)
+    for name, image in (("grey", frame.grey), ("depth", frame.depth)):
+        kind = np.asarray(image).dtype
+        if np.shape(image) != size or kind.kind not in "uif":
+            raise FrameError(f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed")
+    if not camera.is_distorted:
+        return frame
+    grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))
+    color = None if frame.color is None else camera.undistort_image(frame.color)
+    return replace(frame, grey=grey, depth=depth, color=color)
+
+
 def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
     """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
 
     def read(index: int) -> Frame | FrameError:
         try:
-            return sequence[index]
+            return rectified(sequence[index], sequence.camera.rectified())
         except FrameError as error:
             return error
 

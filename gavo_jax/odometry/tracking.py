@@ -152,7 +152,7 @@ def track_frame(
     target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
     readout = None
     if options.rolling_shutter:  # a readout that is longer than the time between two frames cannot be
-        readout = jnp.where(camera.readout > clock.elapsed, 0.0, camera.readout / clock.elapsed)
+        readout = jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
     exposure = Exposure.of(raw)
     previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
     views = (previous, keyframe) if options.reference == "keyframe" else (previous,)

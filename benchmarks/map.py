@@ -1,0 +1,116 @@
+"""How near a run's map lies to what a frame saw that is no part of it, and a picture of the map.
+
+Tracks a clip, fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.mapping`), and prints how
+far the left-out frame's depth, put where the run says that it was taken, lies from it. Needs the extra `[map]`.
+
+    python benchmarks/map.py
+    python benchmarks/map.py --clip FOLDER --picture map.png --json map.json
+
+On 2 cores the defaults take about a minute.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import common
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from gavo_jax import Reading, open_source, run_odometry
+from gavo_jax.mapping import VOXEL, SceneMap, build_map, import_open3d
+from gavo_jax.output.screen import number, print_table
+from gavo_jax.trajectory import inverse
+
+FARTHEST = 4.0
+"""Metres: depth beyond is not in the map."""
+
+SIZE, ABOVE, BEHIND, VIEW = (1280, 960), -0.25, -0.9, 55.0
+"""Of the picture: pixels, metres above and behind the first camera, degrees from side to side."""
+
+
+def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Metres from points to the mesh."""
+    open3d = import_open3d()
+    tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
+    rays = open3d.t.geometry.RaycastingScene()
+    rays.add_triangles(tensor(scene.points.astype(np.float32)), tensor(faces))
+    return rays.compute_distance(tensor(points.astype(np.float32))).numpy()
+
+
+def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
+    """RGB of the mesh as a camera sees it, by casting a ray through each pixel; white where there is nothing."""
+    open3d = import_open3d()
+    tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
+    rays = open3d.t.geometry.RaycastingScene()
+    rays.add_triangles(tensor(scene.points.astype(np.float32)), tensor(faces))
+    width, height = SIZE
+    focal = width / 2 / np.tan(np.radians(VIEW / 2))
+    matrix = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
+    through = rays.create_rays_pinhole(tensor(matrix), tensor(inverse(world_T_camera)), width, height)
+    hit = rays.cast_rays(through)
+    triangle, share = hit["primitive_ids"].numpy(), hit["primitive_uvs"].numpy()
+    seen = np.isfinite(hit["t_hit"].numpy())
+    corners = scene.colors[faces[np.where(seen, triangle, 0)]].astype(float)
+    weights = np.stack([1 - share.sum(-1), share[..., 0], share[..., 1]], axis=-1)
+    color = np.einsum("hwkc,hwk->hwc", corners, weights)
+    return np.where(seen[..., None], np.rint(np.clip(color, 0, 255)), 255).astype(np.uint8)
+
+
+def looking_on() -> Float[np.ndarray, "4 4"]:
+    """From behind and above the first camera, along its view."""
+    tilt = np.arctan2(-ABOVE, 1.5 - BEHIND)
+    pose = np.eye(4)
+    pose[1:3, 1:3] = [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]
+    pose[:3, 3] = (0, ABOVE, BEHIND)
+    return pose
+
+
+def main(
+    clip: str = "fr1_xyz:60",
+    method: str = "ga:fast",
+    voxel: float = VOXEL,
+    left_out: int | None = None,
+    picture_file: Path | None = None,
+    json: Path | None = None,
+) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clip: see `common.open_clip`.
+        method: METHOD or METHOD:PRESET.
+        voxel: side, metres.
+        left_out: number of the frame that is no part of the map; the middle one by default.
+        picture_file: where a picture of the map of all frames is written.
+        json: file for the figures.
+    """
+    plain = common.open_clip(clip)
+    sequence = plain
+    if (folder := getattr(plain, "folder", None)) is not None:
+        sequence = open_source(folder, Reading(color=True))[: len(plain)]
+    run = run_odometry(sequence, common.preset_of(method))
+    index = len(sequence) // 2 if left_out is None else left_out
+    step = next(step for step in run.steps if step.index == index)
+    scene = build_map(sequence, [other for other in run.steps if other.index != index], "mesh", voxel)
+    camera, frame = sequence.camera, sequence[index]
+    depth = frame.depth / camera.depth_scale
+    v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
+    points = camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u])
+    away = distances(scene, points @ step.world_T_camera[:3, :3].T + step.world_T_camera[:3, 3])
+    figures = {"median_m": float(np.median(away)), "p90_m": float(np.percentile(away, 90)), "points": len(away)}
+    rows = [
+        ("frames in the map", str(scene.frames), ""),
+        ("triangles", str(len(np.asarray(scene.triangles))), ""),
+        (f"depth of frame {index} from it, median", number(1e3 * figures["median_m"], 2), "mm"),
+        ("90th percentile", number(1e3 * figures["p90_m"], 2), "mm"),
+    ]
+    print_table(f"map of {clip} by {method}, voxels of {1e3 * voxel:g} mm", ("", "", "unit"), rows)
+    if picture_file is not None:
+        image = picture(build_map(sequence, run.steps, "mesh", voxel), looking_on())
+        cv2.imwrite(str(picture_file), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    common.record(json, "map", figures)
+    return figures
+
+
+if __name__ == "__main__":
+    common.command(main)

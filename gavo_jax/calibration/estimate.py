@@ -1,0 +1,328 @@
+"""What a camera does not say of itself, from the images that it took: no pose, no truth, no pattern.
+
+Two frames agree best if what is supposed of the camera is so. What of that shows where:
+
+- **Readout** of a rolling shutter: in the grey residuals, as the camera speeds up and slows down.
+- **Delay** of depth: in the depth residuals. The motion follows the images, and depth follows it late or early.
+- **Focal length** and **principal point**: in the grey residuals, as a turn moves the image's rim more than its middle.
+- **Depth scale**: in none of them. With depth registered to colour, a world twice as large is seen alike. Of a first
+  Kinect and its like the steps between depths tell (`datasets.depth_unit`); of other sensors nothing does.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
+from gavo_jax.calibration.scan import Least, Score, coarse, refine
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
+from gavo_jax.errors import GavoError
+
+Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
+ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")
+ON_WISH: tuple[Wanted, ...] = ("focal_length", "principal_point")
+
+WINDOW = 45
+"""Frames of a stretch, a second and a half; enough for many a turn back and forth."""
+WINDOWS = 2
+"""Stretches, those of most motion."""
+LEAST_FRAMES = 12
+MOST_SEARCHED = 3000
+"""Frames among which the stretches are looked for."""
+EDGE = 2
+"""Pairs at either end of a stretch that do not count: the motion before and after them is not known."""
+
+LONGEST_READOUT, LONGEST_DELAY = 0.05, 0.05
+"""Seconds."""
+READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP = 0.004, 0.005, 0.015, 4.0
+"""Between the values of the last parabolas: seconds, seconds, share, pixels."""
+FOCAL_RANGE, CENTRE_RANGE = 0.25, 40.0
+"""Either way of what the camera says, share and pixels."""
+ROUNDS = 2
+"""Each number is found while the others are held, so all are found again."""
+
+TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0}
+"""One standard deviation from which on a number is not determined: seconds, seconds, share, pixels."""
+
+STEPS_DEVIATION = 0.04
+"""Share by which cameras of that make differ in the factor of their steps."""
+SNAP = 0.08
+"""A unit that files commonly have is taken where the steps come so near to it."""
+
+
+class Found(NamedTuple):
+    """One number of a camera."""
+
+    value: float | None
+    """None where the images do not determine it."""
+    deviation: float | None
+    """One standard deviation; None where it is a unit, or nothing is known."""
+    unit: str
+    why: str
+    """How it was found, or why it was not, in a few words."""
+
+
+@dataclass(frozen=True)
+class CameraEstimate:
+    """What was found, by name, and the camera with it.
+
+    Attributes:
+        found: readout, depth_delay, depth_scale and, on wish, fx, fy, cx and cy.
+        camera: of the frames as they were given, with what was determined.
+        depth_delay: seconds; what the frames' own stamps say is not counted. 0 where it was not determined.
+        pairs: that told.
+    """
+
+    found: dict[str, Found]
+    camera: Camera
+    depth_delay: float
+    pairs: int
+
+
+@dataclass
+class _Trial:
+    """Stretches, and what is supposed of the camera so far."""
+
+    stretches: list[Stretch]
+    stamps: list[np.ndarray]
+    camera: Camera
+    unknowns: Unknowns
+    kinematics: list[Kinematics]
+
+    def match(self, unknowns: Unknowns) -> list[Matched]:
+        size = replace(self.camera.rectified(), fx=1.0, fy=1.0, cx=0.0, cy=0.0, readout=0.0, depth_scale=1.0)
+        traced = Unknowns(*(np.float32(value) for value in unknowns))
+        pairs = zip(self.stretches, self.kinematics, strict=True)
+        return [match_pairs(stretch, moving, traced, camera=size) for stretch, moving in pairs]
+
+    def settle(self) -> None:
+        """Find the camera's motion again, under what is supposed now."""
+        matched = self.match(self.unknowns)
+        self.kinematics = [Kinematics.of(stamps, m) for stamps, m in zip(self.stamps, matched, strict=True)]
+
+    def score(self, channel: Literal["grey", "depth"], change: Callable[[Unknowns, float], Unknowns]) -> Score:
+        """The pairs' residuals of one channel as a function of one number."""
+
+        def evaluate(value: float) -> tuple[np.ndarray, np.ndarray]:
+            matched = self.match(change(self.unknowns, value))
+            costs = [np.asarray(getattr(m, channel))[EDGE:-EDGE] for m in matched]
+            counted = [np.asarray(m.usable)[EDGE:-EDGE] > 0 for m in matched]
+            joined = np.concatenate(costs)
+            return np.nan_to_num(joined), np.concatenate(counted) & np.isfinite(joined)
+
+        return evaluate
+
+
+def estimate_camera(
+    sequence: Sequence,
+    wanted: Iterable[Wanted] = ALWAYS,
+    rounds: int = ROUNDS,
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> CameraEstimate:
+    """Find what a camera does not say of itself.
+
+    Args:
+        sequence: at least a dozen frames, of a camera that moves; a second or more of quick motion tells most.
+        wanted: the names of what is asked for.
+        rounds: how often each number is found, the others held.
+        on_progress: is told what is being found.
+
+    Raises:
+        GavoError: too few frames that can be read, or no two of them agree in any way.
+    """
+    wanted, camera = tuple(wanted), sequence.camera
+    found: dict[str, Found] = {}
+    if "depth_scale" in wanted:
+        found["depth_scale"] = _depth_scale(sequence)
+    if found.keys() == set(wanted):
+        return CameraEstimate(found, _with_found(camera, found), 0.0, 0)
+    on_progress("looking for stretches of motion")
+    stretches = [Stretch.of(frames, camera) for frames in _stretches(sequence)]
+    unknowns = Unknowns.of(camera)._replace(readout=0.0)
+    stamps = [np.asarray(stretch.stamps, float) for stretch in stretches]
+    standing = [Kinematics.unknown(len(times)) for times in stamps]
+    trial = _Trial(stretches, stamps, camera, unknowns, standing)
+    on_progress("finding the camera's motion")
+    for _ in range(2):
+        trial.settle()
+    pairs = int(sum(np.asarray(m.usable)[EDGE:-EDGE].sum() for m in trial.match(trial.unknowns)))
+    if pairs < LEAST_FRAMES // 2:
+        raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned: nothing can be found from them")
+    interval = min(float(np.median(np.diff(times))) for times in stamps)
+    leasts: dict[str, Least] = {}
+    for number in range(rounds):
+        for name, find in _STAGES.items():
+            if name in wanted:
+                on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {rounds}")
+                leasts |= find(trial, interval, number == 0)
+                trial.settle()
+    found |= _judged(leasts, trial)
+    delay = found["depth_delay"].value if "depth_delay" in found else None
+    return CameraEstimate(found, _with_found(camera, found), delay or 0.0, pairs)
+
+
+def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+    most = min(interval, LONGEST_READOUT)
+    score = trial.score("grey", lambda unknowns, value: unknowns._replace(readout=value))
+    start = coarse(score, np.linspace(0, most, 7)) if is_first else float(trial.unknowns.readout)
+    least = refine(score, start, READOUT_STEP, -2 * READOUT_STEP, most + 2 * READOUT_STEP)
+    least = least._replace(value=max(0.0, least.value))
+    trial.unknowns = trial.unknowns._replace(readout=least.value)
+    return {"readout": least}
+
+
+def _find_delay(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+    del interval
+    score = trial.score("depth", lambda unknowns, value: unknowns._replace(delay=value))
+    grid = np.arange(-LONGEST_DELAY, LONGEST_DELAY + 1e-9, 2 * DELAY_STEP)
+    start = coarse(score, grid) if is_first else float(trial.unknowns.delay)
+    reach = LONGEST_DELAY + 2 * DELAY_STEP
+    least = refine(score, start, DELAY_STEP, -reach, reach)
+    trial.unknowns = trial.unknowns._replace(delay=least.value)
+    return {"depth_delay": least}
+
+
+def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+    """Both focal lengths by one factor: their ratio is the pixels', and better known than the images tell it."""
+    del interval
+    said, ratio = trial.camera.fx, trial.camera.fy / trial.camera.fx
+
+    def change(unknowns: Unknowns, value: float) -> Unknowns:
+        return unknowns._replace(fx=said * value, fy=said * value * ratio)
+
+    score = trial.score("grey", change)
+    grid = np.arange(1 - FOCAL_RANGE, 1 + FOCAL_RANGE + 1e-9, 0.05)
+    start = coarse(score, grid) if is_first else float(trial.unknowns.fx) / said
+    least = refine(score, start, FOCAL_STEP, 1 - FOCAL_RANGE, 1 + FOCAL_RANGE)
+    trial.unknowns = change(trial.unknowns, least.value)
+    return {
+        "fx": Least(least.value * said, least.deviation * said),
+        "fy": Least(least.value * said * ratio, least.deviation * said * ratio),
+    }
+
+
+def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+    del interval, is_first
+    leasts = {}
+    for name in ("cx", "cy"):
+        said, now = getattr(trial.camera, name), float(getattr(trial.unknowns, name))
+
+        def change(unknowns: Unknowns, value: float, name: str = name) -> Unknowns:
+            return unknowns._replace(**{name: value})
+
+        least = refine(trial.score("grey", change), now, CENTRE_STEP, said - CENTRE_RANGE, said + CENTRE_RANGE)
+        trial.unknowns = change(trial.unknowns, least.value)
+        leasts[name] = least
+    return leasts
+
+
+_STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Least]]] = {
+    "readout": _find_readout,
+    "depth_delay": _find_delay,
+    "focal_length": _find_focal,
+    "principal_point": _find_centre,
+}
+"""In the order in which they are found: those that show most come first."""
+
+_KINDS: dict[str, tuple[str, str, str]] = {
+    "readout": ("readout", "s", "grey residuals"),
+    "depth_delay": ("depth_delay", "s", "depth residuals"),
+    "fx": ("focal_length", "pixels", "grey residuals"),
+    "fy": ("focal_length", "pixels", "grey residuals, with fx"),
+    "cx": ("principal_point", "pixels", "grey residuals"),
+    "cy": ("principal_point", "pixels", "grey residuals"),
+}
+
+
+def _judged(leasts: dict[str, Least], trial: _Trial) -> dict[str, Found]:
+    """Each number with its deviation, or why it is not determined."""
+    found = {}
+    for name, least in leasts.items():
+        kind, unit, how = _KINDS[name]
+        most = TOO_UNSURE[kind] * (getattr(trial.camera, name) if kind == "focal_length" else 1.0)
+        if least.deviation < most:
+            found[name] = Found(least.value, least.deviation, unit, how)
+        else:
+            found[name] = Found(None, None, unit, "the motion in these frames leaves it open")
+    return found
+
+
+def _depth_scale(sequence: Sequence) -> Found:
+    """By the steps between depths, where the sensor is one of those."""
+    sample, _ = sample_sequence(sequence)
+    camera, unit = sequence.camera, "units per metre"
+    looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
+    if sample is None or sample.kinect_scale is None or not looks_so:
+        why = "images alone do not tell: a world of another size looks alike, and depth has no steps of a known sensor"
+        return Found(None, None, unit, why)
+    scale = sample.kinect_scale
+    common = min(COMMON, key=lambda other: abs(np.log(scale / other)))
+    if abs(scale / common - 1) < SNAP:
+        why = f"steps of depth, as of a first Kinect, say {scale:.0f}: the common unit next to it"
+        return Found(common, None, unit, why)
+    return Found(scale, STEPS_DEVIATION * scale, unit, "steps of depth, as of a first Kinect")
+
+
+def _with_found(camera: Camera, found: dict[str, Found]) -> Camera:
+    names = ("readout", "depth_scale", "fx", "fy", "cx", "cy")
+    values: dict[str, Any] = {name: found[name].value for name in names if name in found}
+    return replace(camera, **{name: value for name, value in values.items() if value is not None})
+
+
+def _stretches(sequence: Sequence) -> list[list[Frame]]:
+    """The stretches of most motion, each of consecutive frames that can be read.
+
+    Raises:
+        GavoError: there is none of enough frames.
+    """
+    count = min(len(sequence), MOST_SEARCHED)
+    length = min(WINDOW, count)
+    changes = _changes(sequence, count)
+    sums = np.convolve(changes, np.ones(length - 1), "valid")
+    chosen: list[int] = []
+    for start in np.argsort(-sums, kind="stable"):
+        if all(abs(int(start) - other) >= length for other in chosen):
+            chosen.append(int(start))
+        if len(chosen) == WINDOWS:
+            break
+    runs = [_readable(sequence, start, length) for start in chosen]
+    runs = [run for run in runs if len(run) >= LEAST_FRAMES]
+    if not runs:
+        raise GavoError(f"{sequence.name}: at least {LEAST_FRAMES} frames in a row that can be read are needed")
+    return runs
+
+
+def _changes(sequence: Sequence, count: int) -> np.ndarray:
+    """How much each image differs from the one before, per contrast; where one cannot be read, nothing."""
+    if count <= WINDOW:
+        return np.zeros(max(count - 1, 0))
+    changes, before = np.zeros(count - 1), None
+    for index in range(count):
+        try:
+            grey = np.asarray(sequence[index].grey)[::8, ::8].astype(np.float32)
+        except FrameError:
+            before = None
+            continue
+        if before is not None:
+            changes[index - 1] = np.mean(np.abs(grey - before)) / max(float(grey.std()), 1.0)
+        before = grey
+    return changes
+
+
+def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
+    """The longest run of frames that can be read, with stamps that go forward and depth."""
+    runs: list[list[Frame]] = [[]]
+    for index in range(start, start + length):
+        try:
+            frame = sequence[index]
+        except FrameError:
+            runs.append([])
+            continue
+        if runs[-1] and frame.timestamp <= runs[-1][-1].timestamp:
+            runs.append([])
+        runs[-1].append(frame)
+    return max(runs, key=len)

@@ -1,0 +1,225 @@
+"""How well consecutive frames agree if the camera were so: E of each pair at the motion that suits it best.
+
+All that is asked for is a number of one compiled program, so that a search over it compiles nothing anew.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gavo_jax.alignment.search import align_views
+from gavo_jax.alignment.visits import fit_objective, levels_of, prepare_target, stack_levels
+from gavo_jax.camera import Camera, to_pixels, to_ray
+from gavo_jax.datasets.base import Frame
+from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
+from gavo_jax.image.sampling import Target
+from gavo_jax.image.warp import Points, moved
+from gavo_jax.objective.estimates import estimate_scales
+from gavo_jax.objective.points import Reference, make_references, settle_reference
+from gavo_jax.se3 import exp, rigid_inverse
+from gavo_jax.settings import AlignmentOptions
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.status import AlignmentStatus
+
+SOLVER = GaussNewton(iterations=(6, 6, 8, 8, 0))
+OPTIONS = AlignmentOptions(
+    points=(4800, 1200, 1200, 1200, 1200), views=(1,) * LEVELS, depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3)
+)
+"""Frame to frame: a keyframe would carry what was believed of the camera from pair to pair. Level 0 is that of images
+of half the size: what the odometry ends with."""
+
+
+class Unknowns(NamedTuple):
+    """What may be asked of a camera."""
+
+    readout: Any
+    """Seconds from the first row to the last."""
+    delay: Any
+    """Seconds that depth was taken after what its stamp says, or the colour image's where it has none."""
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+
+    @classmethod
+    def of(cls, camera: Camera) -> "Unknowns":
+        """What a camera says of itself."""
+        return cls(camera.readout, 0.0, camera.fx, camera.fy, camera.cx, camera.cy)
+
+    def on(self, camera: Camera) -> Camera:
+        """A camera with these values."""
+        return replace(camera, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, readout=self.readout)
+
+
+class Stretch(NamedTuple):
+    """Consecutive frames of a recording, at half their size."""
+
+    grey: Float[Array, "f h w"]
+    inverse_depth: Float[Array, "f h w"]
+    stamps: Float[Array, " f"]
+    """Of colour, seconds after the first; of an even clock where they are such with jitter."""
+    delays: Float[Array, " f"]
+    """Of depth after colour, by the stamps, seconds."""
+
+    @classmethod
+    def of(cls, frames: Iterable[Frame], camera: Camera) -> "Stretch":
+        """Frames side by side, on the device."""
+        levels, stamps, depth_stamps = [], [], []
+        for frame in frames:
+            levels.append(_half(frame.grey, frame.depth, camera.depth_scale))
+            stamps.append(frame.timestamp)
+            depth_stamps.append(frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp)
+        grey, inverse_depth = (jnp.stack(images) for images in zip(*levels, strict=True))
+        start = stamps[0]
+        colour, depth = evened(np.array(stamps) - start), evened(np.array(depth_stamps) - start)
+        return cls(grey, inverse_depth, jnp.asarray(colour, jnp.float32), jnp.asarray(depth - colour, jnp.float32))
+
+
+MOST_JITTER = 0.3
+"""Of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
+
+
+def evened(stamps: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Stamps of an even clock, where these are such with jitter; frames may be missing.
+
+    A camera exposes evenly; a stamp says when an image arrived. A jitter of milliseconds, against 33 between frames,
+    would make the speed jump by a tenth from frame to frame, and so hide how the camera really speeds up.
+    """
+    intervals = np.diff(stamps)
+    ticks = np.concatenate([[0.0], np.cumsum(np.round(intervals / np.median(intervals)))])
+    interval, start = np.polyfit(ticks, stamps, 1)
+    even = start + interval * ticks
+    fits = len(np.unique(ticks)) == len(ticks) and np.abs(stamps - even).max() < MOST_JITTER * interval
+    return even if fits else stamps
+
+
+@jax.jit
+def _half(grey: Array, depth: Array, depth_scale: Array | float) -> PyramidLevel:
+    return build_pyramid(grey, depth, depth_scale, 2)[1]
+
+
+class Kinematics(NamedTuple):
+    """How the camera moves at the frames' moments: twists of the points in it, per second."""
+
+    velocity: Float[Array, "f 6"]
+    acceleration: Float[Array, "f 6"]
+    between: Float[Array, "f 6"]
+    """Mean velocity from a frame to the next; the last row is not used."""
+    guesses: Float[Array, "f 4 4"]
+    """target_T_reference from a frame to the next, to start from."""
+
+    @classmethod
+    def unknown(cls, frames: int) -> "Kinematics":
+        """Standing still."""
+        zero = jnp.zeros((frames, 6))
+        return cls(zero, zero, zero, jnp.tile(jnp.eye(4), (frames, 1, 1)))
+
+    @classmethod
+    def of(cls, stamps: np.ndarray, matched: "Matched") -> "Kinematics":
+        """From the motions between the frames: central differences of fourth order, of second order near the ends."""
+        seconds = np.diff(stamps)[:, None]
+        between = np.nan_to_num(np.asarray(matched.xi)) / seconds
+        velocity = np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
+        if len(between) > 3:
+            velocity[2:-2] = (7 * (between[1:-2] + between[2:-1]) - between[:-3] - between[3:]) / 12
+        acceleration = np.zeros_like(velocity)
+        acceleration[1:-1] = (between[1:] - between[:-1]) / ((seconds[1:] + seconds[:-1]) / 2)
+        rows = (velocity, acceleration, np.concatenate([between, between[-1:]]))
+        guesses = jnp.concatenate([matched.target_T_reference, jnp.eye(4)[None]])
+        return cls(*(jnp.asarray(row, jnp.float32) for row in rows), guesses)
+
+
+class Matched(NamedTuple):
+    """Of each pair of consecutive frames what their best motion leaves."""
+
+    grey: Float[Array, " pairs"]
+    """Logarithm of the grey residuals' scale."""
+    depth: Float[Array, " pairs"]
+    """Logarithm of the depth residuals' scale."""
+    xi: Float[Array, "pairs 6"]
+    target_T_reference: Float[Array, "pairs 4 4"]
+    usable: Float[Array, " pairs"]
+
+
+@partial(jax.jit, static_argnames="camera")
+def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *, camera: Camera) -> Matched:
+    """Align each frame of a stretch with the one before it by Gauss-Newton, under what is supposed of the camera.
+
+    Args:
+        stretch: Frames.
+        kinematics: How the camera moves, for what depends on it to first order: shutter and delay.
+        unknowns: What is supposed.
+        camera: Of the full images; only its size counts.
+    """
+    seen = unknowns.on(camera).level(1)
+    levels = levels_of(seen, SOLVER, OPTIONS)
+
+    def prepare(frame: Array) -> tuple[Reference, Target]:
+        late = stretch.delays[frame] + unknowns.delay
+        twist = late * kinematics.velocity[frame] + 0.5 * late**2 * kinematics.acceleration[frame]
+        depth = depth_moved(stretch.inverse_depth[frame], seen, exp(twist))
+        pyramid = [PyramidLevel(stretch.grey[frame], depth)]
+        for _ in levels.numbers[1:]:
+            pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
+        return make_references(tuple(pyramid), seen, levels), prepare_target(tuple(pyramid), levels)
+
+    references, targets = jax.lax.map(prepare, jnp.arange(stretch.stamps.shape[0]))
+
+    def pair(first: Array) -> Matched:
+        reference, target = (
+            jax.tree.map(lambda leaf: leaf[first], references),
+            jax.tree.map(lambda leaf: leaf[first + 1], targets),
+        )
+        # the target's rows are taken as moving on by the mean velocity; so the reference's move by as much less as the
+        # camera really gained between the two
+        gained = kinematics.velocity[first + 1] - kinematics.velocity[first]
+        reference = settle_reference(reference, (kinematics.between[first] - gained) * unknowns.readout)
+        share = unknowns.readout / (stretch.stamps[first + 1] - stretch.stamps[first])
+        key, guess = jax.random.key(0), kinematics.guesses[first][None]
+        found, _ = align_views((reference,), target, seen, levels, SOLVER, OPTIONS, key, guess, readout=share)
+        visits = stack_levels((reference,), seen, levels, OPTIONS, None, share)
+        finest = jax.tree.map(lambda leaf: leaf[-1], visits)
+        objective, _ = fit_objective(finest, target, OPTIONS, found.target_T_reference)
+        scales = estimate_scales(objective.residuals(found.target_T_reference), finest.depth_weight)
+        usable = (found.status == int(AlignmentStatus.OK)).astype(jnp.float32)
+        return Matched(jnp.log(scales.grey), jnp.log(scales.depth), found.xi, found.target_T_reference, usable)
+
+    return jax.lax.map(pair, jnp.arange(stretch.stamps.shape[0] - 1))
+
+
+ONE_SURFACE = 0.03
+"""Neighbouring readings whose inverse depths differ by no more, as a share, are interpolated."""
+
+
+def depth_moved(
+    inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
+) -> Float[Array, "h w"]:
+    """As `image.warp.synchronise_depth`, interpolated: what is looked up at the nearest pixel does not change for moves
+    of less than half a pixel, and here it is the small changes that count.
+
+    Args:
+        inverse_depth: 1/m, 0 = no reading, seen by the camera where it stood when depth was read.
+        camera: camera of the image.
+        depth_T_colour: maps points of the camera at the colour image's moment into the camera at the depth image's.
+    """
+    height, width = inverse_depth.shape
+    x, y = to_ray(camera, jnp.arange(width), jnp.arange(height)[:, None])
+    x, y, z = moved(Points(x, y, inverse_depth), depth_T_colour)
+    u, v = to_pixels(camera, x, y, 1.0 / jnp.maximum(z, 1e-3))
+    inside = (z > 1e-3) & (inverse_depth > 0) & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
+    column, row = (jnp.where(inside, jnp.floor(at), 0).astype(jnp.int32) for at in (u, v))
+    across, down = u - column, v - row
+    flat, place = inverse_depth.reshape(-1), row * width + column
+    corners = jnp.stack([flat.at[place + step].get(mode="promise_in_bounds") for step in (0, 1, width, width + 1)])
+    shares = jnp.stack([(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down])
+    nearest, farthest = jnp.max(corners, axis=0), jnp.min(corners, axis=0)
+    smooth = inside & (farthest > nearest * (1.0 - ONE_SURFACE))
+    read = jnp.where(smooth, jnp.sum(shares * corners, axis=0), 0.0)
+    _, _, back = moved(Points(*to_ray(camera, u, v), read), rigid_inverse(depth_T_colour))
+    return jnp.where(smooth & (back > 1e-3), read / back, 0.0)

@@ -1,0 +1,72 @@
+"""`gavo calibrate`: what a recording does not say of its camera, found from its images, as a camera file."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
+from gavo_jax.calibration.file import write_camera_file
+from gavo_jax.camera_files import Calibration
+from gavo_jax.cli.options import Calibrate
+from gavo_jax.cli.selection import open_sequence
+from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.errors import GavoError
+from gavo_jax.interrupts import interruptible
+from gavo_jax.output.files import describe
+from gavo_jax.output.screen import print_table, say, waiting
+
+
+def calibrate(options: Calibrate) -> int:
+    """Find it, print a table (or JSON), and write the camera file."""
+    output = options.output or Path("camera.toml")
+    if output.suffix.lower() != ".toml":
+        raise GavoError(f"{output}: a camera file ends in .toml")
+    if not output.absolute().parent.is_dir():
+        raise GavoError(f"{output}: no such folder: {output.parent}")
+    wanted: list[Wanted] = [*ALWAYS]
+    if options.focal_length:
+        wanted.append("focal_length")
+    if options.principal_point:
+        wanted.append("principal_point")
+    sequence = open_sequence(options, force=True)
+    enable_compilation_cache()
+    with waiting("looking at the frames …"):
+        estimate = interruptible(lambda: estimate_camera(sequence, wanted))
+    calibration = calibration_of(sequence, estimate)
+    write_camera_file(output, calibration, ("found from the images alone by gavo calibrate", *_comments(estimate)))
+    if options.json:
+        print(json.dumps(describe(_facts(estimate)), indent=2, allow_nan=False))
+        return 0
+    rows = [(name, *_cells(found), found.why) for name, found in estimate.found.items()]
+    print_table(f"camera of {sequence.name}, by {estimate.pairs} pairs of frames", ("", "", "±", "unit", "by"), rows)
+    say(f"camera file: {output}")
+    return 0
+
+
+def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
+    """The cameras as they record, with what was found; a delay that they had already counts on."""
+    before = getattr(sequence, "calibration", None) or Calibration(sequence.camera)
+    values = {
+        name: getattr(estimate.camera, name)
+        for name, found in estimate.found.items()
+        if name != "depth_delay" and found.value is not None
+    }
+    delay = before.depth_delay + estimate.depth_delay
+    return replace(before, color=replace(before.color, **values), depth_delay=delay)
+
+
+def _cells(found: Found) -> tuple[str, str, str]:
+    if found.value is None:
+        return "not determined", "", ""
+    digits = 4 if found.unit == "s" else 1
+    deviation = "" if found.deviation is None else f"{found.deviation:.{digits}f}"
+    return f"{found.value:.{digits}f}", deviation, found.unit
+
+
+def _comments(estimate: CameraEstimate) -> list[str]:
+    return [" ".join((f"{name}:", *filter(None, _cells(f)), f"({f.why})")) for name, f in estimate.found.items()]
+
+
+def _facts(estimate: CameraEstimate) -> dict[str, object]:
+    return {"pairs": estimate.pairs, **{name: found._asdict() for name, found in estimate.found.items()}}

@@ -1,0 +1,136 @@
+"""`gavo run` over a camera's frames as they come, until Ctrl-C, the camera's end or `--frames`."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gavo_jax.camera_files import load_camera
+from gavo_jax.cli.options import Run
+from gavo_jax.cli.run_table import print_run
+from gavo_jax.cli.selection import check_seed, choose_settings
+from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.datasets.devices import open_device
+from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
+from gavo_jax.early import INTERRUPTED
+from gavo_jax.errors import GavoError
+from gavo_jax.interrupts import interruptible
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import compute_metrics
+from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
+from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.output.screen import say, tell, waiting
+from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
+from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory
+from gavo_jax.viewer.base import Viewer
+from gavo_jax.viewer.live import make_viewer
+
+LOST = 3
+"""As of `cli.run`."""
+
+
+def run_live(options: Run) -> int:
+    """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
+    check_seed(options.seed)
+    _refuse_what_cannot_be(options)
+    trajectory_formats = formats(options.trajectory_format)
+    method, preset, settings = choose_settings(options)
+    options = replace(options, method=method, preset=preset)
+    device = open_device(options.sequence)
+    camera = device.camera if options.camera == "auto" else load_camera(options.camera)
+    name = f"{device.name}-{method}-{preset}"
+    path = options.output or Path("runs") / name
+    enable_compilation_cache()
+    with Newest(device) as newest, RunFolder(path) as folder, make_viewer(options.viewer, path / RECORDING) as viewer:
+        odometry = Odometry(camera.rectified(), settings, seed=options.seed, record=viewer.wants_populations)
+        with waiting(f"{device.name}: compiling …"):
+            compile_seconds = interruptible(odometry.warm_up)
+        remove_trajectories(folder.path)
+        say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
+        seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings)
+        if odometry.progress.last_index < 1:
+            raise GavoError(f"{device.name}: ended after {newest.received} frames: at least two are needed")
+        steps = folder.steps()
+        trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
+        metrics: dict[str, Any] = {
+            **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed, "complete": True},
+            **compute_metrics(
+                trajectory_of(float(trajectory.timestamps[0]), steps), None, steps, seconds, compile_seconds
+            ),
+            **{"frames_received": newest.received, "frames_dropped": newest.dropped},
+        }
+        folder.finish(metrics)
+        write_trajectories(trajectory, folder.path, trajectory_formats)
+    print_run(name, metrics, folder.path, False)
+    say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")
+    if interrupted:
+        return INTERRUPTED
+    return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _track(
+    options: Run,
+    newest: Newest,
+    camera: Any,
+    odometry: Odometry,
+    folder: RunFolder,
+    viewer: Viewer,
+    settings: Settings,
+) -> tuple[float, bool]:
+    """Track until there is no more; the seconds it took, and whether Ctrl-C came."""
+    count, start = 0, time.perf_counter()
+    images: LiveImages
+    try:
+        for images in newest:
+            frame = frame_of(images, camera)
+            if count == 0:
+                folder.start(_config(options, newest.device, camera, settings), frame.timestamp)
+                viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
+                start = time.perf_counter()
+            step = odometry.register(frame, frame.timestamp)
+            viewer.watch(frame, step, odometry.candidates)
+            if step is not None:
+                folder.add(step, odometry.progress)
+            count += 1
+            if count == options.frames:
+                break
+            if step is not None and step.lost and settings.odometry.on_lost == "stop":
+                break
+    except KeyboardInterrupt:
+        if count < 2:
+            raise
+        tell(f"{newest.device.name}: interrupted after {count} frames")
+        return time.perf_counter() - start, True
+    return time.perf_counter() - start, False
+
+
+def _refuse_what_cannot_be(options: Run) -> None:
+    """Raise GavoError for options that a live camera has no use for."""
+    for option, is_given in (
+        ("--resume", options.resume),
+        ("--start", options.start != 0),
+        ("--stride", options.stride != 1),
+        ("--map", options.map is not None),
+    ):
+        if is_given:
+            raise GavoError(f"{option}: not with the live source {options.sequence!r}: record it and run over that")
+    if options.frames is not None and options.frames < 2:
+        raise GavoError(f"--frames: must be at least 2, not {options.frames}")
+
+
+def _config(options: Run, device: LiveDevice, camera: Any, settings: Settings) -> dict[str, Any]:
+    """What config.json says."""
+    return {
+        "options": options,
+        "sequence": {"name": device.name, "frames": None, "camera": camera},
+        "solver": settings.solver,
+        "alignment": settings.alignment,
+        "odometry": settings.odometry,
+        "device": jax.devices()[0].device_kind,
+        "versions": environment(),
+    }

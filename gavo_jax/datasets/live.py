@@ -1,0 +1,153 @@
+"""Frames as a camera delivers them: checked, rectified, and the newest one where they come faster than is tracked."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol, Self
+
+import cv2
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.errors import GavoError
+
+
+class LiveImages(NamedTuple):
+    """What a device hands over at one moment."""
+
+    color: np.ndarray
+    """RGB of uint8 [H, W, 3], or grey [H, W]."""
+    depth: np.ndarray
+    """Registered to colour: uint16 [H, W] in units of the camera's `depth_scale`, or floats in metres; 0 or not finite
+    = no reading."""
+    timestamp: float
+    """Of the colour image, seconds, by any clock that only goes forward."""
+    depth_timestamp: float | None = None
+    """Of the depth image, by the same clock."""
+
+
+class LiveDevice(Protocol):
+    """A camera, or whatever stands for one."""
+
+    @property
+    def name(self) -> str:
+        """Short, for tables and folders."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """As it records: with its distortion."""
+        ...
+
+    def read(self) -> LiveImages | None:
+        """Wait for the next images; None at the end.
+
+        Raises:
+            GavoError: the device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the device; a `read` that waits returns."""
+        ...
+
+
+def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
+    """A frame of raw images, without the camera's lens distortion.
+
+    Args:
+        images: as the device hands them over.
+        camera: as it records; frames are those of `camera.rectified()`.
+        color: whether the frame carries RGB beside grey.
+
+    Raises:
+        GavoError: an image is of another size or type than it may be; the message says what was expected.
+    """
+    size = (camera.height, camera.width)
+    image, depth = np.asarray(images.color), np.asarray(images.depth)
+    if image.dtype != np.uint8 or image.shape not in (size, (*size, 3)):
+        raise GavoError(
+            f"colour image is {image.dtype} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
+        )
+    if depth.shape != size or not (depth.dtype == np.uint16 or depth.dtype.kind == "f"):
+        raise GavoError(
+            f"depth image is {depth.dtype} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
+        )
+    if depth.dtype != np.uint16:
+        raw = depth * camera.depth_scale
+        depth = np.where(np.isfinite(raw) & (raw > 0) & (raw < 65535), raw + 0.5, 0).astype(np.uint16)
+    image, depth = camera.undistort(np.ascontiguousarray(image), np.ascontiguousarray(depth))
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    rgb = None
+    if color:
+        rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+    return Frame(grey, depth, images.timestamp, rgb, images.depth_timestamp)
+
+
+@dataclass
+class Newest:
+    """The newest images of a device: a thread takes what comes, and what is not asked for in time is dropped.
+
+    An odometry that fell behind a camera would never catch up, and its pose would be of ever longer ago. So a frame
+    that is not yet taken when the next one comes makes room for it, and is counted.
+
+    Attributes:
+        device: it is closed in the end.
+        received: images that came so far.
+        dropped: of these, those that made room for a newer one.
+    """
+
+    device: LiveDevice
+    received: int = 0
+    dropped: int = 0
+    _waiting: LiveImages | None = None
+    _fault: BaseException | None = None
+    _ended: bool = False
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+    _thread: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        """Begin to take images."""
+        self._thread = threading.Thread(target=self._take, name=f"reads {self.device.name}", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        with self._changed:
+            self._ended = True
+        self.device.close()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+
+    def __iter__(self) -> Iterator[LiveImages]:
+        """The newest images, whenever they are asked for; waits for some.
+
+        Raises:
+            GavoError: what the device raised.
+        """
+        while True:
+            with self._changed:
+                while self._waiting is None and not self._ended:
+                    self._changed.wait(timeout=0.1)  # a wait without end would not hear Ctrl-C everywhere
+                images, self._waiting = self._waiting, None
+                if images is None:
+                    if self._fault is not None:
+                        raise self._fault
+                    return
+            yield images
+
+    def _take(self) -> None:
+        try:
+            while not self._ended and (images := self.device.read()) is not None:
+                with self._changed:
+                    self.received += 1
+                    self.dropped += self._waiting is not None
+                    self._waiting = images
+                    self._changed.notify()
+        except BaseException as error:
+            self._fault = error if isinstance(error, GavoError) else GavoError(f"{self.device.name}: {error}")
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()

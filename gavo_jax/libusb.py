@@ -1,0 +1,34 @@
+"""Libraries that link to libusb, on systems that lack it: that of the package libusb-package is loaded first."""
+
+import ctypes
+import importlib
+import warnings
+from typing import Any
+
+
+def import_with_libusb(name: str) -> Any:
+    """Import a library, if need be with the package's libusb; its warnings are not shown.
+
+    Raises:
+        ImportError: it cannot be imported.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return importlib.import_module(name)
+        except ImportError as error:
+            if "libusb" not in str(error):
+                raise
+            _load_libusb(error)
+            return importlib.import_module(name)
+
+
+def _load_libusb(error: ImportError) -> None:
+    """Load the package's library for all that come later; raise `error` where there is none."""
+    try:
+        path = importlib.import_module("libusb_package").get_library_path()
+        if path is None:
+            raise error
+        ctypes.CDLL(str(path), ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        raise error from None

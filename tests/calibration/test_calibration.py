@@ -1,0 +1,127 @@
+"""What is found of a small rendered camera, how a least is found, even clocks, and the camera file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import CAMERA
+
+from gavo_jax.calibration.estimate import Found, estimate_camera
+from gavo_jax.calibration.file import write_camera_file
+from gavo_jax.calibration.pairs import evened
+from gavo_jax.calibration.scan import coarse, refine
+from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.cli.calibrate import calibration_of
+from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.se3 import exp
+from gavo_jax.trajectory import Trajectory
+
+READOUT, DELAY = 0.02, 0.01
+LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""A camera that looks along the world's x axis, whose z points up."""
+
+
+def shaken(stamps: np.ndarray) -> Trajectory:
+    """A hand that shakes a camera."""
+    poses = []
+    for t in stamps:
+        turn = [0.08 * np.sin(14 * t), 0.07 * np.sin(11 * t + 1), 0.03 * np.sin(9 * t)]
+        shift = [0.04 * np.sin(12 * t + 2), 0.03 * np.sin(10 * t), 0.02 * np.sin(8 * t)]
+        poses.append(LEVEL @ np.asarray(exp(np.array([*shift, *turn], np.float32)), np.float64))
+    return Trajectory(stamps, np.stack(poses))
+
+
+class Shaken:
+    """Frames whose depth is late by `DELAY`, of a camera whose shutter rolls."""
+
+    name, ground_truth = "shaken", None
+
+    def __init__(self, frames: int = 20):
+        fine = np.arange(-0.1, frames / 30 + 0.2, 0.005)
+        sequence = SyntheticSequence(noise=NONE, camera=replace(CAMERA, readout=READOUT), trajectory=shaken(fine))
+        self.camera = replace(CAMERA, readout=0.0)
+        self.timestamps = np.arange(frames) / 30
+        at = [int(np.argmin(abs(fine - t))) for t in self.timestamps]
+        self.frames = [Frame(sequence[i].grey, sequence[i + round(DELAY / 0.005)].depth, float(fine[i])) for i in at]
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        return self.frames[index]
+
+
+def test_shutter_and_delay_are_found_from_the_images():
+    estimate = estimate_camera(Shaken(), ("readout", "depth_delay"), rounds=1)  # pyright: ignore
+    readout, delay = estimate.found["readout"], estimate.found["depth_delay"]
+    assert readout.value == pytest.approx(READOUT, abs=0.003), readout
+    assert delay.value == pytest.approx(DELAY, abs=0.003), delay
+    assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
+
+
+def test_depth_scale_is_not_made_up():
+    estimate = estimate_camera(SyntheticSequence(3, noise=NONE, camera=CAMERA), ("depth_scale",))
+    found = estimate.found["depth_scale"]
+    assert found.value is None and "do not tell" in found.why
+    assert estimate.camera.depth_scale == CAMERA.depth_scale
+
+
+def test_a_least_comes_with_how_sure_it_is():
+    rng = np.random.default_rng(1)
+    middles, everywhere = 0.3 + 0.1 * rng.standard_normal(100), np.ones(100, bool)
+
+    def score(value):
+        return (value - middles) ** 2, everywhere
+
+    assert coarse(score, np.linspace(-1, 1, 9)) == 0.25
+    least = refine(score, -0.5, 0.1, -1, 1, rounds=8)
+    assert least.value == pytest.approx(middles.mean(), abs=1e-6)
+    assert least.deviation == pytest.approx(0.1 / 10, rel=0.3)
+    flat = refine(lambda _: (rng.standard_normal(100), everywhere), 0.0, 0.1, -1, 1)
+    assert flat.deviation > 0.05
+    assert refine(lambda v: (np.full(100, v), everywhere), 0.0, 0.1, -1, 1).deviation == np.inf
+    assert refine(lambda v: (np.full(100, v), ~everywhere), 0.0, 0.1, -1, 1).deviation == np.inf
+
+
+def test_stamps_with_jitter_are_those_of_an_even_clock():
+    rng = np.random.default_rng(2)
+    ticks = np.delete(np.arange(40), [7, 20, 21])
+    stamps = ticks / 30 + rng.uniform(-0.004, 0.004, len(ticks))
+    np.testing.assert_allclose(np.diff(evened(stamps)), np.diff(ticks) / 30, atol=5e-4)
+    uneven = np.cumsum(rng.uniform(0.02, 0.2, 30))
+    np.testing.assert_array_equal(evened(uneven), uneven)
+
+
+def test_a_camera_file_holds_what_was_found(tmp_path):
+    rig = Calibration(
+        replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), readout=0.03), CAMERA, np.eye(4), depth_delay=-0.015
+    )
+    write_camera_file(tmp_path / "camera.toml", rig, ("a remark",))
+    read = load_calibration(tmp_path / "camera.toml")
+    assert (read.color, read.depth_delay) == (rig.color, rig.depth_delay)
+    assert read.depth is not None and read.depth.matrix.tolist() == CAMERA.matrix.tolist()
+    (tmp_path / "bad.toml").write_text((tmp_path / "camera.toml").read_text().replace("-0.015", "15"))
+    with pytest.raises(GavoError, match="depth_delay: must be a number from -1 to 1"):
+        load_calibration(tmp_path / "bad.toml")
+
+
+def test_a_delay_moves_depths_stamp_or_makes_one():
+    shape = (CAMERA.height, CAMERA.width)
+    assembler = FrameAssembler(Calibration(CAMERA, depth_delay=-0.015), DepthUnit(5000.0, 5000.0))
+    images = (np.zeros((*shape, 3), np.uint8), DepthImage(np.zeros(shape, np.uint16), "depth"), "colour")
+    assert assembler.frame(*images, 2.0).depth_timestamp == pytest.approx(1.985)
+    assert assembler.frame(*images, 2.0, 2.01).depth_timestamp == pytest.approx(1.995)
+
+
+def test_what_is_not_determined_stays_as_it_was():
+    class Estimate:
+        found = {"readout": Found(None, None, "s", ""), "depth_scale": Found(1000.0, None, "", "")}
+        camera, depth_delay = replace(CAMERA, readout=0.5, depth_scale=1000.0), 0.01
+
+    sequence = type("Recorded", (), {"calibration": Calibration(CAMERA, depth_delay=0.02), "camera": CAMERA})
+    calibration = calibration_of(sequence, Estimate)  # pyright: ignore
+    assert (calibration.color.readout, calibration.color.depth_scale) == (CAMERA.readout, 1000.0)
+    assert calibration.depth_delay == pytest.approx(0.03)

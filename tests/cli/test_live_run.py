@@ -1,0 +1,95 @@
+"""`gavo run` over a live device: a stand-in that plays a few rendered frames."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from command import runner
+from small import CAMERA, NEWTON
+
+from gavo_jax import presets
+from gavo_jax.datasets.devices import register_device
+from gavo_jax.datasets.live import LiveImages
+from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.trajectory import Trajectory
+
+LENS = replace(CAMERA, distortion=(0.1, -0.1, 0.0, 0.0, 0.0))
+FRAMES = SyntheticSequence(5, noise=NONE, camera=CAMERA, color=True)
+
+
+class Player:
+    """Gives a frame when the one before was tracked, so that none is dropped; then the end, Ctrl-C or nothing more."""
+
+    name = "player"
+
+    def __init__(self, camera=CAMERA, frames=FRAMES):
+        self.camera, self.coming = camera, iter(frames)
+
+    def read(self):
+        frame = next(self.coming, None)
+        return frame and LiveImages(frame.color, frame.depth, frame.timestamp, None)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def _method():
+    presets.register("small-newton", NEWTON)
+
+
+def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", Player)
+    done = runner(capsys)(
+        *("run", "player", "--method", "small-newton", "--output", tmp_path / "run", "--trajectory-format", "json")
+    )
+    assert done.status == 0, done.err
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["frames_received"], metrics["frames_dropped"]) == (5, 5, 0)
+    trajectory = Trajectory.read_tum(tmp_path / "run" / "trajectory.txt")
+    expected = run_odometry(FRAMES, NEWTON).trajectory
+    assert abs(trajectory.world_T_camera - expected.world_T_camera).max() < 1e-6
+    assert (tmp_path / "run" / "trajectory.json").exists()
+    assert "0 of 5 frames came while another was tracked" in done.out
+
+
+class Unhurried:
+    """As `Newest`, without the thread: every frame is taken."""
+
+    def __init__(self, device):
+        self.device, self.received, self.dropped = device, 0, 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.device.close()
+
+    def __iter__(self):
+        while (images := self.device.read()) is not None:
+            self.received += 1
+            yield images
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("player", "--resume"), "--resume: not with the live source 'player'"),
+        (("player", "--map", "a.ply"), "--map: "),
+        (("player", "--frames", "1"), "at least 2"),
+        (("empty",), "ended after 0 frames"),
+        (("odd",), "colour image is uint8 of shape"),
+    ],
+)
+def test_what_cannot_be_is_one_line(arguments, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.ply").unlink(missing_ok=True)
+    monkeypatch.setattr("gavo_jax.cli.run.check_options", lambda *_: "cloud")
+    register_device("player", Player)
+    register_device("empty", lambda: Player(frames=()))
+    register_device("odd", lambda: Player(camera=replace(CAMERA, width=320)))
+    done = runner(capsys)("run", *arguments, "--method", "small-newton")
+    assert done.status == 2
+    assert words in done.err and done.err.count("\n") == 1
