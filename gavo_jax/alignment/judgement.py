@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from gavo_jax.alignment.evidence import Evidence as Chosen
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.visits import Level, Search
@@ -31,6 +32,8 @@ MIN_EXPLAINED_DEPTH = 0.9
 DOUBTFUL_DEVIATION = 0.005
 """metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
 where it is not, depth that disagrees says that it is wrong."""
+MIN_EVIDENCE, MIN_SEEN_EVIDENCE = 0.7, 1.8
+"""Evidence, of all readings and of those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
 MAX_RIVAL = 1.1
 """Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
 MAX_DEPARTURE = 1e-4
@@ -47,6 +50,7 @@ def conclude(
     options: AlignmentOptions,
     history: jax.Array,
     centre: Float[Array, "4 4"],
+    chosen_by: Chosen | None = None,
 ) -> Alignment:
     """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
     found = search.islands[0]
@@ -62,7 +66,7 @@ def conclude(
     motion = problem.origin
     evidence = _examine(problem, residuals)
     covariance = _covariance(evidence, objective)
-    findings = as_findings(find_against(evidence, covariance, objective, search.rival))
+    findings = as_findings(find_against(evidence, covariance, objective, search.rival, chosen_by))
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
         motion,
@@ -137,7 +141,11 @@ def _covariance(evidence: Evidence, objective: Objective) -> Float[Array, "6 6"]
 
 
 def find_against(
-    evidence: Evidence, covariance: Float[Array, "6 6"], objective: Objective, rival: Float[Array, ""]
+    evidence: Evidence,
+    covariance: Float[Array, "6 6"],
+    objective: Objective,
+    rival: Float[Array, ""],
+    chosen_by: Chosen | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
     """All that can be said against a motion, by its status; docs/status.md gives the reasons."""
     motion, model, explained = evidence.motion, evidence.model, evidence.explained
@@ -147,6 +155,8 @@ def find_against(
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
+    if chosen_by is not None:
+        unexplained = (chosen_by.seen < MIN_SEEN_EVIDENCE) | (chosen_by.total < MIN_EVIDENCE)
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     return {
         AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
+from gavo_jax.alignment.contest import hold_contest
+from gavo_jax.alignment.evidence import Evidence, evidence
 from gavo_jax.alignment.judgement import conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
@@ -21,6 +23,7 @@ from gavo_jax.alignment.visits import (
     Exchanged,
     Level,
     Search,
+    comparable_objective,
     fit_objective,
     level_objective,
     stack_levels,
@@ -83,6 +86,7 @@ def align_views(
     record: bool = False,
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
+    hypotheses: Float[Array, "h 4 4"] | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -101,6 +105,8 @@ def align_views(
         exchanged: What the `symmetric` error needs; None where it is not asked for.
         readout: Time that the shutter takes from the first to the last row, over the time between anchor and target;
             None where all rows are exposed at once.
+        hypotheses: Motions that compete with what a search with `refine` finds, wherever they lie; not-a-number where
+            there is none.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
@@ -119,22 +125,63 @@ def align_views(
     of_levels = partial(_search_levels, target=target, options=options, exchanged=exchanged, centre=origins[0])
     places = np.array([levels.numbers.index(number) for number in searched])
     rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
-    search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
+
+    evidence_found = None
     if options.refine:
+        known = guesses if hypotheses is None else jnp.concatenate([guesses, hypotheses])
+
+        def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
+            search, *kept = of_levels(solver, start, rows, keys[:-1], record=record)
+            return search.islands[: options.islands[searched[-1]]], tuple(kept)
+
         # nothing competes any more, and the brightness can be told from the first level on
         visits = visits._replace(is_first=jnp.zeros_like(visits.is_first), islands=jnp.ones_like(visits.islands))
         finest = jax.tree.map(lambda leaf: leaf[-1], visits)
-        winner = search._replace(islands=search.islands[:1], box=start.box)
-        search, *_ = of_levels(REFINER, winner, visits, jax.random.split(key, (len(levels.numbers), 1)), record=False)
+        refiner = partial(_refine, target=target, options=options, exchanged=exchanged, start=start)
+        coarse = jax.tree.map(lambda leaf: leaf[: max(1, len(levels.numbers) - 1)], visits)
+        judge = comparable_objective(jax.tree.map(lambda leaf: leaf[-1], coarse), target, options, exchanged)
+
+        def refine(motion: jax.Array) -> tuple[jax.Array, Evidence]:
+            refined = refiner(coarse, motion).islands[0]
+            return refined, evidence(judge, refined)
+
+        contest, (histories, populations) = hold_contest(known, search_islands, refine)
+        winner, evidence_found = contest.winner
+        search = refiner(visits, winner)._replace(rival=contest.lead)
+    else:
+        search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
+    centre = search.islands[0] if options.refine else origins[0]
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, origins[0]), populations
+    return conclude(objective, search, finest, options, history, centre, evidence_found), populations
+
+
+def _refine(
+    visits: Level,
+    motion: Float[Array, "4 4"],
+    *,
+    target: Target,
+    options: AlignmentOptions,
+    exchanged: Exchanged | None,
+    start: Search,
+) -> Search:
+    """Take one motion through some levels by Gauss-Newton."""
+    count = visits.number.shape[0]
+    alone = start._replace(islands=motion[None])
+    keys = jax.random.split(jax.random.key(0), (count, 1))
+    options = replace(options, min_overlap=jnp.minimum(options.min_overlap, REFINED_OVERLAP))
+    search, *_ = _search_levels(
+        REFINER, alone, visits, keys, target=target, options=options, exchanged=exchanged, centre=motion, record=False
+    )
+    return search
 
 
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
-"""What refines the winner of many islands. These are small and widely spread, which finds the basin, not its middle: on
+"""What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
 pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+REFINED_OVERLAP = 0.1
+"""Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
 
 
 def _search_levels(
@@ -173,6 +220,10 @@ def _search_levels(
             about = centre if options.precondition else search.islands[0]
             motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
             population = Population(level.number, log(motions), error, log(about), search.box)
+        if options.refine and places > 1:
+            judge = comparable_objective(level, target, options, exchanged)
+            total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
+            errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
         order = best_distinct(found, errors, places)
         rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
@@ -220,14 +271,30 @@ def _origins(
     """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
     about it.
     """
-    objective = level_objective(level, target, options, unchanged_brightness(level))
-    leader = _best_guess(objective, guesses)
     places = max(options.islands)
+    if options.refine:
+        judge = comparable_objective(level, target, options, exchanged)
+
+        def errors_of(motions: jax.Array) -> jax.Array:
+            return -jax.lax.map(lambda motion: evidence(judge, motion).total, motions, batch_size=SCOUTS_AT_ONCE)
+
+        leader = guesses[jnp.argmin(errors_of(guesses))] if len(guesses) > 1 else guesses[0]
+    else:
+        objective = level_objective(level, target, options, unchanged_brightness(level))
+        leader = _best_guess(objective, guesses)
+        if options.scouts:
+            objective, _ = fit_objective(level, target, options, leader, exchanged)
+
+        def errors_of(motions: jax.Array) -> jax.Array:
+            return objective.score(motions)[0]
+
     if not options.scouts:
         return jnp.repeat(leader[None], places, axis=0)
-    objective, _ = fit_objective(level, target, options, leader, exchanged)
     spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
     twists = spread * jax.random.normal(key, (options.scouts, 6))
     scouts = leader @ exp(twists.at[0].set(0.0))
-    errors, _ = objective.score(scouts)
-    return scouts[best_distinct(scouts, errors, places)]
+    return scouts[best_distinct(scouts, errors_of(scouts), places)]
+
+
+SCOUTS_AT_ONCE = 32
+"""Motions whose evidence is taken side by side."""
