@@ -1,10 +1,10 @@
 """How much two frames speak for a motion, on one scale for candidates of any origin.
 
-E's scales are estimated at the motion that a level starts from, and what leaves the view is paid for by a share of them.
-Errors of candidates that were found on different ways are therefore not comparable. The evidence is: every candidate is
-asked about the same points of both frames, with the same fixed scales. Each point in view tells by how much likelier its
-residuals are under "the frames match here" than under "any two pixels of these frames meet here". A point that is out of
-view, or hidden behind something nearer, tells nothing.
+E's scales are estimated at the motion that a level starts from, and what leaves the view is paid for by a share of
+them. Errors of candidates that were found on different ways are therefore not comparable. The evidence is: every
+candidate is asked about the same points of both frames, with the same fixed scales. Each point in view tells by how
+much likelier its residuals are under "the frames match here" than under "any two pixels of these frames meet here". A
+point that is out of view, or hidden behind something nearer, tells nothing.
 """
 
 from dataclasses import replace
@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gavo_jax.objective.error import Objective
-from gavo_jax.se3 import rigid_inverse
+from gavo_jax.se3 import exp, rigid_inverse
 
 POINTS = 1200
 """Points of a frame, evenly spread, that are asked at most."""
@@ -32,6 +32,12 @@ HIDDEN = 3.0
 """Depth scales by which the target must be nearer than a point for the point to be hidden."""
 
 
+STEP = (0.05, 0.05)
+"""Metres and radians: a motion this far off must explain the frames worse,"""
+LEAST_FALL = 0.1
+"""by this share of the evidence."""
+
+
 class Evidence(NamedTuple):
     """What the frames say of a motion."""
 
@@ -41,6 +47,15 @@ class Evidence(NamedTuple):
     """The same over the points that are seen alone: how well the frames match where they do overlap."""
 
 
+class Held(NamedTuple):
+    """What the evidence says of six directions."""
+
+    held: Bool[Array, " 6"]
+    """Whether it falls both ways"""
+    steps: Float[Array, "6 6"]
+    """within these, as columns."""
+
+
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Evidence:
     """What both directions of an objective say of one motion; its scales and brightness do not count."""
     sums = _sums(objective, target_T_reference)
@@ -48,6 +63,25 @@ def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> E
         sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference))
     total, seen, readings = sums
     return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, 0.02 * readings + 1.0))
+
+
+def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], directions: Float[Array, "6 6"]) -> Held:
+    """Whether the evidence falls on both sides of a motion, along some directions of a step on the reference's side.
+
+    Gradients of frames that lie far apart agree little, and a direction may seem open for that alone. What counts then
+    is whether a motion that is off by `STEP` explains the frames as well.
+
+    Args:
+        objective: Of the level that the evidence is taken on.
+        target_T_reference: The motion.
+        directions: As columns, metres and radians, of any length.
+    """
+    size = jnp.repeat(jnp.stack([jnp.float32(step) for step in STEP]), 3)
+    steps = directions / jnp.max(jnp.abs(directions) / size[:, None], axis=0)
+    aside = target_T_reference @ exp(jnp.concatenate([steps.T, -steps.T]))
+    fallen = jax.lax.map(lambda motion: evidence(objective, motion).total, aside, batch_size=12)
+    here = evidence(objective, target_T_reference).total
+    return Held(jnp.all(fallen.reshape(2, 6) < here - LEAST_FALL * jnp.abs(here), axis=0), steps)
 
 
 def _sums(objective: Objective, motion: Float[Array, "4 4"]) -> Float[Array, " 3"]:

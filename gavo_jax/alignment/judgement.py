@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.alignment.evidence import Evidence as Chosen
+from gavo_jax.alignment.evidence import Held, is_held
+from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.visits import Level, Search
@@ -50,7 +52,7 @@ def conclude(
     options: AlignmentOptions,
     history: jax.Array,
     centre: Float[Array, "4 4"],
-    chosen_by: Chosen | None = None,
+    judge: Objective | None = None,
 ) -> Alignment:
     """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
     found = search.islands[0]
@@ -65,7 +67,14 @@ def conclude(
         residuals = objective.residuals(problem.origin)
     motion = problem.origin
     evidence = _examine(problem, residuals)
-    covariance = _covariance(evidence, objective)
+    held, chosen_by = None, None
+    if judge is not None:
+        held = is_held(judge, motion, evidence.information.directions)
+        chosen_by = evidence_for(judge, motion)
+    covariance = _covariance(evidence, objective, held)
+    if held is not None:
+        determined = evidence.information.determined | held.held
+        evidence = evidence._replace(information=evidence.information._replace(determined=determined))
     findings = as_findings(find_against(evidence, covariance, objective, search.rival, chosen_by))
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
@@ -126,16 +135,19 @@ def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
-def _covariance(evidence: Evidence, objective: Objective) -> Float[Array, "6 6"]:
+def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
     """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
-    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree); a direction
-    that is not determined has `UNDETERMINED`.
+    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
+    that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
     """
     inverse = evidence.information.inverse()
     least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
     covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
     open_ways = jnp.where(evidence.information.determined, 0.0, evidence.information.directions)
     open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
+    if held is not None:
+        known_within = jnp.where(evidence.information.determined, 0.0, 0.5 * held.steps)
+        open_ways = jnp.where(held.held, known_within, open_ways)
     covariance += open_ways @ open_ways.T
     return 0.5 * (covariance + covariance.T)
 

@@ -14,7 +14,7 @@ from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-from gavo_jax.features import FeatureKind, feature_motion
+from gavo_jax.features import feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings

@@ -7,15 +7,15 @@ starts the next level from its best candidate.
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
-from gavo_jax.alignment.contest import hold_contest
-from gavo_jax.alignment.evidence import Evidence, evidence
+from gavo_jax.alignment.contest import Entry, hold_contest
+from gavo_jax.alignment.evidence import evidence
 from gavo_jax.alignment.judgement import conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
@@ -34,6 +34,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.sampling import Target
 from gavo_jax.objective.error import Objective
+from gavo_jax.objective.estimates import Brightness
 from gavo_jax.objective.points import Reference
 from gavo_jax.objective.preconditioning import preconditioner, reference_curvature, unconditioner
 from gavo_jax.objective.problem import Problem
@@ -115,66 +116,50 @@ def align_views(
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
     searched = visited_levels(levels.numbers, options)
     keys = jax.random.split(key, (len(searched) + 1, max(options.islands)))
-    origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
-    start = Search(
-        islands=origins,
-        box=jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
-        brightness=unchanged_brightness(first),
-        rival=jnp.float32(jnp.inf),
-    )
-    of_levels = partial(_search_levels, target=target, options=options, exchanged=exchanged, centre=origins[0])
+    box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
     places = np.array([levels.numbers.index(number) for number in searched])
     rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
+    frames = Frames(target, options, exchanged)
 
-    evidence_found = None
+    def search_all() -> tuple[Search, Float[Array, "4 4"], tuple[jax.Array, Population | None]]:
+        origins = _origins(frames, first, guesses, keys[-1, 0])
+        start = Search(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
+        search, *kept = _search_levels(frames, solver, start, rows, keys[:-1], centre=origins[0], record=record)
+        return search, origins[0], (kept[0], kept[1])
+
+    judge = None
     if options.refine:
         known = guesses if hypotheses is None else jnp.concatenate([guesses, hypotheses])
+        judged = finest if len(levels.numbers) == 1 else jax.tree.map(lambda leaf: leaf[-2], visits)
+        judge = comparable_objective(judged, target, options, exchanged)
 
         def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
-            search, *kept = of_levels(solver, start, rows, keys[:-1], record=record)
-            return search.islands[: options.islands[searched[-1]]], tuple(kept)
+            search, _, kept = search_all()
+            return search.islands[: options.islands[searched[-1]]], kept
 
-        # nothing competes any more, and the brightness can be told from the first level on
-        visits = visits._replace(is_first=jnp.zeros_like(visits.is_first), islands=jnp.ones_like(visits.islands))
-        finest = jax.tree.map(lambda leaf: leaf[-1], visits)
-        refiner = partial(_refine, target=target, options=options, exchanged=exchanged, start=start)
-        coarse = jax.tree.map(lambda leaf: leaf[: max(1, len(levels.numbers) - 1)], visits)
-        judge = comparable_objective(jax.tree.map(lambda leaf: leaf[-1], coarse), target, options, exchanged)
+        def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
+            search = _refine(frames, visits, motion, box, is_last)
+            return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
 
-        def refine(motion: jax.Array) -> tuple[jax.Array, Evidence]:
-            refined = refiner(coarse, motion).islands[0]
-            return refined, evidence(judge, refined)
-
-        contest, (histories, populations) = hold_contest(known, search_islands, refine)
-        winner, evidence_found = contest.winner
-        search = refiner(visits, winner)._replace(rival=contest.lead)
+        winner, lead, (histories, populations) = hold_contest(known, search_islands, refine)
+        search = Search(winner.motion[None], box, winner.brightness, lead)
+        centre = winner.motion
+        # nothing competes any more
+        finest = finest._replace(is_first=jnp.array(False), islands=jnp.int32(1))
     else:
-        search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
-    centre = search.islands[0] if options.refine else origins[0]
+        search, centre, (histories, populations) = search_all()
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, centre, evidence_found), populations
+    return conclude(objective, search, finest, options, history, centre, judge), populations
 
 
-def _refine(
-    visits: Level,
-    motion: Float[Array, "4 4"],
-    *,
-    target: Target,
-    options: AlignmentOptions,
-    exchanged: Exchanged | None,
-    start: Search,
-) -> Search:
-    """Take one motion through some levels by Gauss-Newton."""
-    count = visits.number.shape[0]
-    alone = start._replace(islands=motion[None])
-    keys = jax.random.split(jax.random.key(0), (count, 1))
-    options = replace(options, min_overlap=jnp.minimum(options.min_overlap, REFINED_OVERLAP))
-    search, *_ = _search_levels(
-        REFINER, alone, visits, keys, target=target, options=options, exchanged=exchanged, centre=motion, record=False
-    )
-    return search
+class Frames(NamedTuple):
+    """What all searches of a pair have in common."""
+
+    target: Target
+    options: AlignmentOptions
+    exchanged: Exchanged | None
 
 
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
@@ -184,20 +169,43 @@ REFINED_OVERLAP = 0.1
 """Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
 
 
+def _refine(
+    frames: Frames,
+    visits: Level,
+    motion: Float[Array, "4 4"],
+    box: Float[Array, " 6"],
+    is_last: Bool[Array, ""],
+) -> Search:
+    """Take one motion by Gauss-Newton through all levels but the finest one, or through that alone. Nothing else
+    competes, so that the brightness can be told from the first level on.
+    """
+    count = visits.number.shape[0]
+    is_finest = jnp.arange(count) == count - 1
+    visited = (is_finest == is_last) | (count == 1)
+    visits = visits._replace(is_first=jnp.zeros(count, bool), islands=visited.astype(jnp.int32))
+    options = replace(frames.options, min_overlap=jnp.minimum(frames.options.min_overlap, REFINED_OVERLAP))
+    views = visits.reference.grey.shape[1]
+    start = Search(motion[None], box, Brightness.unchanged(views), jnp.float32(jnp.inf))
+    keys = jax.random.split(jax.random.key(0), (count, 1))
+    return _search_levels(frames._replace(options=options), REFINER, start, visits, keys, centre=motion, record=False)[
+        0
+    ]
+
+
 def _search_levels(
+    frames: Frames,
     solver: Solver,
     start: Search,
     visits: Level,
     keys: PRNGKeyArray,
     *,
-    target: Target,
-    options: AlignmentOptions,
-    exchanged: Exchanged | None,
     centre: Float[Array, "4 4"],
     record: bool,
 ) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
-    """Search some levels, one after the other, each from the islands of the last; held about a centre."""
-    places = start.islands.shape[0]
+    """Search some levels, one after the other, each from the islands of the last; held about a centre.
+    A level without islands is left out.
+    """
+    (target, options, exchanged), places = frames, start.islands.shape[0]
 
     def search_level(
         search: Search, visit: tuple[Level, PRNGKeyArray]
@@ -229,7 +237,14 @@ def _search_levels(
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
         return search, (history[order[0]], population)
 
-    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys))
+    def visit_level(search: Search, visit: tuple[Level, PRNGKeyArray]) -> Any:
+        blank = jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(search_level, search, visit)[1]
+        )
+        return jax.lax.cond(visit[0].islands > 0, search_level, lambda search, _: (search, blank), search, visit)
+
+    visit_one = visit_level if solver is REFINER else search_level
+    search, (histories, populations) = jax.lax.scan(visit_one, start, (visits, keys))
     return search, histories, populations
 
 
@@ -260,17 +275,11 @@ def _search_island(
     return problem.transform(solution.x), solution.error, solution.history, trail
 
 
-def _origins(
-    level: Level,
-    target: Target,
-    options: AlignmentOptions,
-    guesses: Float[Array, "g 4 4"],
-    key: PRNGKeyArray,
-    exchanged: Exchanged | None,
-) -> Float[Array, "i 4 4"]:
+def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray) -> Float[Array, "i 4 4"]:
     """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
     about it.
     """
+    target, options, exchanged = frames
     places = max(options.islands)
     if options.refine:
         judge = comparable_objective(level, target, options, exchanged)
@@ -292,9 +301,14 @@ def _origins(
         return jnp.repeat(leader[None], places, axis=0)
     spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
     twists = spread * jax.random.normal(key, (options.scouts, 6))
+    if options.refine:  # far ones as well as near ones
+        farther = jnp.linspace(*SCOUT_RANGE, options.scouts)[:, None]
+        twists *= jnp.concatenate([jnp.repeat(farther, 3, axis=1), jnp.ones((options.scouts, 3))], axis=1)
     scouts = leader @ exp(twists.at[0].set(0.0))
     return scouts[best_distinct(scouts, errors_of(scouts), places)]
 
 
+SCOUT_RANGE = (0.5, 2.0)
+"""Factors on the scouts' translations, from the first one to the last."""
 SCOUTS_AT_ONCE = 32
 """Motions whose evidence is taken side by side."""
