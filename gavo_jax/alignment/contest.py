@@ -16,8 +16,11 @@ STRONG_TOTAL, STRONG_SEEN = 1.5, 2.8
 """Evidence beyond which a motion that was known before needs no search."""
 LEAST_EVIDENCE = 0.02
 """Evidence counts as this much at least where two are compared."""
-KNOWN, FOUND, WINNER = range(3)
-"""Rounds: what is known before, what a search finds, and the best of both on the finest level."""
+KNOWN, FOUND, ALIASES, WINNER = range(4)
+"""Rounds: what is known before, what a search finds, what a pattern that repeats would have instead of the best of
+both, and the best of all on the finest level."""
+LEAST_RIVAL = 0.5
+"""Evidence, over the winner's, from which on another mode is a rival."""
 
 
 class Entry(NamedTuple):
@@ -33,6 +36,7 @@ class Entry(NamedTuple):
 def hold_contest(
     known: Float[Array, "g 4 4"],
     search: Callable[[], tuple[Float[Array, "k 4 4"], Any]],
+    aliases: Float[Array, "a 4 4"],
     refine: Callable[[Float[Array, "4 4"], Bool[Array, ""]], Entry],
 ) -> tuple[Entry, Float[Array, ""], Any]:
     """Refine what is known and, unless that decides it, what a search finds; then the winner on the finest level.
@@ -40,19 +44,20 @@ def hold_contest(
     Args:
         known: Motions that need no search; not-a-number where there is none.
         search: Finds K motions, and whatever else is to be kept of it.
+        aliases: Motions after which the reference looks as before (`aliases.self_motions`).
         refine: Takes a motion to the nearest one that the frames speak for, on the finest level or on all the others.
 
     Returns:
-        The winner; its evidence over that of the best motion of another mode, +inf without one; and what was kept of
-        the search, zeros if there was none.
+        The winner; its evidence over a rival's of another mode, of the points that each sees, +inf without one; and
+        what was kept of the search, zeros if there was none.
     """
     found, kept = jax.eval_shape(search)
-    places = max(known.shape[0], found.shape[0])
+    places = max(known.shape[0], found.shape[0], aliases.shape[0])
     like = partial(jax.tree.map, lambda leaf: jnp.zeros(leaf.shape, leaf.dtype))
     nothing = jnp.float32(-jnp.inf)
     blank: Entry = like(jax.eval_shape(lambda: refine(jnp.eye(4), jnp.array(True))))
     blank = blank._replace(motion=jnp.eye(4), evidence=Evidence(nothing, nothing))
-    rows = jax.tree.map(lambda leaf: jnp.tile(leaf[None, None], (3, places) + (1,) * leaf.ndim), blank)
+    rows = jax.tree.map(lambda leaf: jnp.tile(leaf[None, None], (WINNER + 1, places) + (1,) * leaf.ndim), blank)
 
     def fill(motions: jax.Array) -> jax.Array:
         return jnp.full((places, 4, 4), jnp.nan).at[: motions.shape[0]].set(motions)
@@ -64,10 +69,14 @@ def hold_contest(
             motions, kept = search()
             return fill(motions), kept
 
-        def choose_now() -> tuple[jax.Array, Any]:
-            return fill(_best(rows).motion[None]), kept
-
-        entries, kept = jax.lax.switch(number, (lambda: (fill(known), kept), search_now, choose_now))
+        best = _best(rows).motion
+        rounds = (
+            lambda: (fill(known), kept),
+            search_now,
+            lambda: (fill(best @ aliases), kept),
+            lambda: (fill(best[None]), kept),
+        )
+        entries, kept = jax.lax.switch(number, rounds)
 
         def enter(motion: jax.Array) -> Entry:
             exists = jnp.all(jnp.isfinite(motion))
@@ -77,7 +86,7 @@ def hold_contest(
         rows = jax.tree.map(lambda all, new: all.at[number].set(new), rows, entered)
         best = _best(rows).evidence
         decided = (best.total > STRONG_TOTAL) & (best.seen > STRONG_SEEN)
-        return jnp.where((number == KNOWN) & decided, WINNER, number + 1), rows, kept
+        return jnp.where((number == KNOWN) & decided, ALIASES, number + 1), rows, kept
 
     start = (jnp.int32(KNOWN), rows, like(kept))
     _, rows, kept = jax.lax.while_loop(lambda carry: carry[0] <= WINNER, hold_round, start)
@@ -85,7 +94,7 @@ def hold_contest(
 
 
 def _competing(rows: Entry) -> Entry:
-    """All that competed, [2 K]."""
+    """All that competed."""
     return jax.tree.map(lambda leaf: leaf[:WINNER].reshape(-1, *leaf.shape[2:]), rows)
 
 
@@ -96,6 +105,11 @@ def _best(rows: Entry) -> Entry:
 
 
 def _lead(rows: Entry) -> Float[Array, ""]:
-    """The winner's evidence over that of the best motion of another mode."""
-    entries = _competing(rows)
-    return rival_error(entries.motion, 1.0 / jnp.maximum(entries.evidence.total, LEAST_EVIDENCE))
+    """The winner's evidence over a rival's, of the points that each sees: a motion is no better for a larger overlap
+    alone.
+    """
+    entries, best = _competing(rows), _best(rows).evidence
+    total, seen = entries.evidence
+    costs = jnp.where(total >= LEAST_RIVAL * best.total, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
+    costs = costs.at[jnp.argmax(total)].set(0.0)
+    return rival_error(entries.motion, costs) * 1e-6 * best.seen

@@ -56,11 +56,11 @@ class Held(NamedTuple):
     """within these, as columns."""
 
 
-def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Evidence:
+def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
     """What both directions of an objective say of one motion; its scales and brightness do not count."""
-    sums = _sums(objective, target_T_reference)
+    sums = _sums(objective, target_T_reference, points)
     if objective.backward is not None:
-        sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference))
+        sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference), points)
     total, seen, readings = sums
     return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, 0.02 * readings + 1.0))
 
@@ -84,9 +84,9 @@ def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], direc
     return Held(jnp.all(fallen.reshape(2, 6) < here - LEAST_FALL * jnp.abs(here), axis=0), steps)
 
 
-def _sums(objective: Objective, motion: Float[Array, "4 4"]) -> Float[Array, " 3"]:
+def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Float[Array, " 3"]:
     """Sum of the logarithms, points that tell something, and readings, of one direction."""
-    few = replace(objective.sample(POINTS), backward=None, centred=None)
+    few = replace(objective.sample(points), backward=None, centred=None)
     reference = few.reference
     has_reading = reference.points.q > 0
     r = few.residuals(motion)

@@ -140,14 +140,22 @@ def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> 
     residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
     that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
     """
-    inverse = evidence.information.inverse()
+    information, known_within = evidence.information, jnp.zeros((6, 6))
+    if held is not None:
+        # the gradients of frames far apart may tell less of a direction than that the motion is not a step off
+        ways = information.directions
+        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (evidence.scatter @ ways), axis=0))
+        half = 0.5 * jnp.max(jnp.abs(held.steps), axis=0) / jnp.max(jnp.abs(ways), axis=0)
+        vague = held.held & (~information.determined | (spread > half * jnp.abs(information.curvature)))
+        information = information._replace(determined=information.determined & ~vague)
+        known_within = jnp.where(vague, 0.5 * held.steps, 0.0)
+    inverse = information.inverse()
     least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
     covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
-    open_ways = jnp.where(evidence.information.determined, 0.0, evidence.information.directions)
+    is_open = ~information.determined & jnp.all(known_within == 0.0, axis=0)
+    open_ways = jnp.where(is_open, information.directions, 0.0)
     open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
-    if held is not None:
-        known_within = jnp.where(evidence.information.determined, 0.0, 0.5 * held.steps)
-        open_ways = jnp.where(held.held, known_within, open_ways)
+    open_ways += known_within
     covariance += open_ways @ open_ways.T
     return 0.5 * (covariance + covariance.T)
 

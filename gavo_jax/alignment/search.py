@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
+from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
 from gavo_jax.alignment.evidence import evidence
 from gavo_jax.alignment.judgement import conclude
@@ -135,13 +136,18 @@ def align_views(
 
         def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
             search, _, kept = search_all()
-            return search.islands[: options.islands[searched[-1]]], kept
+            return search.islands[: min(FINALISTS, options.islands[searched[-1]])], kept
 
         def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
             search = _refine(frames, visits, motion, box, is_last)
             return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
 
-        winner, lead, (histories, populations) = hold_contest(known, search_islands, refine)
+        aliases = jnp.full((1, 4, 4), jnp.nan)
+        if exchanged is not None:
+            second = jax.tree.map(lambda leaf: leaf[min(1, len(levels.numbers) - 1)], visits)
+            itself = comparable_objective(second, target, options, None)
+            aliases = self_motions(itself, exchanged.target)
+        winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine)
         search = Search(winner.motion[None], box, winner.brightness, lead)
         centre = winner.motion
         # nothing competes any more
@@ -165,6 +171,8 @@ class Frames(NamedTuple):
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
 """What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
 pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+FINALISTS = 4
+"""Islands, those that most speaks for, whose motions are refined."""
 REFINED_OVERLAP = 0.1
 """Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
 
@@ -285,7 +293,9 @@ def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: 
         judge = comparable_objective(level, target, options, exchanged)
 
         def errors_of(motions: jax.Array) -> jax.Array:
-            return -jax.lax.map(lambda motion: evidence(judge, motion).total, motions, batch_size=SCOUTS_AT_ONCE)
+            return -jax.lax.map(
+                lambda motion: evidence(judge, motion, SCOUTED_POINTS).total, motions, batch_size=SCOUTS_AT_ONCE
+            )
 
         leader = guesses[jnp.argmin(errors_of(guesses))] if len(guesses) > 1 else guesses[0]
     else:
@@ -310,5 +320,7 @@ def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: 
 
 SCOUT_RANGE = (0.5, 2.0)
 """Factors on the scouts' translations, from the first one to the last."""
+SCOUTED_POINTS = 480
+"""Points of a frame that a scout's evidence is taken on."""
 SCOUTS_AT_ONCE = 32
 """Motions whose evidence is taken side by side."""
