@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import jax
 
-from gavo_jax.features import FeatureKind
 from gavo_jax.image.levels import PointsPerLevel
 from gavo_jax.objective.losses import Loss, geman_mcclure
 from gavo_jax.solvers.base import Solver, static
@@ -31,7 +30,7 @@ class AlignmentOptions:
         refine: Whether the solver stops where islands no longer compete, and the motion that won is taken through all
             levels once more by Gauss-Newton, with the brightness and scales that are known only then (static).
         features: What finds the features of two images whose motion competes with what the search finds, where `refine`
-            is set (static): `sift`, `orb`, both or none. Of single pairs alone (`align`), not of a sequence's frames.
+            is set (static). Of single pairs alone (`align`), not of a sequence's frames.
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points a level, one a square block of pixels, or an entry a level (static);
@@ -65,7 +64,7 @@ class AlignmentOptions:
     centred: bool = static(False)
     symmetric: bool = static(False)
     refine: bool = static(False)
-    features: tuple[FeatureKind, ...] = static(())
+    features: Literal["off", "sift", "orb", "both"] = static("off")
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: PointsPerLevel = static(4800)

@@ -57,7 +57,7 @@ def hold_contest(
     nothing = jnp.float32(-jnp.inf)
     blank: Entry = like(jax.eval_shape(lambda: refine(jnp.eye(4), jnp.array(True))))
     blank = blank._replace(motion=jnp.eye(4), evidence=Evidence(nothing, nothing))
-    rows = jax.tree.map(lambda leaf: jnp.tile(leaf[None, None], (WINNER + 1, places) + (1,) * leaf.ndim), blank)
+    rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (WINNER + 1, places, *leaf.shape)), blank)
 
     def fill(motions: jax.Array) -> jax.Array:
         return jnp.full((places, 4, 4), jnp.nan).at[: motions.shape[0]].set(motions)
@@ -69,12 +69,12 @@ def hold_contest(
             motions, kept = search()
             return fill(motions), kept
 
-        best = _best(rows).motion
+        leader = _best(rows).motion
         rounds = (
             lambda: (fill(known), kept),
             search_now,
-            lambda: (fill(best @ aliases), kept),
-            lambda: (fill(best[None]), kept),
+            lambda: (fill(leader @ aliases), kept),
+            lambda: (fill(leader[None]), kept),
         )
         entries, kept = jax.lax.switch(number, rounds)
 

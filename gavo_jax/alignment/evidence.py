@@ -34,7 +34,7 @@ HIDDEN = 3.0
 
 STEP = (0.05, 0.05)
 """Metres and radians: a motion this far off must explain the frames worse,"""
-LEAST_FALL = 0.1
+LEAST_FALL = 0.03
 """by this share of the evidence."""
 
 

@@ -14,7 +14,7 @@ from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-from gavo_jax.features import feature_motion
+from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
@@ -76,11 +76,19 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     )
 
 
+FEATURE_KINDS: dict[str, tuple[FeatureKind, ...]] = {
+    "off": (),
+    "sift": ("sift",),
+    "orb": ("orb",),
+    "both": ("sift", "orb"),
+}
+
+
 def with_features(
-    guesses: Float[Array, "b 4 4"], sides: Any, camera: Camera, settings: Settings
+    guesses: Float[Array | np.ndarray, "b 4 4"], sides: Any, camera: Camera, settings: Settings
 ) -> Float[Array, "b g 4 4"]:
     """Each pair's guess, and the motions that its features ask for, one per kind; not-a-number where there is none."""
-    kinds = settings.alignment.features if settings.alignment.refine else ()
+    kinds = FEATURE_KINDS[settings.alignment.features] if settings.alignment.refine else ()
     found = np.full((len(sides[0].grey), len(kinds), 4, 4), np.nan, np.float32)
     for row, pair in enumerate(zip(*sides[0], *sides[1], strict=True) if kinds else ()):
         before, after = ((np.asarray(grey), np.asarray(depth)) for grey, depth in (pair[:2], pair[2:]))

@@ -125,8 +125,10 @@ def align_views(
     def search_all() -> tuple[Search, Float[Array, "4 4"], tuple[jax.Array, Population | None]]:
         origins = _origins(frames, first, guesses, keys[-1, 0])
         start = Search(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
-        search, *kept = _search_levels(frames, solver, start, rows, keys[:-1], centre=origins[0], record=record)
-        return search, origins[0], (kept[0], kept[1])
+        search, histories, populations = _search_levels(
+            frames, solver, start, rows, keys[:-1], centre=origins[0], record=record
+        )
+        return search, origins[0], (histories, populations)
 
     judge = None
     if options.refine:

@@ -55,7 +55,7 @@ def align_batch_sharded(
         raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
-    guesses = with_features(guesses, sides, camera, settings)
+    guesses = with_features(np.asarray(guesses), sides, camera, settings)
     mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:

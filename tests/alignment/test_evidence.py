@@ -25,14 +25,14 @@ def wall(shift: float, period: float | None) -> tuple[np.ndarray, np.ndarray]:
     u, v = np.meshgrid(np.arange(CAMERA.width) - shift, np.arange(CAMERA.height))
     along = u if period is None else u % period
     waves = np.random.default_rng(3).normal(0, 0.12, (12, 2))
-    grey = 128 + 22 * sum(np.sin(a * along + b * v + i) for i, (a, b) in enumerate(waves))
+    grey = 128 + 22 * np.sum([np.sin(a * along + b * v + i) for i, (a, b) in enumerate(waves)], axis=0)
     return np.clip(grey, 0, 255).astype(np.uint8), np.full(grey.shape, CAMERA.depth_scale).astype(np.uint16)
 
 
 @jax.jit
 def ask(before: Any, after: Any, motions: jax.Array) -> Any:
     """Evidence of some motions, whether the first is held, and where the first frame looks like itself."""
-    pyramids = [build_pyramid(*images, CAMERA.depth_scale, 3) for images in (before, after)]
+    pyramids = [build_pyramid(grey, depth, CAMERA.depth_scale, 3) for grey, depth in (before, after)]
     options = AlignmentOptions(symmetric=True, points=1200, **{k: getattr(PLAIN_ERROR, k) for k in ("loss", "depth")})
     [objective] = objectives_of(pyramids[0], pyramids[1], CAMERA, (2,), options, motions[0])
     assert objective.backward is not None
