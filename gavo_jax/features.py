@@ -58,8 +58,8 @@ class FeatureMotion(NamedTuple):
 @cache
 def _detector(kind: FeatureKind) -> Any:
     if kind == "sift":
-        return cv2.SIFT_create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST)
-    return cv2.ORB_create(nfeatures=KEYPOINTS)
+        return cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST)
+    return cv2.ORB.create(nfeatures=KEYPOINTS)
 
 
 def detect(
@@ -116,7 +116,7 @@ def solve_motion(reference: Features, target: Features, camera: Camera) -> Featu
         return None
     if not found or inliers is None:
         return None
-    chosen = inliers[:, 0]
+    chosen: np.ndarray = np.asarray(inliers)[:, 0]
     for _ in range(REFINEMENTS):
         if len(chosen) < FEWEST:
             return None

@@ -96,18 +96,19 @@ WIDE_OBJECTIVE = AlignmentOptions(
     centred=True,
     symmetric=True,
     refine=True,
+    features="both",
     points=19200,
     estimation_points=None,
     depth_weight=(0.3, 0.3, 1.0, 0.3, 0.3),
     doubt_depth=True,
-    islands=(1, 1, 4, 16, 96),
+    islands=(1, 1, 1, 16, 96),
     scouts=8192,
-    scout_spread=(0.1, 0.5),
+    scout_spread=(0.2, 0.5),
     min_overlap=0.2,
     outside_cost=1.0,
-    bounds=(0.5, 1.05),
+    bounds=(1.0, 1.2),
 )
-"""Motions of up to 0.5 m and 60° from the guess: thousands of scouts, then 96 populations at level 4, of which the
+"""Motions of up to 1 m and 70° from the guess: thousands of scouts, then 96 populations at level 4, of which the
 16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
 so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
 their mean, and while a few modes compete that grey tells apart badly, depth counts as much as grey does; at the finest

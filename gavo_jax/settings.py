@@ -29,6 +29,8 @@ class AlignmentOptions:
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
         refine: Whether the solver stops where islands no longer compete, and the motion that won is taken through all
             levels once more by Gauss-Newton, with the brightness and scales that are known only then (static).
+        features: What finds the features of two images whose motion competes with what the search finds, where `refine`
+            is set (static). Of single pairs alone (`align`), not of a sequence's frames.
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points per level, one per square block of pixels, or an entry per level
@@ -62,6 +64,7 @@ class AlignmentOptions:
     centred: bool = static(False)
     symmetric: bool = static(False)
     refine: bool = static(False)
+    features: Literal["off", "sift", "orb", "both"] = static("off")
     robust_scale: bool = static(True)
     precondition: bool = static(True)
     points: PointsPerLevel = static(4800)

@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from gavo_jax.alignment.evidence import Evidence as Chosen
+from gavo_jax.alignment.evidence import Held, is_held
+from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.visits import Level, Search
@@ -31,6 +34,8 @@ MIN_EXPLAINED_DEPTH = 0.9
 DOUBTFUL_DEVIATION = 0.005
 """metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
 where it is not, depth that disagrees says that it is wrong."""
+MIN_EVIDENCE, MIN_SEEN_EVIDENCE = 0.7, 1.8
+"""Evidence, of all readings and of those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
 MAX_RIVAL = 1.1
 """Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
 MAX_DEPARTURE = 1e-4
@@ -47,6 +52,7 @@ def conclude(
     options: AlignmentOptions,
     history: jax.Array,
     centre: Float[Array, "4 4"],
+    judge: Objective | None = None,
 ) -> Alignment:
     """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
     found = search.islands[0]
@@ -61,8 +67,15 @@ def conclude(
         residuals = objective.residuals(problem.origin)
     motion = problem.origin
     evidence = _examine(problem, residuals)
-    covariance = _covariance(evidence, objective)
-    findings = as_findings(find_against(evidence, covariance, objective, search.rival))
+    held, chosen_by = None, None
+    if judge is not None:
+        held = is_held(judge, motion, evidence.information.directions)
+        chosen_by = evidence_for(judge, motion)
+    covariance = _covariance(evidence, objective, held)
+    if held is not None:
+        determined = evidence.information.determined | held.held
+        evidence = evidence._replace(information=evidence.information._replace(determined=determined))
+    findings = as_findings(find_against(evidence, covariance, objective, search.rival, chosen_by))
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
         motion,
@@ -122,22 +135,37 @@ def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
-def _covariance(evidence: Evidence, objective: Objective) -> Float[Array, "6 6"]:
+def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
     """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
-    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree); a direction
-    that is not determined has `UNDETERMINED`.
+    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
+    that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
     """
-    inverse = evidence.information.inverse()
+    information, known_within = evidence.information, jnp.zeros((6, 6))
+    if held is not None:
+        # the gradients of frames far apart may tell less of a direction than that the motion is not a step off
+        ways = information.directions
+        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (evidence.scatter @ ways), axis=0))
+        half = 0.5 * jnp.max(jnp.abs(held.steps), axis=0) / jnp.max(jnp.abs(ways), axis=0)
+        vague = held.held & (~information.determined | (spread > half * jnp.abs(information.curvature)))
+        information = information._replace(determined=information.determined & ~vague)
+        known_within = jnp.where(vague, 0.5 * held.steps, 0.0)
+    inverse = information.inverse()
     least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
     covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
-    open_ways = jnp.where(evidence.information.determined, 0.0, evidence.information.directions)
+    is_open = ~information.determined & jnp.all(known_within == 0.0, axis=0)
+    open_ways = jnp.where(is_open, information.directions, 0.0)
     open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
+    open_ways += known_within
     covariance += open_ways @ open_ways.T
     return 0.5 * (covariance + covariance.T)
 
 
 def find_against(
-    evidence: Evidence, covariance: Float[Array, "6 6"], objective: Objective, rival: Float[Array, ""]
+    evidence: Evidence,
+    covariance: Float[Array, "6 6"],
+    objective: Objective,
+    rival: Float[Array, ""],
+    chosen_by: Chosen | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
     """All that can be said against a motion, by its status; docs/status.md gives the reasons."""
     motion, model, explained = evidence.motion, evidence.model, evidence.explained
@@ -147,6 +175,8 @@ def find_against(
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
+    if chosen_by is not None:
+        unexplained = (chosen_by.seen < MIN_SEEN_EVIDENCE) | (chosen_by.total < MIN_EVIDENCE)
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     return {
         AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,

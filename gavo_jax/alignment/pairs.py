@@ -14,6 +14,7 @@ from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
+from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
@@ -34,14 +35,18 @@ def _align_images(
     solver: Solver,
     options: AlignmentOptions,
     key: PRNGKeyArray,
-    guess: Float[Array, "4 4"],
+    guesses: Float[Array, "g 4 4"],
 ) -> Alignment:
     before, after = (
         build_pyramid(frame.grey, frame.depth, camera.depth_scale, LEVELS) for frame in (reference, target)
     )
     levels = levels_of(camera, solver, options)
     view, packed, exchanged = prepare_pair(before, after, camera, levels, options)
-    return align_views((view,), packed, camera, levels, solver, options, key, guess[None], exchanged=exchanged)[0]
+    guess, hypotheses = guesses[:1], guesses[1:]
+    found, _ = align_views(
+        (view,), packed, camera, levels, solver, options, key, guess, exchanged=exchanged, hypotheses=hypotheses
+    )
+    return found
 
 
 POINTS_SIDE_BY_SIDE = 2**20
@@ -59,8 +64,8 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     """
 
     def one(i):
-        reference, target, key, guess = jax.tree.map(lambda leaf: leaf[i], (references, targets, keys, guesses))
-        return _align_images(reference, target, camera, solver, options, key, guess)
+        reference, target, key, own = jax.tree.map(lambda leaf: leaf[i], (references, targets, keys, guesses))
+        return _align_images(reference, target, camera, solver, options, key, own)
 
     if jax.default_backend() != "cpu":
         at_once = max(1, POINTS_SIDE_BY_SIDE // levels_of(camera, solver, options).most_points)
@@ -71,8 +76,31 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     )
 
 
+FEATURE_KINDS: dict[str, tuple[FeatureKind, ...]] = {
+    "off": (),
+    "sift": ("sift",),
+    "orb": ("orb",),
+    "both": ("sift", "orb"),
+}
+
+
+def with_features(
+    guesses: Float[Array | np.ndarray, "b 4 4"], sides: Any, camera: Camera, settings: Settings
+) -> Float[Array, "b g 4 4"]:
+    """Each pair's guess, and the motions that its features ask for, one per kind; not-a-number where there is none."""
+    kinds = FEATURE_KINDS[settings.alignment.features] if settings.alignment.refine else ()
+    found = np.full((len(sides[0].grey), len(kinds), 4, 4), np.nan, np.float32)
+    for row, pair in enumerate(zip(*sides[0], *sides[1], strict=True) if kinds else ()):
+        before, after = ((np.asarray(grey), np.asarray(depth)) for grey, depth in (pair[:2], pair[2:]))
+        for place, kind in enumerate(kinds):
+            motion = feature_motion(before, after, camera.rectified(), kind)
+            if motion is not None:
+                found[row, place] = motion.target_T_reference
+    return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
+
+
 def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
-    """`align_batch` of images that are stacked already, its results on the device."""
+    """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device."""
     count = len(guesses)
     if count == 1:  # padded to two rows, of which one is computed
         sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
@@ -122,7 +150,7 @@ def align(
     sides = [stacked_images([frame], camera) for frame in (reference, target)]
     keys = (jax.random.key(0) if key is None else key)[None]
     guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
-    result = align_rows(sides, camera, settings, keys, guesses)
+    result = align_rows(sides, camera, settings, keys, with_features(guesses, sides, camera, settings))
     return on_host(jax.tree.map(lambda leaf: leaf[0], result))
 
 
@@ -163,6 +191,7 @@ def align_batch(
         raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
+    guesses = with_features(guesses, sides, camera, settings)
     return on_host(align_rows(sides, camera, settings, keys, guesses))
 
 

@@ -7,13 +7,16 @@ starts the next level from its best candidate.
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
+from gavo_jax.alignment.aliases import self_motions
+from gavo_jax.alignment.contest import Entry, hold_contest
+from gavo_jax.alignment.evidence import evidence
 from gavo_jax.alignment.judgement import conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
@@ -21,6 +24,7 @@ from gavo_jax.alignment.visits import (
     Exchanged,
     Level,
     Search,
+    comparable_objective,
     fit_objective,
     level_objective,
     stack_levels,
@@ -31,6 +35,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.sampling import Target
 from gavo_jax.objective.error import Objective
+from gavo_jax.objective.estimates import Brightness
 from gavo_jax.objective.points import Reference
 from gavo_jax.objective.preconditioning import preconditioner, reference_curvature, unconditioner
 from gavo_jax.objective.problem import Problem
@@ -83,6 +88,7 @@ def align_views(
     record: bool = False,
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
+    hypotheses: Float[Array, "h 4 4"] | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -101,6 +107,8 @@ def align_views(
         exchanged: What the `symmetric` error needs; None where it is not asked for.
         readout: Time that the shutter takes from the first to the last row, over the time between anchor and target;
             None where all rows are exposed at once.
+        hypotheses: Motions that compete with what a search with `refine` finds, wherever they lie; not-a-number where
+            there is none.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
@@ -109,48 +117,105 @@ def align_views(
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
     searched = visited_levels(levels.numbers, options)
     keys = jax.random.split(key, (len(searched) + 1, max(options.islands)))
-    origins = _origins(first, target, options, guesses, keys[-1, 0], exchanged)
-    start = Search(
-        islands=origins,
-        box=jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3),
-        brightness=unchanged_brightness(first),
-        rival=jnp.float32(jnp.inf),
-    )
-    of_levels = partial(_search_levels, target=target, options=options, exchanged=exchanged, centre=origins[0])
+    box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
     places = np.array([levels.numbers.index(number) for number in searched])
     rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
-    search, histories, populations = of_levels(solver, start, rows, keys[:-1], record=record)
+    frames = Frames(target, options, exchanged)
+
+    def search_all() -> tuple[Search, Float[Array, "4 4"], tuple[jax.Array, Population | None]]:
+        origins = _origins(frames, first, guesses, keys[-1, 0])
+        start = Search(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
+        search, histories, populations = _search_levels(
+            frames, solver, start, rows, keys[:-1], centre=origins[0], record=record
+        )
+        return search, origins[0], (histories, populations)
+
+    judge = None
     if options.refine:
-        # nothing competes any more, and the brightness can be told from the first level on
-        visits = visits._replace(is_first=jnp.zeros_like(visits.is_first), islands=jnp.ones_like(visits.islands))
-        finest = jax.tree.map(lambda leaf: leaf[-1], visits)
-        winner = search._replace(islands=search.islands[:1], box=start.box)
-        search, *_ = of_levels(REFINER, winner, visits, jax.random.split(key, (len(levels.numbers), 1)), record=False)
+        known = guesses if hypotheses is None else jnp.concatenate([guesses, hypotheses])
+        judged = finest if len(levels.numbers) == 1 else jax.tree.map(lambda leaf: leaf[-2], visits)
+        judge = comparable_objective(judged, target, options, exchanged)
+
+        def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
+            search, _, kept = search_all()
+            return search.islands[: min(FINALISTS, options.islands[searched[-1]])], kept
+
+        def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
+            search = _refine(frames, visits, motion, box, is_last)
+            return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
+
+        aliases = jnp.full((1, 4, 4), jnp.nan)
+        if exchanged is not None:
+            second = jax.tree.map(lambda leaf: leaf[min(1, len(levels.numbers) - 1)], visits)
+            itself = comparable_objective(second, target, options, None)
+            aliases = self_motions(itself, exchanged.target)
+        winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine)
+        search = Search(winner.motion[None], box, winner.brightness, lead)
+        centre = winner.motion
+        # nothing competes any more
+        finest = finest._replace(is_first=jnp.array(False), islands=jnp.int32(1))
+    else:
+        search, centre, (histories, populations) = search_all()
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, origins[0]), populations
+    return conclude(objective, search, finest, options, history, centre, judge), populations
+
+
+class Frames(NamedTuple):
+    """What all searches of a pair have in common."""
+
+    target: Target
+    options: AlignmentOptions
+    exchanged: Exchanged | None
 
 
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
-"""What refines the winner of many islands. These are small and widely spread, which finds the basin, not its middle: on
+"""What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
 pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+FINALISTS = 4
+"""Islands, those that most speaks for, whose motions are refined."""
+REFINED_OVERLAP = 0.1
+"""Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
+
+
+def _refine(
+    frames: Frames,
+    visits: Level,
+    motion: Float[Array, "4 4"],
+    box: Float[Array, " 6"],
+    is_last: Bool[Array, ""],
+) -> Search:
+    """Take one motion by Gauss-Newton through all levels but the finest one, or through that alone. Nothing else
+    competes, so that the brightness can be told from the first level on.
+    """
+    count = visits.number.shape[0]
+    is_finest = jnp.arange(count) == count - 1
+    visited = (is_finest == is_last) | (count == 1)
+    visits = visits._replace(is_first=jnp.zeros(count, bool), islands=visited.astype(jnp.int32))
+    options = replace(frames.options, min_overlap=jnp.minimum(frames.options.min_overlap, REFINED_OVERLAP))
+    views = visits.reference.grey.shape[1]
+    start = Search(motion[None], box, Brightness.unchanged(views), jnp.float32(jnp.inf))
+    keys = jax.random.split(jax.random.key(0), (count, 1))
+    return _search_levels(frames._replace(options=options), REFINER, start, visits, keys, centre=motion, record=False)[
+        0
+    ]
 
 
 def _search_levels(
+    frames: Frames,
     solver: Solver,
     start: Search,
     visits: Level,
     keys: PRNGKeyArray,
     *,
-    target: Target,
-    options: AlignmentOptions,
-    exchanged: Exchanged | None,
     centre: Float[Array, "4 4"],
     record: bool,
 ) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
-    """Search some levels, one after the other, each from the islands of the last; held about a centre."""
-    places = start.islands.shape[0]
+    """Search some levels, one after the other, each from the islands of the last; held about a centre.
+    A level without islands is left out.
+    """
+    (target, options, exchanged), places = frames, start.islands.shape[0]
 
     def search_level(
         search: Search, visit: tuple[Level, PRNGKeyArray]
@@ -173,12 +238,23 @@ def _search_levels(
             about = centre if options.precondition else search.islands[0]
             motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
             population = Population(level.number, log(motions), error, log(about), search.box)
+        if options.refine and places > 1:
+            judge = comparable_objective(level, target, options, exchanged)
+            total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
+            errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
         order = best_distinct(found, errors, places)
         rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
         search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
         return search, (history[order[0]], population)
 
-    search, (histories, populations) = jax.lax.scan(search_level, start, (visits, keys))
+    def visit_level(search: Search, visit: tuple[Level, PRNGKeyArray]) -> Any:
+        blank = jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(search_level, search, visit)[1]
+        )
+        return jax.lax.cond(visit[0].islands > 0, search_level, lambda search, _: (search, blank), search, visit)
+
+    visit_one = visit_level if solver is REFINER else search_level
+    search, (histories, populations) = jax.lax.scan(visit_one, start, (visits, keys))
     return search, histories, populations
 
 
@@ -209,25 +285,44 @@ def _search_island(
     return problem.transform(solution.x), solution.error, solution.history, trail
 
 
-def _origins(
-    level: Level,
-    target: Target,
-    options: AlignmentOptions,
-    guesses: Float[Array, "g 4 4"],
-    key: PRNGKeyArray,
-    exchanged: Exchanged | None,
-) -> Float[Array, "i 4 4"]:
+def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray) -> Float[Array, "i 4 4"]:
     """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
     about it.
     """
-    objective = level_objective(level, target, options, unchanged_brightness(level))
-    leader = _best_guess(objective, guesses)
+    target, options, exchanged = frames
     places = max(options.islands)
+    if options.refine:
+        judge = comparable_objective(level, target, options, exchanged)
+
+        def errors_of(motions: jax.Array) -> jax.Array:
+            return -jax.lax.map(
+                lambda motion: evidence(judge, motion, SCOUTED_POINTS).total, motions, batch_size=SCOUTS_AT_ONCE
+            )
+
+        leader = guesses[jnp.argmin(errors_of(guesses))] if len(guesses) > 1 else guesses[0]
+    else:
+        objective = level_objective(level, target, options, unchanged_brightness(level))
+        leader = _best_guess(objective, guesses)
+        if options.scouts:
+            objective, _ = fit_objective(level, target, options, leader, exchanged)
+
+        def errors_of(motions: jax.Array) -> jax.Array:
+            return objective.score(motions)[0]
+
     if not options.scouts:
         return jnp.repeat(leader[None], places, axis=0)
-    objective, _ = fit_objective(level, target, options, leader, exchanged)
     spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
     twists = spread * jax.random.normal(key, (options.scouts, 6))
+    if options.refine:  # far ones as well as near ones
+        farther = jnp.linspace(*SCOUT_RANGE, options.scouts)[:, None]
+        twists *= jnp.concatenate([jnp.repeat(farther, 3, axis=1), jnp.ones((options.scouts, 3))], axis=1)
     scouts = leader @ exp(twists.at[0].set(0.0))
-    errors, _ = objective.score(scouts)
-    return scouts[best_distinct(scouts, errors, places)]
+    return scouts[best_distinct(scouts, errors_of(scouts), places)]
+
+
+SCOUT_RANGE = (0.5, 2.0)
+"""Factors on the scouts' translations, from the first one to the last."""
+SCOUTED_POINTS = 480
+"""Points of a frame that a scout's evidence is taken on."""
+SCOUTS_AT_ONCE = 32
+"""Motions whose evidence is taken side by side."""

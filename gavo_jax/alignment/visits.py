@@ -176,6 +176,18 @@ def fit_objective(
     return objective, brightness
 
 
+def comparable_objective(
+    level: Level, target: Target, options: AlignmentOptions, exchanged: Exchanged | None
+) -> Objective:
+    """What `evidence` asks of one level: nothing in it depends on a motion."""
+    objective = level_objective(level, target, options, unchanged_brightness(level))
+    if exchanged is None or level.exchanged is None:
+        return objective
+    readout = None if level.readout is None else -level.readout
+    swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)
+    return replace(objective, backward=comparable_objective(swapped, exchanged.target, options, None))
+
+
 def objectives_of(
     reference: Pyramid,
     target: Pyramid,
@@ -206,4 +218,5 @@ class Search(NamedTuple):
     """Half-widths of the search box, metres and radians."""
     brightness: Brightness
     rival: Float[Array, ""]
-    """Error of the second-best mode over the best one's, where several islands competed last; +inf without one."""
+    """How far the second-best mode is behind, where several competed: the best one's evidence over its, or its error
+    over the best one's; +inf without one."""

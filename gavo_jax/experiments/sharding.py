@@ -9,7 +9,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment.pairs import Images, align_rows, stacked_images
+from gavo_jax.alignment.pairs import Images, align_rows, stacked_images, with_features
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
@@ -55,6 +55,7 @@ def align_batch_sharded(
         raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
+    guesses = with_features(np.asarray(guesses), sides, camera, settings)
     mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:

@@ -1,0 +1,115 @@
+"""Candidates of any origin, refined and chosen by the evidence for them: prior, features, what the islands found."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.alignment.evidence import Evidence
+from gavo_jax.alignment.modes import rival_error
+from gavo_jax.objective.estimates import Brightness
+
+STRONG_TOTAL, STRONG_SEEN = 1.5, 2.8
+"""Evidence beyond which a motion that was known before needs no search."""
+LEAST_EVIDENCE = 0.02
+"""Evidence counts as this much at least where two are compared."""
+KNOWN, FOUND, ALIASES, WINNER = range(4)
+"""Rounds: what is known before, what a search finds, what a pattern that repeats would have instead of the best of
+both, and the best of all on the finest level."""
+LEAST_RIVAL = 0.5
+"""Evidence, over the winner's, from which on another mode is a rival."""
+
+
+class Entry(NamedTuple):
+    """A motion that competes, or [K] of them."""
+
+    motion: Float[Array, "*k 4 4"]
+    evidence: Evidence
+    """-inf in a place that is empty."""
+    brightness: Brightness
+    """With which the motion was refined."""
+
+
+def hold_contest(
+    known: Float[Array, "g 4 4"],
+    search: Callable[[], tuple[Float[Array, "k 4 4"], Any]],
+    aliases: Float[Array, "a 4 4"],
+    refine: Callable[[Float[Array, "4 4"], Bool[Array, ""]], Entry],
+) -> tuple[Entry, Float[Array, ""], Any]:
+    """Refine what is known and, unless that decides it, what a search finds; then the winner on the finest level.
+
+    Args:
+        known: Motions that need no search; not-a-number where there is none.
+        search: Finds K motions, and whatever else is to be kept of it.
+        aliases: Motions after which the reference looks as before (`aliases.self_motions`).
+        refine: Takes a motion to the nearest one that the frames speak for, on the finest level or on all the others.
+
+    Returns:
+        The winner; its evidence over a rival's of another mode, of the points that each sees, +inf without one; and
+        what was kept of the search, zeros if there was none.
+    """
+    found, kept = jax.eval_shape(search)
+    places = max(known.shape[0], found.shape[0], aliases.shape[0])
+    like = partial(jax.tree.map, lambda leaf: jnp.zeros(leaf.shape, leaf.dtype))
+    nothing = jnp.float32(-jnp.inf)
+    blank: Entry = like(jax.eval_shape(lambda: refine(jnp.eye(4), jnp.array(True))))
+    blank = blank._replace(motion=jnp.eye(4), evidence=Evidence(nothing, nothing))
+    rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (WINNER + 1, places, *leaf.shape)), blank)
+
+    def fill(motions: jax.Array) -> jax.Array:
+        return jnp.full((places, 4, 4), jnp.nan).at[: motions.shape[0]].set(motions)
+
+    def hold_round(carry: tuple[jax.Array, Entry, Any]) -> tuple[jax.Array, Entry, Any]:
+        number, rows, kept = carry
+
+        def search_now() -> tuple[jax.Array, Any]:
+            motions, kept = search()
+            return fill(motions), kept
+
+        leader = _best(rows).motion
+        rounds = (
+            lambda: (fill(known), kept),
+            search_now,
+            lambda: (fill(leader @ aliases), kept),
+            lambda: (fill(leader[None]), kept),
+        )
+        entries, kept = jax.lax.switch(number, rounds)
+
+        def enter(motion: jax.Array) -> Entry:
+            exists = jnp.all(jnp.isfinite(motion))
+            return jax.lax.cond(exists, lambda: refine(motion, number == WINNER), lambda: blank)
+
+        entered = jax.lax.map(enter, entries)
+        rows = jax.tree.map(lambda all, new: all.at[number].set(new), rows, entered)
+        best = _best(rows).evidence
+        decided = (best.total > STRONG_TOTAL) & (best.seen > STRONG_SEEN)
+        return jnp.where((number == KNOWN) & decided, ALIASES, number + 1), rows, kept
+
+    start = (jnp.int32(KNOWN), rows, like(kept))
+    _, rows, kept = jax.lax.while_loop(lambda carry: carry[0] <= WINNER, hold_round, start)
+    return jax.tree.map(lambda leaf: leaf[WINNER, 0], rows), _lead(rows), kept
+
+
+def _competing(rows: Entry) -> Entry:
+    """All that competed."""
+    return jax.tree.map(lambda leaf: leaf[:WINNER].reshape(-1, *leaf.shape[2:]), rows)
+
+
+def _best(rows: Entry) -> Entry:
+    """The entry that most speaks for."""
+    entries = _competing(rows)
+    return jax.tree.map(lambda leaf: leaf[jnp.argmax(entries.evidence.total)], entries)
+
+
+def _lead(rows: Entry) -> Float[Array, ""]:
+    """The winner's evidence over a rival's, of the points that each sees: a motion is no better for a larger overlap
+    alone.
+    """
+    entries, best = _competing(rows), _best(rows).evidence
+    total, seen = entries.evidence
+    costs = jnp.where(total >= LEAST_RIVAL * best.total, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
+    costs = costs.at[jnp.argmax(total)].set(0.0)
+    return rival_error(entries.motion, costs) * 1e-6 * best.seen

@@ -1,0 +1,70 @@
+"""The evidence is one scale for all motions: the true one has most, and what is not seen tells nothing."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gavo_jax.alignment.aliases import self_motions
+from gavo_jax.alignment.evidence import evidence, is_held
+from gavo_jax.alignment.visits import objectives_of
+from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.se3 import exp
+from gavo_jax.settings import AlignmentOptions
+from tests.small import CAMERA, PLAIN_ERROR
+
+SHIFT = 12.0
+"""Pixels to the side, of a wall a metre ahead."""
+TURNED = (0.0, 0.0, 0.0, 0.0, 3.0, 0.0)
+
+
+def wall(shift: float, period: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """A wall with a pattern of dots, which may repeat to the side, and a step in its depth."""
+    u, v = np.meshgrid(np.arange(CAMERA.width) - shift, np.arange(CAMERA.height))
+    along = u if period is None else u % period
+    waves = np.random.default_rng(3).normal(0, 0.12, (12, 2))
+    grey = 128 + 22 * np.sum([np.sin(a * along + b * v + i) for i, (a, b) in enumerate(waves)], axis=0)
+    return np.clip(grey, 0, 255).astype(np.uint8), np.full(grey.shape, CAMERA.depth_scale).astype(np.uint16)
+
+
+@jax.jit
+def ask(before: Any, after: Any, motions: jax.Array) -> Any:
+    """Evidence of some motions, whether the first is held, and where the first frame looks like itself."""
+    pyramids = [build_pyramid(grey, depth, CAMERA.depth_scale, 3) for grey, depth in (before, after)]
+    options = AlignmentOptions(symmetric=True, points=1200, **{k: getattr(PLAIN_ERROR, k) for k in ("loss", "depth")})
+    [objective] = objectives_of(pyramids[0], pyramids[1], CAMERA, (2,), options, motions[0])
+    assert objective.backward is not None
+    totals = jax.vmap(lambda motion: evidence(objective, motion).total)(motions)
+    held = is_held(objective, motions[0], jnp.eye(6)).held
+    return totals, held, self_motions(objective, objective.backward.target)
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[bool, Any]:
+    """Of a wall that repeats and one that does not."""
+    twists = np.zeros((4, 6), np.float32)
+    twists[0, 0] = twists[1, 0] = SHIFT / CAMERA.fx
+    twists[1, 0] -= 0.05
+    twists[3] = TURNED
+    motions = exp(jnp.asarray(twists))
+    return {
+        repeats: jax.device_get(ask(wall(0.0, period), wall(SHIFT, period), motions))
+        for repeats, period in ((True, 40.0), (False, None))
+    }
+
+
+def test_the_true_motion_has_most(answers: dict[bool, Any]) -> None:
+    (true, aside, still, turned), held, _ = answers[False]
+    assert true > 0.8 and true > 1.2 * max(aside, still)
+    assert held[0] and held[1], "to the side, up and down"
+    assert turned == 0.0, "what is not seen tells nothing"
+
+
+def test_a_pattern_that_repeats_looks_like_itself(answers: dict[bool, Any]) -> None:
+    assert not np.isfinite(answers[False][2]).any()
+    found = answers[True][2]
+    found = found[np.isfinite(found).all(axis=(1, 2))]
+    assert len(found) >= 2
+    np.testing.assert_allclose(np.abs(found[:2, 0, 3]) * CAMERA.fx, 40.0, atol=6.0)
