@@ -1,6 +1,6 @@
 """How near a run's map lies to what a frame saw that is no part of it, and a picture of the map.
 
-Tracks a clip, fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.mapping`), and prints how
+Tracks a clip, fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.scene_map`), and prints how
 far the left-out frame's depth, put where the run says that it was taken, lies from it. Needs the extra `[map]`.
 
     python benchmarks/map.py
@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gavo_jax import Reading, open_source, run_odometry
-from gavo_jax.mapping import VOXEL, SceneMap, build_map, import_open3d
 from gavo_jax.output.screen import number, print_table
+from gavo_jax.scene_map import VOXEL, SceneMap, build_map, import_open3d
 from gavo_jax.trajectory import inverse
 
 FARTHEST = 4.0

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.mapping import Shape, build_map, check_map, check_voxel, import_open3d, warn_of
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.screen import say, waiting
+from gavo_jax.scene_map import Shape, build_map, check_map, check_voxel, import_open3d, warn_of
 
 
 def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:

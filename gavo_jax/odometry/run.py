@@ -18,7 +18,7 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from gavo_jax.mapping import SceneMap
+    from gavo_jax.scene_map import SceneMap
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class OdometryRun:
         Raises:
             GavoError: Open3D cannot be imported, an absurd voxel, or the run does not hold its sequence.
         """
-        from gavo_jax.mapping import build_map
+        from gavo_jax.scene_map import build_map
 
         if self.sequence is None:
             raise GavoError("the run does not hold the sequence that it was run over: no map can be made of it")

@@ -9,8 +9,8 @@ from small import CAMERA
 
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.mapping import MapBuilder, build_map, check_map, check_voxel, import_open3d
 from gavo_jax.odometry.run import OdometryRun
+from gavo_jax.scene_map import MapBuilder, build_map, check_map, check_voxel, import_open3d
 
 needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
