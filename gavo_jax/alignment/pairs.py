@@ -71,10 +71,13 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     )
 
 
-def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
-    """`align_batch` of images that are stacked already, its results on the device."""
-    count = len(guesses)
-    if count == 1:  # padded to two rows, of which one is computed
+def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
+    """`align_batch` of images that are stacked already, its results on the device; of the first `count` rows alone,
+    where that is given.
+    """
+    rows = len(guesses)
+    count = rows if count is None else count
+    if rows == 1:  # padded to two rows, of which one is computed
         sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
     result = _align_pairs(
         jnp.int32(count),
@@ -85,7 +88,7 @@ def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
         keys,
         guesses,
     )
-    return jax.tree.map(lambda leaf: leaf[:count], result)
+    return jax.tree.map(lambda leaf: leaf[:rows], result)
 
 
 def align(

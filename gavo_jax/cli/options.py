@@ -72,6 +72,8 @@ class Run(Search, Source):
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    loops: bool = False
+    """Keep a map of keyframes and correct the trajectory where the camera comes back to a place (docs/loops.md)."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False

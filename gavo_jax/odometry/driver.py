@@ -217,7 +217,7 @@ def clock_of(before: Progress, frame: Frame) -> Clock:
     return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay), np.uint32(before.last_index))
 
 
-def _unwatched(frame: Frame | None, step: Step | None) -> None:
+def unwatched(frame: Frame | None, step: Step | None) -> None:
     """Nobody looks."""
 
 
@@ -227,7 +227,7 @@ def track(
     *,
     seed: int = 0,
     odometry: Odometry | None = None,
-    watch: Callable[[Frame | None, Step | None], None] = _unwatched,
+    watch: Callable[[Frame | None, Step | None], None] = unwatched,
 ) -> Iterator[Step]:
     """Stream a sequence: a step for every frame after the first, as it is done.
 

@@ -9,8 +9,10 @@ import numpy as np
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Odometry, Step, track
-from gavo_jax.odometry.metrics import RunMetrics, compute_metrics
+from gavo_jax.mapping.correction import correct, loop_figures
+from gavo_jax.mapping.mapper import Loops, Mapper
+from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
+from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -24,6 +26,10 @@ class OdometryRun:
     trajectory: Trajectory
     steps: list[Step]
     metrics: RunMetrics
+    odometry: Trajectory | None = None
+    """With loops: the trajectory before they corrected it,"""
+    loops: Loops | None = None
+    """and the map."""
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -61,17 +67,28 @@ def run_odometry(
     sequence.check()
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
     odometry = Odometry(sequence.camera, settings, seed=seed)
-    compile_seconds = odometry.warm_up()
+    mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []
     start = time.perf_counter()
-    for step in track(sequence, odometry=odometry):
+    for step in track(sequence, odometry=odometry, watch=mapper.watch if mapper else unwatched):
         steps.append(step)
         if on_step is not None:
             on_step(step)
+    causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    loops = mapper.finish() if mapper else None
+    if loops is not None:
+        trajectory = correct(causal, loops)
     seconds = time.perf_counter() - start
-    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
-    return OdometryRun(trajectory, steps, {"sequence": sequence.name, "seed": seed, **metrics})
+
+    def figures(of: Trajectory) -> Metrics:
+        return compute_metrics(of, sequence.ground_truth, steps, seconds, compile_seconds)
+
+    metrics: RunMetrics = {"sequence": sequence.name, "seed": seed, **figures(trajectory)}
+    if loops is None:
+        return OdometryRun(trajectory, steps, metrics)
+    metrics.update(errors_before(figures(causal)) | loop_figures(loops))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return OdometryRun(trajectory, steps, metrics, causal, loops)
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:

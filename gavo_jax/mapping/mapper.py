@@ -1,0 +1,162 @@
+"""The map of a run: keyframes as it goes, loops between them, and in the end a trajectory that fits all of them."""
+
+import time
+from collections import OrderedDict
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.mapping.candidates import find_candidates
+from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
+from gavo_jax.mapping.motions import carried, log
+from gavo_jax.mapping.pose_graph import Solution, optimise, require_gtsam
+from gavo_jax.mapping.verification import Edge, Verifier
+from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import inverse
+
+STEP_FLOOR = 5e-4
+"""Metres and radians that a step of the odometry is off by beside what its covariance says."""
+UNKNOWN = 1.0
+"""Metres and radians that stand for a motion of which nothing is known."""
+GROWTH = 1.25
+"""Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
+FIRST = 20
+"""Keyframes of the first one."""
+REMEMBERED = 64
+"""Frames whose covariance is kept, for those that refer to them."""
+
+
+class Loops(NamedTuple):
+    """What a map says of a run."""
+
+    keyframes: list[Keyframe]
+    edges: list[Edge]
+    solution: Solution
+
+
+class Mapper:
+    """Watches a run and keeps its map.
+
+    Args:
+        camera: Of the frames, without distortion.
+        most: Keyframes that keep their images.
+
+    Raises:
+        GavoError: GTSAM is not installed.
+    """
+
+    def __init__(self, camera: Camera, most: int = MAX_IMAGES):
+        require_gtsam()
+        self.keyframes = Keyframes(camera, most)
+        self.verifier = Verifier(self.keyframes.camera)
+        self.edges: list[Edge] = []
+        self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
+        self._first: Frame | None = None
+        self._next = FIRST
+
+    def warm_up(self) -> float:
+        """Compile what is needed, or load it; the seconds this took."""
+        start = time.perf_counter()
+        self.verifier.warm_up()
+        return time.perf_counter() - start
+
+    def watch(self, frame: Frame | None, step: Step | None) -> None:
+        """Take notice of a frame (None: it could not be read) with its step (None: it is the first)."""
+        if step is None:
+            self._first = frame
+            return
+        alignment, stamp = step.alignment, _key(step.timestamp)
+        if step.lost:
+            return
+        seconds = step.timestamp - step.reference_timestamp
+        motion = np.asarray(alignment.target_T_reference, np.float64)
+        twist = log(motion) / max(seconds, 1e-3)
+        if self._first is not None and not self.keyframes.all:
+            self._add(self._first, 0, 0, np.eye(4), twist)
+            self._know(_key(step.reference_timestamp), np.zeros((6, 6)))
+        self._first = None
+        before = self._known.get(_key(step.reference_timestamp))
+        covariance = np.asarray(alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
+        if before is not None and np.isfinite(covariance).all():
+            self._know(stamp, carried(motion, before + covariance))
+        if frame is not None and self.is_due(step):
+            self._add(frame, step.index, step.segment, step.world_T_camera, twist)
+            self._known.clear()
+            self._know(stamp, np.zeros((6, 6)))
+
+    def is_due(self, step: Step) -> bool:
+        """Whether a step's frame will become a keyframe."""
+        return not step.lost and self.keyframes.is_due(step.world_T_camera, step.segment)
+
+    def replay(self, sequence: Sequence, steps: list[Step]) -> None:
+        """Take notice of what a run did before it was cut short; only what becomes a keyframe is decoded."""
+        self.watch(_decoded(sequence, 0), None)
+        for step in steps:
+            self.watch(_decoded(sequence, step.index) if self.is_due(step) else None, step)
+
+    def finish(self) -> Loops:
+        """Look for loops once more with what is known now, and optimise."""
+        for _ in range(2):
+            solution = self._optimise()
+            found = len(self.edges)
+            for keyframe in self.keyframes.searchable():
+                self._close(keyframe)
+            if len(self.edges) == found:
+                break
+        else:
+            solution = self._optimise()
+        return Loops(self.keyframes.all, self.edges, solution)
+
+    def _know(self, stamp: str, covariance: np.ndarray) -> None:
+        self._known[stamp] = covariance
+        if len(self._known) > REMEMBERED:
+            self._known.popitem(last=False)
+
+    def _add(self, frame: Frame, index: int, segment: int, pose: np.ndarray, twist: np.ndarray) -> None:
+        step = self._known.get(_key(frame.timestamp))
+        keyframe = self.keyframes.add(frame, index, segment, pose, twist, step)
+        self._close(keyframe)
+        if len(self.keyframes.all) >= self._next:
+            self._next = int(GROWTH * len(self.keyframes.all)) + 1
+            self._optimise()
+
+    def _close(self, keyframe: Keyframe) -> None:
+        """Look for loops that a keyframe closes."""
+        earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
+        candidates = find_candidates(keyframe, earlier, self.keyframes.camera)
+        for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
+            keyframe.tried[candidate.earlier.number] = candidate.later_T_earlier
+            if edge is not None:
+                keyframe.linked.add(edge.earlier)
+                self.edges.append(edge)
+
+    def _optimise(self) -> Solution:
+        """Move all keyframes to where odometry and loops want them."""
+        keyframes = self.keyframes.all
+        poses = np.stack([keyframe.world_T_camera for keyframe in keyframes])
+        solution = optimise(poses, self._odometry(), self.edges)
+        for keyframe, pose in zip(keyframes, solution.world_T_camera, strict=True):
+            keyframe.world_T_camera = pose
+        return solution
+
+    def _odometry(self) -> list[Edge]:
+        keyframes = self.keyframes.all
+        edges = []
+        for a, b in zip(keyframes, keyframes[1:], strict=False):
+            covariance = UNKNOWN**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
+            edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
+        return edges
+
+
+def _decoded(sequence: Sequence, index: int) -> Frame | None:
+    try:
+        return sequence[index]
+    except FrameError:
+        return None
+
+
+def _key(stamp: float) -> str:
+    return f"{stamp:.6f}"
