@@ -19,7 +19,7 @@ from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics, errors_before
-from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.run import guessed, trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, environment
@@ -51,7 +51,13 @@ def run(options: Run) -> int:
     mapper = Mapper(sequence.camera) if settings.odometry.loops else None
     poses = ODOMETRY if mapper else TRAJECTORY
     with RunFolder(path, getattr(sequence, "files", ()), poses) as folder, viewer:
-        odometry = Odometry(sequence.camera, settings, seed=options.seed, record=viewer.wants_populations)
+        odometry = Odometry(
+            sequence.camera,
+            settings,
+            seed=options.seed,
+            record=viewer.wants_populations,
+            relocaliser=mapper,
+        )
         config = _config(options, settings, sequence)
         blank = blank_state(sequence.camera, settings.solver, settings.alignment)
         progress = folder.resume(config, blank) if options.resume else None
@@ -108,7 +114,7 @@ def _track(
     if mapper is not None:
         start = time.perf_counter()
         loops = interruptible(mapper.finish)
-        trajectory = correct(causal, loops)
+        trajectory = correct(causal, loops, guessed(steps))
         tracked_seconds = (len(tracked.steps) + 1) / speed if speed else 0.0
         speed = (len(tracked.steps) + 1) / (tracked_seconds + time.perf_counter() - start)
         trajectory.write_tum(folder.path / TRAJECTORY)

@@ -1,7 +1,7 @@
 """A run's trajectory as its map corrects it."""
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.mapper import Loops
@@ -12,8 +12,13 @@ COUNTED = 0.5
 """Weight from which on a loop counts as right."""
 
 
-def correct(odometry: Trajectory, loops: Loops) -> Trajectory:
+def correct(odometry: Trajectory, loops: Loops, guessed: Bool[np.ndarray, " n"] | None = None) -> Trajectory:
     """A trajectory of the odometry corrected as its keyframes were.
+
+    Args:
+        odometry: It.
+        loops: The map.
+        guessed: Which poses are no more than guesses; they are put between those around, where these belong together.
 
     Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
     poses which they give. Segments that a loop joins become one.
@@ -33,7 +38,20 @@ def correct(odometry: Trajectory, loops: Loops) -> Trajectory:
         else:
             nearest = after if _begins(keyframes, after, odometry.segments[i]) else before
             poses[i] = corrections[nearest] @ pose
-    return Trajectory(odometry.timestamps, poses, joined(odometry.segments, loops))
+    corrected = Trajectory(odometry.timestamps, poses, joined(odometry.segments, loops))
+    return corrected if guessed is None else bridged(corrected, guessed)
+
+
+def bridged(trajectory: Trajectory, guessed: Bool[np.ndarray, " n"]) -> Trajectory:
+    """A trajectory with the poses that were guessed between two others of one segment put on the way between these."""
+    known = np.flatnonzero(~guessed)
+    poses, segments, stamps = trajectory.world_T_camera.copy(), trajectory.segments, trajectory.timestamps
+    for start, end in zip(known, known[1:], strict=False):
+        for i in range(start + 1, end):
+            if segments[start] == segments[i] == segments[end]:
+                share = (stamps[i] - stamps[start]) / (stamps[end] - stamps[start])
+                poses[i] = between(poses[start], poses[end], float(share))
+    return Trajectory(stamps, poses, segments)
 
 
 def _begins(keyframes: list[Keyframe], number: int, segment: int) -> bool:

@@ -142,16 +142,16 @@ class Keyframes:
         last = self.all[-1]
         return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.look.distance) > SPACING)
 
-    def add(
+    def make(
         self,
         frame: Frame,
         index: int,
         segment: int,
         world_T_odometry: Float64[np.ndarray, "4 4"],
         twist: Float64[np.ndarray, " 6"],
-        step: Float64[np.ndarray, "6 6"] | None,
+        step: Float64[np.ndarray, "6 6"] | None = None,
     ) -> Keyframe:
-        """Make a frame a keyframe, and give up another one's images where there are too many.
+        """A frame as the next keyframe, which it is not yet.
 
         Args:
             frame: The images.
@@ -163,24 +163,28 @@ class Keyframes:
         """
         delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
         images = still(frame.grey, frame.depth, self.full, twist, delay)
-        world_T_camera = world_T_odometry
-        if self.all:
-            last = self.all[-1]
-            world_T_camera = last.world_T_camera @ inverse(last.world_T_odometry) @ world_T_odometry
-        keyframe = Keyframe(
+        return Keyframe(
             number=len(self.all),
             index=index,
             timestamp=frame.timestamp,
             segment=segment,
             world_T_odometry=np.array(world_T_odometry),
-            world_T_camera=world_T_camera,
+            world_T_camera=np.array(world_T_odometry),
             step=step,
             images=images,
             look=Look.of(images, self.camera),
         )
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Keep a keyframe, placed as the last one of its segment was corrected; another one's images are given up where
+        there are too many.
+        """
+        before = next((other for other in reversed(self.all) if other.segment == keyframe.segment), None)
+        if before is not None:
+            correction = before.world_T_camera @ inverse(before.world_T_odometry)
+            keyframe.world_T_camera = correction @ keyframe.world_T_odometry
         self.all.append(keyframe)
         self._thin()
-        return keyframe
 
     def searchable(self) -> list[Keyframe]:
         """Those that have their images."""

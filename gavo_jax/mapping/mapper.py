@@ -13,8 +13,9 @@ from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import Solution, optimise, require_gtsam
+from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
-from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.driver import Found, Step
 from gavo_jax.trajectory import inverse
 
 STEP_FLOOR = 5e-4
@@ -25,8 +26,10 @@ GROWTH = 1.25
 """Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
 FIRST = 20
 """Keyframes of the first one."""
+SOUGHT_OF_SEGMENT = 5
+"""Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
 REMEMBERED = 64
-"""Frames whose covariance is kept, for those that refer to them."""
+"""Frames since a keyframe whose covariance is kept, for those that refer to them."""
 
 
 class Loops(NamedTuple):
@@ -52,7 +55,9 @@ class Mapper:
         require_gtsam()
         self.keyframes = Keyframes(camera, most)
         self.verifier = Verifier(self.keyframes.camera)
+        self.recogniser = Recogniser(self.keyframes.camera, self.verifier)
         self.edges: list[Edge] = []
+        self._place: Place | None = None
         self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
         self._first: Frame | None = None
         self._next = FIRST
@@ -68,28 +73,41 @@ class Mapper:
         if step is None:
             self._first = frame
             return
-        alignment, stamp = step.alignment, _key(step.timestamp)
         if step.lost:
             return
         seconds = step.timestamp - step.reference_timestamp
-        motion = np.asarray(alignment.target_T_reference, np.float64)
+        motion = np.asarray(step.alignment.target_T_reference, np.float64)
         twist = log(motion) / max(seconds, 1e-3)
         if self._first is not None and not self.keyframes.all:
-            self._add(self._first, 0, 0, np.eye(4), twist)
-            self._know(_key(step.reference_timestamp), np.zeros((6, 6)))
+            self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist))
         self._first = None
-        before = self._known.get(_key(step.reference_timestamp))
-        covariance = np.asarray(alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
-        if before is not None and np.isfinite(covariance).all():
-            self._know(stamp, carried(motion, before + covariance))
-        if frame is not None and self.is_due(step):
-            self._add(frame, step.index, step.segment, step.world_T_camera, twist)
-            self._known.clear()
-            self._know(stamp, np.zeros((6, 6)))
+        due, is_found = self.is_due(step), step.origin == "relocalised"
+        if is_found:
+            twist = np.zeros(6)
+        else:
+            self._follow(step, motion)
+        if frame is not None and due:
+            known = None if is_found else self._known.get(_key(step.timestamp))
+            keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known)
+            self._add(keyframe)
+            if is_found:
+                self._tie(keyframe)
+
+    def find(self, frame: Frame) -> Found | None:
+        """Where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
+        self._place = None
+        lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
+        self._place = place = self.recogniser.find(lost, self.keyframes.searchable())
+        if place is None or place.edge.alignment is None:
+            return None
+        world_T_camera = place.keyframe.world_T_odometry @ place.edge.earlier_T_later
+        return Found(place.edge.alignment, place.keyframe.timestamp, world_T_camera, place.keyframe.segment)
 
     def is_due(self, step: Step) -> bool:
         """Whether a step's frame will become a keyframe."""
-        return not step.lost and self.keyframes.is_due(step.world_T_camera, step.segment)
+        if step.lost or step.origin == "relocalised":
+            return not step.lost
+        return self.keyframes.is_due(step.world_T_camera, step.segment)
 
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe is decoded."""
@@ -102,6 +120,7 @@ class Mapper:
         for _ in range(2):
             solution = self._optimise()
             found = len(self.edges)
+            self._join()
             for keyframe in self.keyframes.searchable():
                 self._close(keyframe)
             if len(self.edges) == found:
@@ -110,18 +129,55 @@ class Mapper:
             solution = self._optimise()
         return Loops(self.keyframes.all, self.edges, solution)
 
-    def _know(self, stamp: str, covariance: np.ndarray) -> None:
-        self._known[stamp] = covariance
-        if len(self._known) > REMEMBERED:
-            self._known.popitem(last=False)
+    def _join(self) -> None:
+        """Look for segments that nothing ties to others, by their first keyframes."""
+        tied = {
+            keyframes[number].segment
+            for edge in self.edges
+            for number in (edge.earlier, edge.later)
+            if (keyframes := self.keyframes.all)[edge.earlier].segment != keyframes[edge.later].segment
+        }
+        kept = self.keyframes.searchable()
+        for segment in sorted({keyframe.segment for keyframe in kept} - {0} - tied):
+            own = [keyframe for keyframe in kept if keyframe.segment == segment]
+            others = [keyframe for keyframe in kept if keyframe.segment < segment]
+            for keyframe in own[:SOUGHT_OF_SEGMENT]:
+                place = self.recogniser.find(keyframe, others)
+                if place is not None:
+                    self._link(keyframe, place.edge)
+                    break
 
-    def _add(self, frame: Frame, index: int, segment: int, pose: np.ndarray, twist: np.ndarray) -> None:
-        step = self._known.get(_key(frame.timestamp))
-        keyframe = self.keyframes.add(frame, index, segment, pose, twist, step)
+    def _follow(self, step: Step, motion: np.ndarray) -> None:
+        """Keep the covariance of the motion since the last keyframe."""
+        before = self._known.get(_key(step.reference_timestamp))
+        covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
+        if before is not None and np.isfinite(covariance).all():
+            self._known[_key(step.timestamp)] = carried(motion, before + covariance)
+            if len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+
+    def _add(self, keyframe: Keyframe) -> None:
+        self.keyframes.add(keyframe)
+        self._known.clear()
+        self._known[_key(keyframe.timestamp)] = np.zeros((6, 6))
         self._close(keyframe)
         if len(self.keyframes.all) >= self._next:
             self._next = int(GROWTH * len(self.keyframes.all)) + 1
             self._optimise()
+
+    def _tie(self, keyframe: Keyframe) -> None:
+        """Tie a keyframe to the one that it was found by, or that it is found by now: a replay has not looked yet."""
+        if self._place is None:
+            others = [other for other in self.keyframes.searchable() if other is not keyframe]
+            self._place = self.recogniser.find(keyframe, others)
+        if self._place is not None:
+            self._link(keyframe, self._place.edge._replace(later=keyframe.number))
+        self._place = None
+
+    def _link(self, keyframe: Keyframe, edge: Edge) -> None:
+        if edge.earlier not in keyframe.linked:
+            keyframe.linked.add(edge.earlier)
+            self.edges.append(edge)
 
     def _close(self, keyframe: Keyframe) -> None:
         """Look for loops that a keyframe closes."""
@@ -130,8 +186,7 @@ class Mapper:
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
             keyframe.tried[candidate.earlier.number] = candidate.later_T_earlier
             if edge is not None:
-                keyframe.linked.add(edge.earlier)
-                self.edges.append(edge)
+                self._link(keyframe, edge)
 
     def _optimise(self) -> Solution:
         """Move all keyframes to where odometry and loops want them."""

@@ -17,8 +17,8 @@ ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """GTSAM's order of a twist."""
 PROBABILITY = 0.99
 """That the residual of a right loop stays below what makes a loop count as wrong."""
-ROUNDS = 3
-"""Of optimisation and new weights for the odometry."""
+REWEIGHTED = 2
+"""Times that the odometry's weight is told anew and the graph optimised with it."""
 MIN_SCALE = 0.1
 """Of the odometry's covariance, where the loops say that it is better than its covariances."""
 FIXED = 1e-6
@@ -68,11 +68,12 @@ def optimise(poses: Float64[np.ndarray, "n 4 4"], odometry: list[Edge], loops: l
     start = gtsam.Values()
     for number, pose in enumerate(poses):
         start.insert(number, _pose(gtsam, pose))
-    for attempt in range(ROUNDS):
+    graph = _graph(gtsam, poses[0], odometry, loops, scale)
+    values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)
+    for _ in range(REWEIGHTED):
+        scale = float(np.clip(scale * _surprise(graph, values, weights, len(odometry)), MIN_SCALE, 1.0))
         graph = _graph(gtsam, poses[0], odometry, loops, scale)
         values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)
-        if attempt + 1 < ROUNDS:
-            scale = float(np.clip(scale * _surprise(graph, values, weights, len(odometry)), MIN_SCALE, 1.0))
     solved = np.stack([values.atPose3(number).matrix() for number in range(len(poses))])
     residuals = np.stack([_residual(gtsam, values, edge) for edge in loops])
     return Solution(solved, weights, residuals, scale)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.pairs import Images, align_rows
-from gavo_jax.alignment.result import on_host
+from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.mapping.candidates import MOST, Candidate
 from gavo_jax.mapping.motions import between, carried, size
@@ -48,6 +48,8 @@ class Edge(NamedTuple):
     overlap: float = 1.0
     disagreement: tuple[float, float] = (0.0, 0.0)
     """Metres and radians between there and back."""
+    alignment: Alignment | None = None
+    """There: the earlier keyframe is the reference."""
 
 
 @dataclass(frozen=True)
@@ -118,4 +120,5 @@ def _edge(candidate: Candidate, result, there: int, back: int) -> Edge | None:
         SHARED * (covariance + FLOOR**2 * np.eye(6)),
         float(min(result.overlap[there], result.overlap[back])),
         disagreement,  # pyright: ignore[reportArgumentType]
+        jax.tree.map(lambda leaf: leaf[there], result)._replace(status=AlignmentStatus.OK),
     )

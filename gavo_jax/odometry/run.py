@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
@@ -66,8 +67,8 @@ def run_odometry(
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
-    odometry = Odometry(sequence.camera, settings, seed=seed)
     mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
     compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []
     start = time.perf_counter()
@@ -78,7 +79,7 @@ def run_odometry(
     causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     loops = mapper.finish() if mapper else None
     if loops is not None:
-        trajectory = correct(causal, loops)
+        trajectory = correct(causal, loops, guessed(steps))
     seconds = time.perf_counter() - start
 
     def figures(of: Trajectory) -> Metrics:
@@ -89,6 +90,12 @@ def run_odometry(
         return OdometryRun(trajectory, steps, metrics)
     metrics.update(errors_before(figures(causal)) | loop_figures(loops))  # pyright: ignore[reportCallIssue, reportArgumentType]
     return OdometryRun(trajectory, steps, metrics, causal, loops)
+
+
+def guessed(steps: list[Step]) -> Bool[np.ndarray, " poses"]:
+    """Which poses of `trajectory_of` are guesses."""
+    kept = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
+    return np.array([False] + [step.origin == "guessed" for step in kept])
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
