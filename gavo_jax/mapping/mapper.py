@@ -12,7 +12,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.motions import carried, log
-from gavo_jax.mapping.pose_graph import Solution, optimise, require_gtsam
+from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
 from gavo_jax.odometry.driver import Found, Step
@@ -28,6 +28,8 @@ FIRST = 20
 """Keyframes of the first one."""
 SOUGHT_OF_SEGMENT = 5
 """Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
+LAST_ROUNDS = 2
+"""Times that loops are looked for once more in the end."""
 REMEMBERED = 64
 """Frames since a keyframe whose covariance is kept, for those that refer to them."""
 
@@ -60,7 +62,7 @@ class Mapper:
         self._place: Place | None = None
         self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
         self._first: Frame | None = None
-        self._next = FIRST
+        self._next, self._scale = FIRST, 1.0
 
     def warm_up(self) -> float:
         """Compile what is needed, or load it; the seconds this took."""
@@ -117,17 +119,17 @@ class Mapper:
 
     def finish(self) -> Loops:
         """Look for loops once more with what is known now, and optimise."""
-        for _ in range(2):
-            solution = self._optimise()
+        if not self.keyframes.all:
+            return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
+        for _ in range(LAST_ROUNDS):
+            self._optimise(reweighted=1)
             found = len(self.edges)
             self._join()
             for keyframe in self.keyframes.searchable():
                 self._close(keyframe)
             if len(self.edges) == found:
                 break
-        else:
-            solution = self._optimise()
-        return Loops(self.keyframes.all, self.edges, solution)
+        return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
     def _join(self) -> None:
         """Look for segments that nothing ties to others, by their first keyframes."""
@@ -188,11 +190,12 @@ class Mapper:
             if edge is not None:
                 self._link(keyframe, edge)
 
-    def _optimise(self) -> Solution:
+    def _optimise(self, reweighted: int = 0) -> Solution:
         """Move all keyframes to where odometry and loops want them."""
         keyframes = self.keyframes.all
         poses = np.stack([keyframe.world_T_camera for keyframe in keyframes])
-        solution = optimise(poses, self._odometry(), self.edges)
+        solution = optimise(poses, self._odometry(), self.edges, self._scale, reweighted)
+        self._scale = solution.scale
         for keyframe, pose in zip(keyframes, solution.world_T_camera, strict=True):
             keyframe.world_T_camera = pose
         return solution

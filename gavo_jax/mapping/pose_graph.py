@@ -50,19 +50,26 @@ def require_gtsam() -> Any:
     return gtsam
 
 
-def optimise(poses: Float64[np.ndarray, "n 4 4"], odometry: list[Edge], loops: list[Edge]) -> Solution:
+def optimise(
+    poses: Float64[np.ndarray, "n 4 4"],
+    odometry: list[Edge],
+    loops: list[Edge],
+    scale: float = 1.0,
+    reweighted: int = REWEIGHTED,
+) -> Solution:
     """Optimise a pose graph.
 
     Args:
         poses: world_T_camera to start from; the first one stays.
         odometry: Motions between neighbours, which count whatever they say.
         loops: Motions between others, each right or wrong.
+        scale: Of the odometry's covariances, to start from.
+        reweighted: Times that the scale is told anew.
 
     Raises:
         GavoError: GTSAM is not installed.
     """
     gtsam = require_gtsam()
-    scale = 1.0
     if not loops:
         return Solution(np.array(poses), np.ones(0), np.zeros((0, 6)), scale)
     start = gtsam.Values()
@@ -70,7 +77,7 @@ def optimise(poses: Float64[np.ndarray, "n 4 4"], odometry: list[Edge], loops: l
         start.insert(number, _pose(gtsam, pose))
     graph = _graph(gtsam, poses[0], odometry, loops, scale)
     values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)
-    for _ in range(REWEIGHTED):
+    for _ in range(reweighted):
         scale = float(np.clip(scale * _surprise(graph, values, weights, len(odometry)), MIN_SCALE, 1.0))
         graph = _graph(gtsam, poses[0], odometry, loops, scale)
         values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)

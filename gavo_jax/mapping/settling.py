@@ -47,24 +47,24 @@ def still(
         twist: Motion of the points in the camera, (v, w) in m/s and rad/s.
         depth_delay: Seconds from the colour image's moment to the depth image's.
     """
+    grey, depth, camera = halve_grey(grey), halve_depth(depth), camera.level(1)
     twist = np.asarray(twist, np.float32)
     if not np.any(twist):
-        return Still(halve_grey(grey), halve_depth(depth))
+        return Still(grey, depth)
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     flow = _flow(camera, u, v, _filled_inverse_depth(depth, camera), twist)
     seconds = np.float32(camera.readout) * row_time(v, camera)
-    seconds = seconds + (np.float32(camera.readout) / camera.height) * flow[1] * seconds
-    column, row = u + seconds * flow[0], v + seconds * flow[1]
-    settled = (
-        grey if not camera.readout else cv2.remap(grey, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    )
+    seconds = seconds + np.float32(camera.readout / camera.height) * flow[1] * seconds
+    if camera.readout:
+        column, row = u + seconds * flow[0], v + seconds * flow[1]
+        grey = cv2.remap(grey, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     seconds = seconds + np.float32(depth_delay)
     column, row = u + seconds * flow[0], v + seconds * flow[1]
     read = cv2.remap(depth, column, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     moved = read - seconds * (read * flow[2] + np.float32(twist[2] * camera.depth_scale))
     top = np.iinfo(np.uint16).max
-    read = np.where((read > 0) & (moved > 0) & (moved < top), np.round(moved), 0.0).astype(np.uint16)
-    return Still(halve_grey(settled), halve_depth(read))
+    depth = np.where((read > 0) & (moved > 0) & (moved < top), np.round(moved), 0.0).astype(np.uint16)
+    return Still(grey, depth)
 
 
 def _flow(

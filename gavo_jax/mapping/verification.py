@@ -13,6 +13,7 @@ from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.mapping.candidates import MOST, Candidate
 from gavo_jax.mapping.motions import between, carried, size
+from gavo_jax.mapping.settling import Still
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -66,8 +67,9 @@ class Verifier:
 
     def warm_up(self) -> None:
         """Compile the program, or load it."""
-        empty = np.zeros((2 * MOST, self.camera.height, self.camera.width))
-        self._align(Images(empty.astype(np.uint8), empty.astype(np.uint16)), np.tile(np.eye(4), (2 * MOST, 1, 1)), 0)
+        size = (MOST, self.camera.height, self.camera.width)
+        nothing = Images(np.zeros(size, np.uint8), np.zeros(size, np.uint16))
+        self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
 
     def verify(self, candidates: list[Candidate]) -> list[Edge | None]:
         """Edges of the candidates that stand; None for the others."""
@@ -77,48 +79,61 @@ class Verifier:
         return edges
 
     def _verify(self, candidates: list[Candidate]) -> list[Edge | None]:
-        earlier = [candidate.earlier.images for candidate in candidates]
-        later = [candidate.later.images for candidate in candidates]
-        assert all(images is not None for images in earlier + later)
-        guesses = np.stack([candidate.later_T_earlier for candidate in candidates])
-        guesses = np.concatenate([guesses, inverse(guesses)])
-        padding = [(0, 2 * MOST - len(guesses)), (0, 0), (0, 0)]
-        images: list[Images] = [
-            Images(*(np.pad(np.stack(rows), padding) for rows in zip(*side, strict=True)))  # pyright: ignore
-            for side in (earlier + later, later + earlier)
-        ]
-        guesses_padded = np.pad(guesses, padding)
-        result = self._align_sides(images[0], images[1], guesses_padded, len(guesses))
-        n = len(candidates)
-        return [_edge(candidates[k], result, k, k + n) for k in range(n)]
+        """Align there, and back only what stands; each from the guess, so that they are two opinions."""
+        guesses = [candidate.later_T_earlier for candidate in candidates]
+        sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
+        there = self._one_way(sides[0], sides[1], guesses)
+        standing = [k for k in range(len(candidates)) if _stands(there[k])]
+        earlier, later = ([side[k] for k in standing] for side in sides)
+        back = self._one_way(later, earlier, [inverse(guesses[k]) for k in standing])
+        edges: list[Edge | None] = [None] * len(candidates)
+        for k, result in zip(standing, back, strict=True):
+            if _stands(result):
+                edges[k] = _edge(candidates[k], there[k], result)
+        return edges
 
-    def _align(self, images: Images, guesses: np.ndarray, count: int):
-        return self._align_sides(images, images, guesses, count)
+    def _one_way(
+        self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]
+    ) -> list[Alignment]:
+        if not guesses:
+            return []
+        padding = [(0, MOST - len(guesses)), (0, 0), (0, 0)]
 
-    def _align_sides(self, references: Images, targets: Images, guesses: np.ndarray, count: int):
+        def stacked(side: list[Still | None]) -> Images:
+            known = [images for images in side if images is not None]
+            return Images(
+                np.pad(np.stack([images.grey for images in known]), padding),
+                np.pad(np.stack([images.depth for images in known]), padding),
+            )
+
+        result = self._align(stacked(references), stacked(targets), np.pad(np.stack(guesses), padding), len(guesses))
+        return [jax.tree.map(lambda leaf, k=k: leaf[k], result) for k in range(len(guesses))]
+
+    def _align(self, references: Images, targets: Images, guesses: np.ndarray, count: int) -> Alignment:
         keys = jax.random.split(jax.random.key(0), len(guesses))
         sides = [Images(jnp.asarray(side.grey), jnp.asarray(side.depth)) for side in (references, targets)]
         rows = align_rows(sides, self.camera, self.settings, keys, jnp.asarray(guesses, jnp.float32), count)
         return on_host(rows)
 
 
-def _edge(candidate: Candidate, result, there: int, back: int) -> Edge | None:
-    """The edge of a candidate that was aligned there and back, if both stand and agree."""
-    if any(result.status[k] != AlignmentStatus.OK or result.overlap[k] < MIN_OVERLAP for k in (there, back)):
+def _stands(result: Alignment) -> bool:
+    return result.status == AlignmentStatus.OK and float(result.overlap) >= MIN_OVERLAP
+
+
+def _edge(candidate: Candidate, there: Alignment, back: Alignment) -> Edge | None:
+    """The edge of a candidate that was aligned there and back, if these agree."""
+    by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
+    metres, radians = (float(part) for part in size(inverse(by_way_there) @ by_way_back))
+    if metres > MAX_DISAGREEMENT[0] or radians > MAX_DISAGREEMENT[1]:
         return None
-    later_T_earlier = result.target_T_reference[there]
-    by_way_there, by_way_back = inverse(later_T_earlier), result.target_T_reference[back]
-    disagreement = tuple(float(part) for part in size(inverse(by_way_there) @ by_way_back))
-    if any(part > most for part, most in zip(disagreement, MAX_DISAGREEMENT, strict=True)):
-        return None
-    covariance = carried(later_T_earlier, result.covariance[there].astype(np.float64))
-    covariance = 0.5 * (covariance + result.covariance[back].astype(np.float64))
+    covariance = carried(inverse(by_way_there), np.asarray(there.covariance, np.float64))
+    covariance = 0.5 * (covariance + np.asarray(back.covariance, np.float64))
     return Edge(
         candidate.earlier.number,
         candidate.later.number,
         between(by_way_there, by_way_back, 0.5),
         SHARED * (covariance + FLOOR**2 * np.eye(6)),
-        float(min(result.overlap[there], result.overlap[back])),
-        disagreement,  # pyright: ignore[reportArgumentType]
-        jax.tree.map(lambda leaf: leaf[there], result)._replace(status=AlignmentStatus.OK),
+        float(min(there.overlap, back.overlap)),
+        (metres, radians),
+        there._replace(status=AlignmentStatus.OK),
     )
