@@ -6,10 +6,8 @@ from jaxtyping import Bool, Int
 from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.motions import between
+from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.trajectory import Trajectory, inverse
-
-COUNTED = 0.5
-"""Weight from which on a loop counts as right."""
 
 
 def correct(odometry: Trajectory, loops: Loops, guessed: Bool[np.ndarray, " n"] | None = None) -> Trajectory:

@@ -21,6 +21,8 @@ REWEIGHTED = 2
 """Times that the odometry's weight is told anew and the graph optimised with it."""
 MIN_SCALE = 0.1
 """Of the odometry's covariance, where the loops say that it is better than its covariances."""
+COUNTED = 0.5
+"""Weight from which on a loop counts as right."""
 FIXED = 1e-6
 """Metres and radians within which the first keyframe stays."""
 
@@ -107,7 +109,13 @@ def _without_false_loops(gtsam: Any, graph: Any, start: Any, trusted: int) -> tu
     optimizer = gtsam.GncLMOptimizer(graph, start, params)
     optimizer.setInlierCostThresholdsAtProbability(PROBABILITY)
     values = optimizer.optimize()
-    return values, np.asarray(optimizer.getWeights())[trusted:]
+    weights = np.asarray(optimizer.getWeights())[trusted:]
+    # what it ends with may still lean to loops that it gave up last
+    kept = gtsam.NonlinearFactorGraph()
+    for place in range(graph.size()):
+        if place < trusted or weights[place - trusted] > COUNTED:
+            kept.add(graph.at(place))
+    return gtsam.LevenbergMarquardtOptimizer(kept, values).optimize(), weights
 
 
 def _surprise(graph: Any, values: Any, weights: np.ndarray, odometry: int) -> float:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.mapping.correction import COUNTED
 from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.output.files import LOOPS
 from gavo_jax.trajectory import write_lines
 
