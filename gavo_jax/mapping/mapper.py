@@ -62,6 +62,7 @@ class Mapper:
         self._place: Place | None = None
         self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
         self._first: Frame | None = None
+        self._newest: tuple[Frame, Step, Float64[np.ndarray, " 6"]] | None = None
         self._next, self._scale = FIRST, 1.0
 
     def warm_up(self) -> float:
@@ -94,6 +95,9 @@ class Mapper:
             self._add(keyframe)
             if is_found:
                 self._tie(keyframe)
+            self._newest = None
+        elif frame is not None:
+            self._newest = frame, step, twist
 
     def find(self, frame: Frame) -> Found | None:
         """Where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
@@ -118,7 +122,12 @@ class Mapper:
             self.watch(_decoded(sequence, step.index) if self.is_due(step) else None, step)
 
     def finish(self) -> Loops:
-        """Look for loops once more with what is known now, and optimise."""
+        """Make the last frame a keyframe, look for loops once more with what is known now, and optimise."""
+        if self._newest is not None:
+            frame, step, twist = self._newest
+            known = self._known.get(_key(step.timestamp))
+            self._add(self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known))
+            self._newest = None
         if not self.keyframes.all:
             return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
         self._optimise(reweighted=1)
@@ -190,13 +199,14 @@ class Mapper:
         """Move all keyframes to where odometry and loops want them."""
         keyframes = self.keyframes.all
         poses = np.stack([keyframe.world_T_camera for keyframe in keyframes])
-        solution = optimise(poses, self._odometry(), self.edges, self._scale, reweighted)
+        solution = optimise(poses, self.odometry_edges(), self.edges, self._scale, reweighted)
         self._scale = solution.scale
         for keyframe, pose in zip(keyframes, solution.world_T_camera, strict=True):
             keyframe.world_T_camera = pose
         return solution
 
-    def _odometry(self) -> list[Edge]:
+    def odometry_edges(self) -> list[Edge]:
+        """The odometry's motions from keyframe to keyframe."""
         keyframes = self.keyframes.all
         edges = []
         for a, b in zip(keyframes, keyframes[1:], strict=False):
