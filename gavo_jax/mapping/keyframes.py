@@ -191,9 +191,12 @@ class Keyframes:
         return [keyframe for keyframe in self.all if keyframe.images is not None]
 
     def _thin(self) -> None:
+        """Where there are too many images, give up those of the later one of the two keyframes that are nearest to each
+        other: the older a keyframe, the more a loop to it tells.
+        """
         kept = self.searchable()
         if len(kept) <= self.most:
             return
         poses = np.stack([keyframe.world_T_camera for keyframe in kept])
-        crowding = [np.sort(shift(inverse(pose) @ poses, USUAL_DISTANCE))[1:3].sum() for pose in poses[:-1]]
-        kept[int(np.argmin(crowding))].images = None
+        earlier = [shift(inverse(poses[i]) @ poses[:i], USUAL_DISTANCE).min() for i in range(1, len(kept) - 1)]
+        kept[1 + int(np.argmin(earlier))].images = None

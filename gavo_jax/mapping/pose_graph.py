@@ -19,8 +19,12 @@ PROBABILITY = 0.99
 """That the residual of a right loop stays below what makes a loop count as wrong."""
 REWEIGHTED = 2
 """Times that the odometry's weight is told anew and the graph optimised with it."""
-MIN_SCALE = 0.1
-"""Of the odometry's covariance, where the loops say that it is better than its covariances."""
+MISTRUST = 4.0
+"""On the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
+SCALES = (0.1, MISTRUST)
+"""Smallest and largest factor on the odometry's covariances that the loops may tell,"""
+BELIEF = 20.0
+"""and how many residuals' worth its covariances are believed beforehand."""
 COUNTED = 0.5
 """Weight from which on a loop counts as right."""
 FIXED = 1e-6
@@ -77,12 +81,16 @@ def optimise(
     start = gtsam.Values()
     for number, pose in enumerate(poses):
         start.insert(number, _pose(gtsam, pose))
-    graph = _graph(gtsam, poses[0], odometry, loops, scale)
-    values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)
-    for _ in range(reweighted):
-        scale = float(np.clip(scale * _surprise(graph, values, weights, len(odometry)), MIN_SCALE, 1.0))
-        graph = _graph(gtsam, poses[0], odometry, loops, scale)
-        values, weights = _without_false_loops(gtsam, graph, start, len(odometry) + 1)
+    trusted = len(odometry) + 1
+    doubting = _graph(gtsam, poses[0], odometry, loops, MISTRUST)
+    values, weights = _without_false_loops(gtsam, doubting, start, trusted)
+    kept = [edge for edge, weight in zip(loops, weights, strict=True) if weight > COUNTED]
+    for attempt in range(reweighted + 1):
+        # what the search for false loops ends with may still lean to those that it gave up last
+        graph = _graph(gtsam, poses[0], odometry, kept, scale)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        if kept and attempt < reweighted:
+            scale = float(np.clip(scale * _surprise(graph, values, trusted), *SCALES))
     solved = np.stack([values.atPose3(number).matrix() for number in range(len(poses))])
     residuals = np.stack([_residual(gtsam, values, edge) for edge in loops])
     return Solution(solved, weights, residuals, scale)
@@ -109,24 +117,19 @@ def _without_false_loops(gtsam: Any, graph: Any, start: Any, trusted: int) -> tu
     optimizer = gtsam.GncLMOptimizer(graph, start, params)
     optimizer.setInlierCostThresholdsAtProbability(PROBABILITY)
     values = optimizer.optimize()
-    weights = np.asarray(optimizer.getWeights())[trusted:]
-    # what it ends with may still lean to loops that it gave up last
-    kept = gtsam.NonlinearFactorGraph()
-    for place in range(graph.size()):
-        if place < trusted or weights[place - trusted] > COUNTED:
-            kept.add(graph.at(place))
-    return gtsam.LevenbergMarquardtOptimizer(kept, values).optimize(), weights
+    return values, np.asarray(optimizer.getWeights())[trusted:]
 
 
-def _surprise(graph: Any, values: Any, weights: np.ndarray, odometry: int) -> float:
-    """Variance of the odometry's residuals over what their covariances say, by their redundancy (Förstner 1979)."""
-    counted = np.repeat(np.concatenate([np.ones(odometry + 1), weights]), 6)[:, None]
+def _surprise(graph: Any, values: Any, trusted: int) -> float:
+    """Variance of the odometry's residuals over what their covariances say, by their redundancy (Förstner 1979); near 1
+    where the loops say little of it.
+    """
     jacobian, residual = graph.linearize(values).jacobian()
-    rows = slice(6, 6 * (odometry + 1))
-    covariance = np.linalg.inv((counted * jacobian).T @ jacobian)
+    rows = slice(6, 6 * trusted)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
     own = jacobian[rows]
-    redundancy = own.shape[0] - np.einsum("ij,jk,ik->", own, covariance, own)
-    return float((residual[rows] ** 2).sum() / max(redundancy, 1e-6))
+    redundancy = own.shape[0] - np.einsum("ij,jk,ik->", own, covariance, own, optimize=True)
+    return float(((residual[rows] ** 2).sum() + BELIEF) / (redundancy + BELIEF))
 
 
 def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:
