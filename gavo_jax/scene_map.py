@@ -19,7 +19,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.libusb import import_with_libusb
 from gavo_jax.odometry.driver import Step
-from gavo_jax.trajectory import inverse
+from gavo_jax.trajectory import Trajectory, inverse
 
 Shape = Literal["cloud", "mesh"]
 
@@ -178,7 +178,12 @@ class MapBuilder:
 
 
 def build_map(
-    sequence: Sequence, steps: Iterable[Step], shape: Shape = "cloud", voxel: float = VOXEL, farthest: float = FARTHEST
+    sequence: Sequence,
+    steps: Iterable[Step],
+    shape: Shape = "cloud",
+    voxel: float = VOXEL,
+    farthest: float = FARTHEST,
+    trajectory: Trajectory | None = None,
 ) -> SceneMap:
     """Fuse the frames of a run, read once more, one at a time.
 
@@ -191,11 +196,15 @@ def build_map(
         shape: cloud or mesh.
         voxel: side, metres.
         farthest: depth beyond is left out, metres.
+        trajectory: the poses where they are not the steps' own any more: loops have corrected them.
 
     Raises:
         GavoError: an absurd voxel, or Open3D cannot be imported.
     """
     poses = [(0, np.eye(4), 0), *((s.index, s.world_T_camera, s.segment) for s in steps if not s.lost)]
+    corrected = (
+        {} if trajectory is None else dict(zip(trajectory.timestamps.tolist(), trajectory.world_T_camera, strict=True))
+    )
     segments = np.array([segment for *_, segment in poses])
     chosen = int(np.bincount(segments).argmax())
     builder, unreadable = MapBuilder(sequence.camera, voxel, farthest), 0
@@ -206,7 +215,7 @@ def build_map(
             except FrameError:
                 unreadable += 1
                 continue
-            builder.add(frame, world_T_camera)
+            builder.add(frame, corrected.get(float(sequence.timestamps[index]), world_T_camera))
     reasons = ((len(sequence) - len(poses), "lost"), (int(np.sum(segments != chosen)), "of another segment"))
     counted = [f"{count} frames: {why}" for count, why in (*reasons, (unreadable, "unreadable")) if count > 0]
     return builder.extract(shape, counted)

@@ -98,6 +98,7 @@ class OdometryOptions:
         rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
+        loops: Whether a map of keyframes is kept, which closes loops: the trajectory is then corrected by them.
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")
@@ -107,6 +108,7 @@ class OdometryOptions:
     rolling_shutter: bool = static(True)
     recover: bool = static(True)
     on_lost: Literal["hold", "predict", "stop"] = static("hold")
+    loops: bool = static(False)
 
 
 @jax.tree_util.register_dataclass

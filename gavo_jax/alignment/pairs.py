@@ -99,10 +99,13 @@ def with_features(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
-def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
-    """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device."""
-    count = len(guesses)
-    if count == 1:  # padded to two rows, of which one is computed
+def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
+    """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
+    first `count` rows alone, where that is given.
+    """
+    rows = len(guesses)
+    count = rows if count is None else count
+    if rows == 1:  # padded to two rows, of which one is computed
         sides, keys, guesses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), (sides, keys, guesses))
     result = _align_pairs(
         jnp.int32(count),
@@ -113,7 +116,7 @@ def align_rows(sides, camera, settings, keys, guesses) -> Alignment:
         keys,
         guesses,
     )
-    return jax.tree.map(lambda leaf: leaf[:count], result)
+    return jax.tree.map(lambda leaf: leaf[:rows], result)
 
 
 def align(

@@ -8,6 +8,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.scene_map import Shape, build_map, check_map, check_voxel, import_open3d, warn_of
+from gavo_jax.trajectory import Trajectory
 
 
 def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:
@@ -26,14 +27,16 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
     return shape
 
 
-def save_map(path: Path, sequence: Sequence, steps: Many[Step], shape: Shape, voxel: float) -> None:
+def save_map(
+    path: Path, sequence: Sequence, steps: Many[Step], trajectory: Trajectory, shape: Shape, voxel: float
+) -> None:
     """Fuse the frames of a run and write the map.
 
     Raises:
         GavoError: it cannot be written.
     """
     with waiting(f"a map of {len(steps) + 1} frames …"):
-        scene = build_map(sequence, steps, shape, voxel)
+        scene = build_map(sequence, steps, shape, voxel, trajectory=trajectory)
     scene.write(path)
     warn_of(scene, path)
     count = f"{len(scene.points)} points" if scene.triangles is None else f"{len(scene.triangles)} triangles"

@@ -85,6 +85,8 @@ class Run(Search, Source):
     """What the map is."""
     voxel: Annotated[float, arg(metavar="M")] = 0.01
     """Side of the map's voxels, metres."""
+    loops: bool = False
+    """Keep a map of keyframes and correct the trajectory where the camera comes back to a place (docs/loops.md)."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False

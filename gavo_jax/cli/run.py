@@ -17,12 +17,15 @@ from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
+from gavo_jax.mapping.correction import correct, loop_figures
+from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics
-from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics, errors_before
+from gavo_jax.odometry.run import guessed, trajectory_of
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
+from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, environment
+from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
@@ -55,8 +58,16 @@ def run(options: Run) -> int:
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
-    with RunFolder(path, getattr(sequence, "files", ())) as folder, viewer:
-        odometry = Odometry(sequence.camera, settings, seed=options.seed, record=viewer.wants_populations)
+    mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    poses = ODOMETRY if mapper else TRAJECTORY
+    with RunFolder(path, getattr(sequence, "files", ()), poses) as folder, viewer:
+        odometry = Odometry(
+            sequence.camera,
+            settings,
+            seed=options.seed,
+            record=viewer.wants_populations,
+            relocaliser=mapper,
+        )
         config = _config(options, settings, sequence)
         blank = blank_state(sequence.camera, settings.solver, settings.alignment)
         progress = folder.resume(config, blank) if options.resume else None
@@ -71,12 +82,15 @@ def run(options: Run) -> int:
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
+                if mapper is not None:
+                    mapper.replay(sequence, folder.steps())
             say(summary(sequence))
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
-            metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer)
-        write_trajectories(Trajectory.read_tum(folder.path / TRAJECTORY), folder.path, trajectory_formats)
+            metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
+        trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
+        write_trajectories(trajectory, folder.path, trajectory_formats)
         if options.map is not None:
-            save_map(options.map, sequence, folder.steps(), shape, options.voxel)
+            save_map(options.map, sequence, folder.steps(), trajectory, shape, options.voxel)
     print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if interrupted:
         return INTERRUPTED
@@ -85,7 +99,13 @@ def run(options: Run) -> int:
 
 
 def _track(
-    name: str, options: Run, sequence: Sequence, odometry: Odometry, folder: RunFolder, viewer: Viewer
+    name: str,
+    options: Run,
+    sequence: Sequence,
+    odometry: Odometry,
+    folder: RunFolder,
+    viewer: Viewer,
+    mapper: Mapper | None,
 ) -> tuple[dict[str, Any], bool]:
     """Track the frames that are left and write the files; return what metrics.json says, and whether Ctrl-C came.
 
@@ -102,11 +122,22 @@ def _track(
             folder.save_checkpoint()
             saved = time.monotonic()
 
-    tracked = track_visibly(name, sequence, odometry, on_step, viewer)
+    tracked = track_visibly(name, sequence, odometry, on_step, viewer, mapper)
     if tracked.interrupted:
         folder.save_checkpoint()
     steps = folder.steps()
-    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    speed, of_loops = tracked.metrics[FRAMES_PER_SECOND], {}
+    if mapper is not None:
+        start = time.perf_counter()
+        loops = interruptible(mapper.finish)
+        trajectory = correct(causal, loops, guessed(steps))
+        tracked_seconds = (len(tracked.steps) + 1) / speed if speed else 0.0
+        speed = (len(tracked.steps) + 1) / (tracked_seconds + time.perf_counter() - start)
+        trajectory.write_tum(folder.path / TRAJECTORY)
+        write_loops(folder.path, loops)
+        before = compute_metrics(causal, sequence.ground_truth, steps, 0.0, 0.0)
+        of_loops = {**errors_before(before), **loop_figures(loops)}
     metrics = {
         "sequence": sequence.name,
         "method": options.method,
@@ -114,7 +145,8 @@ def _track(
         "seed": options.seed,
         "complete": len(steps) == len(sequence) - 1,
         **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics[COMPILE_SECONDS]),
-        FRAMES_PER_SECOND: tracked.metrics[FRAMES_PER_SECOND],
+        FRAMES_PER_SECOND: speed,
+        **of_loops,
     }
     folder.finish(metrics, complete=not tracked.interrupted)
 
@@ -134,7 +166,7 @@ def _with_shortcuts(settings: Settings, options: Run) -> Settings:
         odometry = replace(odometry, reference=options.reference)
     if options.on_lost is not None:
         odometry = replace(odometry, on_lost=options.on_lost)
-    return replace(settings, odometry=odometry)
+    return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
 
 
 def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, Any]:

@@ -30,6 +30,12 @@ ERRORS = (
 )
 """Rows of the table: what, key in metrics.json, decimals, unit. Those without a figure are left out."""
 
+BEFORE_LOOPS = (
+    ("drift of the odometry alone, translation", f"odometry_{DRIFT}", 6, "m/s"),
+    ("absolute error of the odometry alone", f"odometry_{ABSOLUTE_ERROR}", 6, "m"),
+)
+"""Rows of a run with loops."""
+
 COUNTS = (
     ("frames", "frames", 0, ""),
     ("lost pairs", "lost_pairs", 0, ""),
@@ -51,13 +57,15 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
         has_truth: whether the sequence has a ground truth.
     """
     trajectory = Trajectory.read_tum(folder / TRAJECTORY)
-    known = [row for row in ERRORS if metrics.get(row[1]) is not None]
+    known = [row for row in ERRORS + BEFORE_LOOPS if metrics.get(row[1]) is not None]
     rows: list[Row] = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in known]
     if not known:
         rows += _of_trajectory(trajectory, metrics)
     rows += [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
     counted = metrics.get("statuses", {}).items()
     rows += [(f"pairs: {status}", str(count), "") for status, count in counted if status != "ok"]
+    if "loops" in metrics:
+        rows.append(("loops, those refused", f"{metrics['loops']}, {metrics['loops_refused']}", ""))
     if metrics.get("unknown_motions"):
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
     print_table(name, ("", "", "unit"), rows)

@@ -130,7 +130,7 @@ def _by_level(populations: Population | None) -> tuple[Population, ...]:
 
 def traced_part(options: OdometryOptions) -> OdometryOptions:
     """The options that shape the program; the others are reset, so that they cause no second compilation."""
-    return replace(options, recover=True, on_lost="hold")
+    return replace(options, recover=True, on_lost="hold", loops=False)
 
 
 @dataclass(frozen=True)

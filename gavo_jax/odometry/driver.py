@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -50,12 +50,37 @@ class Step:
     """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
     segment: int = 0
     """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
+    origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
+    """Of the pose: from the reference, from a keyframe of the map (then that is the pair's reference), or from nothing
+    (a lost pair)."""
+
+
+class Found(NamedTuple):
+    """Where a frame was found in a map."""
+
+    alignment: Alignment
+    """With a keyframe as the reference."""
+    timestamp: float
+    """Of the keyframe, seconds."""
+    world_T_camera: Float64[np.ndarray, "4 4"]
+    """Of the frame, in the world of the odometry's segment that the keyframe belongs to."""
+    segment: int
+
+
+class Relocaliser(Protocol):
+    """Finds frames in a map of the run so far."""
+
+    def find(self, frame: Frame) -> Found | None:
+        """Where a frame was taken; None where the map does not show that."""
+        ...
 
 
 MAX_HELD = 3
 """Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
+SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
+"""Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 
 
 class Progress(NamedTuple):
@@ -74,6 +99,8 @@ class Progress(NamedTuple):
     history: History = History()
     segment: int = 0
     """Of the reference."""
+    adrift: int = 0
+    """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
 
 
 class Odometry:
@@ -86,6 +113,7 @@ class Odometry:
         record: Whether every frame's candidates are kept until the next frame, for people to look at.
         solver: Takes the place of the settings' solver.
         aligner: Takes the place of the search that the settings describe.
+        relocaliser: Is asked where a frame is that nothing ties to the frames before.
 
     Attributes:
         camera: Without distortion: that of the frames as they are aligned.
@@ -102,7 +130,9 @@ class Odometry:
         record: bool = False,
         solver: Solver | None = None,
         aligner: Aligner | None = None,
+        relocaliser: Relocaliser | None = None,
     ):
+        self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
         self.progress = Progress()
@@ -151,13 +181,25 @@ class Odometry:
             attempt = self.aligner.align(before.tracker, usable, clock_of(before, usable))
             after, result, lost = self._advance(before, usable, finding, attempt)
             candidates = attempt.candidates
+        origin, reference_timestamp = "guessed" if lost else "tracked", before.reference_timestamp
+        found = self._seek(after, usable if finding.use is Use.ALL else None)
+        if found is not None:
+            after = after._replace(
+                world_T_reference=found.world_T_camera,
+                world_T_camera=found.world_T_camera,
+                segment=found.segment,
+                adrift=0,
+            )
+            result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
+        elif after.adrift:
+            after = after._replace(adrift=after.adrift + 1)
         self.progress, self.candidates = after, candidates
         if before.last_index == 0:
             return None
         milliseconds = (time.perf_counter() - start) * 1e3
         return Step(
             before.last_index,
-            before.reference_timestamp,
+            reference_timestamp,
             timestamp,
             result,
             after.world_T_camera.copy(),
@@ -165,7 +207,16 @@ class Odometry:
             lost,
             self.settings.odometry.on_lost if lost else "",
             after.segment,
+            origin,
         )
+
+    def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
+        """Look for a frame in the map, where it is the reference of a segment that is adrift."""
+        if self.relocaliser is None or frame is None or not after.adrift or after.held:
+            return None
+        if after.adrift > SOUGHT_AT_ONCE and after.adrift % SOUGHT_EVERY:
+            return None
+        return self.relocaliser.find(frame)
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
         """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new
@@ -173,6 +224,7 @@ class Odometry:
         """
         return before._replace(
             segment=before.segment + (before.last_index > 0),
+            adrift=int(before.last_index > 0),
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
             world_T_reference=before.world_T_camera,
@@ -224,7 +276,7 @@ def clock_of(before: Progress, frame: Frame) -> Clock:
     return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay), np.uint32(before.last_index))
 
 
-def _unwatched(frame: Frame | None, step: Step | None) -> None:
+def unwatched(frame: Frame | None, step: Step | None) -> None:
     """Nobody looks."""
 
 
@@ -234,7 +286,7 @@ def track(
     *,
     seed: int = 0,
     odometry: Odometry | None = None,
-    watch: Callable[[Frame | None, Step | None], None] = _unwatched,
+    watch: Callable[[Frame | None, Step | None], None] = unwatched,
 ) -> Iterator[Step]:
     """Stream a sequence: a step for every frame after the first, as it is done.
 

@@ -1,9 +1,9 @@
 """The figures of a run, and their names in every JSON file and table."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Final, TypedDict
+from typing import Any, Final, TypedDict
 
 import jax
 import numpy as np
@@ -55,6 +55,14 @@ FINAL_DISTANCE: Final = "distance_error_final_m"
 COMPILE_SECONDS: Final = "compile_seconds"
 MILLISECONDS: Final = "milliseconds_per_pair_median"
 FRAMES_PER_SECOND: Final = "frames_per_second"
+
+
+ERRORS: Final = (DRIFT, ROTATION_DRIFT, DRIFT_PER_FRAME, ABSOLUTE_ERROR, FINAL_DISTANCE)
+
+
+def errors_before(causal: Mapping[str, Any]) -> dict[str, Any]:
+    """The errors of a trajectory that loops have corrected since, under names of their own."""
+    return {f"odometry_{name}": causal[name] for name in ERRORS}
 
 
 def compute_metrics(

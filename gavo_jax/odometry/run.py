@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from jaxtyping import Bool
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Odometry, Step, track
-from gavo_jax.odometry.metrics import RunMetrics, compute_metrics
+from gavo_jax.mapping.correction import correct, loop_figures
+from gavo_jax.mapping.mapper import Loops, Mapper
+from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
+from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -30,6 +33,10 @@ class OdometryRun:
     metrics: RunMetrics
     sequence: Sequence | None = field(default=None, repr=False)
     """What was run over."""
+    odometry: Trajectory | None = None
+    """With loops: the trajectory before they corrected it,"""
+    loops: Loops | None = None
+    """and the map of keyframes."""
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -52,7 +59,7 @@ class OdometryRun:
 
         if self.sequence is None:
             raise GavoError("the run does not hold the sequence that it was run over: no map can be made of it")
-        return build_map(self.sequence, self.steps, shape, voxel)
+        return build_map(self.sequence, self.steps, shape, voxel, trajectory=self.trajectory)
 
 
 def run_odometry(
@@ -84,18 +91,35 @@ def run_odometry(
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
-    odometry = Odometry(sequence.camera, settings, seed=seed)
-    compile_seconds = odometry.warm_up()
+    mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
+    compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []
     start = time.perf_counter()
-    for step in track(sequence, odometry=odometry):
+    for step in track(sequence, odometry=odometry, watch=mapper.watch if mapper else unwatched):
         steps.append(step)
         if on_step is not None:
             on_step(step)
+    causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    loops = mapper.finish() if mapper else None
+    if loops is not None:
+        trajectory = correct(causal, loops, guessed(steps))
     seconds = time.perf_counter() - start
-    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
-    return OdometryRun(trajectory, steps, {"sequence": sequence.name, "seed": seed, **metrics}, sequence)
+
+    def figures(of: Trajectory) -> Metrics:
+        return compute_metrics(of, sequence.ground_truth, steps, seconds, compile_seconds)
+
+    metrics: RunMetrics = {"sequence": sequence.name, "seed": seed, **figures(trajectory)}
+    if loops is None:
+        return OdometryRun(trajectory, steps, metrics, sequence)
+    metrics.update(errors_before(figures(causal)) | loop_figures(loops))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return OdometryRun(trajectory, steps, metrics, sequence, causal, loops)
+
+
+def guessed(steps: list[Step]) -> Bool[np.ndarray, " poses"]:
+    """Which poses of `trajectory_of` are guesses."""
+    kept = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
+    return np.array([False] + [step.origin == "guessed" for step in kept])
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:

@@ -57,6 +57,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "reference_timestamp": progress.reference_timestamp,
         "held": progress.held,
         "segment": progress.segment,
+        "adrift": progress.adrift,
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,

@@ -22,6 +22,8 @@ from gavo_jax.trajectory import write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+ODOMETRY, LOOPS = "odometry.txt", "loops.csv"
+"""What a run with loops adds: the trajectory as it was before they corrected it, and the loops."""
 CHECKPOINT = "checkpoint.npz"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""

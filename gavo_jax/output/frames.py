@@ -18,12 +18,13 @@ DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"
 FRAME_COLUMNS = (
     ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "undetermined", "lost", "on_lost")
     + DEVIATIONS
-    + ("milliseconds", "segment", "statuses")
+    + ("milliseconds", "segment", "statuses", "origin")
 )
 """Of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction
 that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations
 of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
-0, every status that holds, with blanks between."""
+0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the reference is
+then a keyframe of the map) or `guessed` (of a lost pair)."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
@@ -79,6 +80,7 @@ def _read_step(
         row["lost"] == "1",
         row["on_lost"],  # pyright: ignore[reportArgumentType]
         int(row.get("segment") or 0),
+        row.get("origin") or ("guessed" if row["lost"] == "1" else "tracked"),  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -100,6 +102,7 @@ def frame_row(step: Step) -> list[Any]:
         f"{step.milliseconds:.3f}",
         step.segment,
         " ".join(status.name.lower() for status in alignment.statuses),
+        step.origin,
     ]
 
 

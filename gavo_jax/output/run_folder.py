@@ -24,7 +24,9 @@ from gavo_jax.output.files import (
     CHECKPOINT,
     CONFIG,
     FRAMES,
+    LOOPS,
     METRICS,
+    ODOMETRY,
     RECORDING,
     TRAJECTORY,
     VIEW,
@@ -39,7 +41,7 @@ from gavo_jax.output.files import (
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_steps
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import TRAJECTORY_HEADER, format_tum_row, segment_comment
+from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, segment_comment
 
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
 IDENTITY_OPTIONS = ("method", "preset", "seed")
@@ -109,12 +111,13 @@ class RunFolder:
     that came to its end has a metrics.json and no checkpoint.
     """
 
-    def __init__(self, folder: str | Path, images: Sequence[Sequence[Path]] = ()) -> None:
+    def __init__(self, folder: str | Path, images: Sequence[Sequence[Path]] = (), trajectory: str = TRAJECTORY) -> None:
         """Make the folder where it is missing.
 
         Args:
             folder: what becomes of its files is up to `start` and `resume`.
             images: of each frame, where they are files: a run does not go on where those it saw have changed.
+            trajectory: name of the file that receives the poses as they are found.
 
         Raises:
             GavoError: it is no folder or cannot be written to.
@@ -122,6 +125,7 @@ class RunFolder:
         self.path = prepare_folder(folder)
         self._held = contextlib.ExitStack()
         self._seen = SeenImages(images)
+        self._poses = trajectory
         self._files: dict[str, _GrowingFile] = {}
         self._segment = 0
         self._whole: tuple[dict[str, Mark], str, Progress | None] = ({}, "", None)
@@ -141,13 +145,13 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, FRAMES, RECORDING, VIEW)
+        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, ODOMETRY, LOOPS, FRAMES, RECORDING, VIEW)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
-        self._open({TRAJECTORY: None, FRAMES: None})
+        self._open({self._poses: None, FRAMES: None})
         self._files[FRAMES].append(",".join(FRAME_COLUMNS))
-        self._files[TRAJECTORY].append(TRAJECTORY_HEADER)
-        self._files[TRAJECTORY].append(format_tum_row(timestamp, np.eye(4)))
+        self._files[self._poses].append(TRAJECTORY_HEADER)
+        self._files[self._poses].append(format_tum_row(timestamp, np.eye(4)))
         self._whole = (self._marks(), self._seen.up_to(0), None)
 
     def resume(self, config: Mapping[str, Any], blank: TrackerState) -> Progress | None:
@@ -174,7 +178,7 @@ class RunFolder:
         if not kept.exists():
             return None
         progress, files, images = load_checkpoint(kept, blank)
-        if set(files) != {TRAJECTORY, FRAMES}:
+        if set(files) != {self._poses, FRAMES}:
             raise GavoError(f"{kept}: not a whole checkpoint: run again without --resume")
         if self._seen.up_to(progress.last_index) != images:
             raise GavoError(
@@ -213,9 +217,9 @@ class RunFolder:
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
             if step.segment != self._segment:
                 comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
-                self._files[TRAJECTORY].append(comment)
+                self._files[self._poses].append(comment)
                 self._segment = step.segment
-            self._files[TRAJECTORY].append(format_tum_row(step.timestamp, step.world_T_camera))
+            self._files[self._poses].append(format_tum_row(step.timestamp, step.world_T_camera))
         images = self._whole[1] if progress is None else self._seen.up_to(progress.last_index)
         self._whole = (self._marks(), images, progress)
 
@@ -232,7 +236,7 @@ class RunFolder:
     def steps(self) -> list[Step]:
         """The steps of the run so far, as the files tell them; see `read_steps`."""
         self._cut()
-        return read_steps(self.path)
+        return read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
 
     def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
         """Write metrics.json, whole or not at all; after it a run that is complete needs no checkpoint any more.

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.interrupts import interruptible
+from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
@@ -29,6 +30,7 @@ def track_visibly(
     odometry: Odometry,
     on_step: Callable[[Step], None] | None = None,
     viewer: Viewer = NO_VIEWER,
+    mapper: Mapper | None = None,
 ) -> Tracked:
     """Compile, then track every frame, from where the driver stands, under a progress bar and before a viewer's eyes.
 
@@ -40,10 +42,14 @@ def track_visibly(
     interrupted = False
 
     def watch(frame: Frame | None, step: Step | None) -> None:
+        if mapper is not None:
+            mapper.watch(frame, step)
         viewer.watch(frame, step, odometry.candidates)
 
     with pair_progress(label, pairs, done) as bar:
         compile_seconds = interruptible(odometry.warm_up)
+        if mapper is not None:
+            compile_seconds += interruptible(mapper.warm_up)
         start = time.perf_counter()
         try:
             for step in track(sequence, odometry=odometry, watch=watch):

@@ -1,0 +1,77 @@
+"""Which earlier keyframes may show what a new one shows: those that would look like it from where it stands."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.camera import Camera
+from gavo_jax.mapping.keyframes import Keyframe
+from gavo_jax.mapping.motions import size
+from gavo_jax.trajectory import inverse
+
+MOST = 4
+"""Candidates of one keyframe, which bounds the work."""
+MIN_SECONDS = 1.0
+"""Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
+MIN_OVERLAP = 0.5
+"""Predicted share of either one's points that the other sees,"""
+MIN_LIKENESS = 0.8
+"""and correlation of what both see."""
+APART = 3
+"""Keyframes between two candidates: neighbours would say the same twice."""
+ANOTHER_GUESS = (0.02, 0.02)
+"""Metres and radians by which a guess has to differ from one that led to nothing."""
+
+
+class Candidate(NamedTuple):
+    """A pair of keyframes that may overlap."""
+
+    earlier: Keyframe
+    later: Keyframe
+    later_T_earlier: Float64[np.ndarray, "4 4"]
+    """As it is known now: the guess."""
+    overlap: float
+    """Predicted, the smaller one of the two directions,"""
+    likeness: float
+    """and the correlation."""
+
+
+def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera, most: int = MOST) -> list[Candidate]:
+    """The candidates of a keyframe among earlier ones that have their images, the likest first.
+
+    Args:
+        new: The later one.
+        others: The earlier ones.
+        camera: Of their images.
+        most: Of candidates.
+    """
+    possible = []
+    for other in others:
+        later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
+        if new.timestamp - other.timestamp < MIN_SECONDS or _was_tried(new, other, later_T_earlier):
+            continue
+        back = new.look.agreement(other.look, inverse(later_T_earlier), camera)
+        if back[0] < MIN_OVERLAP or back[1] < MIN_LIKENESS:
+            continue
+        there = other.look.agreement(new.look, later_T_earlier, camera)
+        overlap, likeness = min(there[0], back[0]), min(there[1], back[1])
+        if overlap >= MIN_OVERLAP and likeness >= MIN_LIKENESS:
+            possible.append(Candidate(other, new, later_T_earlier, overlap, likeness))
+    possible.sort(key=lambda candidate: -candidate.likeness)
+    found: list[Candidate] = []
+    for candidate in possible:
+        if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
+            found.append(candidate)
+    return found[:most]
+
+
+def _was_tried(new: Keyframe, other: Keyframe, later_T_earlier: np.ndarray) -> bool:
+    """Whether they are linked, or were aligned in vain from about the same guess."""
+    if other.number in new.linked:
+        return True
+    guess = new.tried.get(other.number)
+    if guess is None:
+        return False
+    changes = size(inverse(guess) @ later_T_earlier)
+    return all(change < least for change, least in zip(changes, ANOTHER_GUESS, strict=True))

@@ -1,0 +1,78 @@
+"""A run's trajectory as its map corrects it."""
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from gavo_jax.mapping.keyframes import Keyframe
+from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.motions import between
+from gavo_jax.mapping.pose_graph import COUNTED
+from gavo_jax.trajectory import Trajectory, inverse
+
+
+def correct(odometry: Trajectory, loops: Loops, guessed: Bool[np.ndarray, " n"] | None = None) -> Trajectory:
+    """A trajectory of the odometry corrected as its keyframes were.
+
+    Args:
+        odometry: It.
+        loops: The map.
+        guessed: Which poses are no more than guesses; they are put between those around, where these belong together.
+
+    Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
+    poses which they give. Segments that a loop joins become one.
+    """
+    keyframes = loops.keyframes
+    if not keyframes:
+        return odometry
+    stamps = np.array([keyframe.timestamp for keyframe in keyframes])
+    corrections = [keyframe.world_T_camera @ inverse(keyframe.world_T_odometry) for keyframe in keyframes]
+    poses = np.empty_like(odometry.world_T_camera)
+    for i, (stamp, pose) in enumerate(zip(odometry.timestamps, odometry.world_T_camera, strict=True)):
+        after = int(np.searchsorted(stamps, stamp, side="right"))
+        before = max(after - 1, 0)
+        if 0 < after < len(stamps) and keyframes[before].segment == keyframes[after].segment:
+            share = (stamp - stamps[before]) / (stamps[after] - stamps[before])
+            poses[i] = between(corrections[before] @ pose, corrections[after] @ pose, float(share))
+        else:
+            nearest = after if _begins(keyframes, after, odometry.segments[i]) else before
+            poses[i] = corrections[nearest] @ pose
+    corrected = Trajectory(odometry.timestamps, poses, joined(odometry.segments, loops))
+    return corrected if guessed is None else bridged(corrected, guessed)
+
+
+def bridged(trajectory: Trajectory, guessed: Bool[np.ndarray, " n"]) -> Trajectory:
+    """A trajectory with the poses that were guessed between two others of one segment put on the way between these."""
+    known = np.flatnonzero(~guessed)
+    poses, segments, stamps = trajectory.world_T_camera.copy(), trajectory.segments, trajectory.timestamps
+    for start, end in zip(known, known[1:], strict=False):
+        for i in range(start + 1, end):
+            if segments[start] == segments[i] == segments[end]:
+                share = (stamps[i] - stamps[start]) / (stamps[end] - stamps[start])
+                poses[i] = between(poses[start], poses[end], float(share))
+    return Trajectory(stamps, poses, segments)
+
+
+def _begins(keyframes: list[Keyframe], number: int, segment: int) -> bool:
+    """Whether a frame before that keyframe belongs to it and not to the one before."""
+    return number < len(keyframes) and keyframes[number].segment == segment
+
+
+def joined(segments: Int[np.ndarray, " n"], loops: Loops) -> Int[np.ndarray, " n"]:
+    """The segments of poses, those that loops join under the number of the first of them."""
+    first = {int(segment): int(segment) for segment in np.unique(segments)}
+    for edge, weight in zip(loops.edges, loops.solution.weights, strict=True):
+        a, b = (first.get(loops.keyframes[number].segment) for number in (edge.earlier, edge.later))
+        if weight > COUNTED and a is not None and b is not None and a != b:
+            first = {segment: min(a, b) if to in (a, b) else to for segment, to in first.items()}
+    return np.array([first[int(segment)] for segment in segments])
+
+
+def loop_figures(loops: Loops) -> dict[str, int | float]:
+    """Entries of metrics.json that tell of the map."""
+    counted = int(np.sum(loops.solution.weights > COUNTED))
+    return {
+        "keyframes": len(loops.keyframes),
+        "loops": counted,
+        "loops_refused": len(loops.edges) - counted,
+        "odometry_covariance_scale": loops.solution.scale,
+    }

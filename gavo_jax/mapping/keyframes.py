@@ -1,0 +1,202 @@
+"""Keyframes: the frames that a map is made of, few enough to be bounded, near enough to overlap."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from gavo_jax.camera import Camera, to_pixels, to_ray
+from gavo_jax.datasets.base import Frame
+from gavo_jax.mapping.motions import size
+from gavo_jax.mapping.settling import Still, still
+from gavo_jax.trajectory import inverse
+
+MAX_IMAGES = 300
+"""Keyframes that keep their images, some 0.25 MB each at 640 x 480; of more the most redundant one loses them."""
+SPACING = 0.15
+"""Shift of the image, radians, after which a new keyframe is due: 9 degrees, or 15 cm at 1 m."""
+SMALLER = 3
+"""Pyramid level, from the keyframe's images, of the small blurred image that tells whether two keyframes look alike
+(Klein and Murray, ECCV 2008); 40 x 30 pixels of a frame of 640 x 480."""
+BLUR = 1.0
+"""Its pixels."""
+NEAREST = 0.05
+"""Metres in front of a camera from which on a point counts as seen,"""
+FEWEST = 30
+"""and how many such points there have to be for two looks to be compared."""
+USUAL_DISTANCE = 2.0
+"""Metres, where depth says nothing."""
+
+
+class Look(NamedTuple):
+    """A small blurred image, and where the things are that it shows."""
+
+    small: Float32[np.ndarray, "h w"]
+    points: Float64[np.ndarray, "3 n"]
+    """Of its pixels that have a reading, metres in the camera."""
+    grey: Float32[np.ndarray, " n"]
+    """Of these pixels."""
+
+    @classmethod
+    def of(cls, images: Still, camera: Camera) -> Self:
+        """That of a keyframe's images, and their camera."""
+        tiny, side = camera.level(SMALLER), 2**SMALLER
+        small = cv2.resize(images.grey, (tiny.width, tiny.height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        small = cv2.GaussianBlur(small, (0, 0), BLUR)
+        depth = images.depth[side // 2 :: side, side // 2 :: side][: tiny.height, : tiny.width]
+        v, u = np.nonzero(depth)
+        z = depth[v, u] / camera.depth_scale
+        x, y = to_ray(tiny, u, v)
+        return cls(small, np.stack([x * z, y * z, z]).astype(np.float64), small[v, u])
+
+    @property
+    def distance(self) -> float:
+        """Median depth, metres."""
+        return float(np.median(self.points[2])) if self.points.size else USUAL_DISTANCE
+
+    def agreement(self, other: "Look", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera) -> tuple[float, float]:
+        """How well another one shows the same from another pose.
+
+        Args:
+            other: The other one.
+            other_T_self: The motion between them.
+            camera: Of the keyframes' images.
+
+        Returns:
+            Share of the points that it sees, and the correlation of their grey in the two; 0 where too few are seen.
+        """
+        seen = other_T_self[:3, :3] @ self.points + other_T_self[:3, 3:]
+        tiny, z = camera.level(SMALLER), np.where(seen[2] > NEAREST, seen[2], 1.0)
+        u, v = to_pixels(tiny, seen[0], seen[1], 1.0 / z)
+        inside = (seen[2] > NEAREST) & (u >= 0) & (u <= tiny.width - 1) & (v >= 0) & (v <= tiny.height - 1)
+        if inside.sum() < FEWEST:
+            return 0.0, 0.0
+        column, row = (axis[inside].astype(np.float32)[None] for axis in (u, v))
+        there = cv2.remap(other.small, column, row, cv2.INTER_LINEAR)[0]
+        return float(inside.mean()), correlation(self.grey[inside], there)
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's, 0 where one of the two is flat."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float((a * b).sum()) / size if size > 1e-3 else 0.0
+
+
+@dataclass
+class Keyframe:
+    """A frame of the map.
+
+    Attributes:
+        number: Its place among the keyframes.
+        index: In the sequence.
+        timestamp: Seconds.
+        segment: Of the odometry's trajectory.
+        world_T_odometry: Its pose by the odometry alone.
+        world_T_camera: Its pose as it is known now.
+        step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
+            unknown.
+        images: Of half the size; None once they were given up.
+        look: What it looks like from afar.
+    """
+
+    number: int
+    index: int
+    timestamp: float
+    segment: int
+    world_T_odometry: Float64[np.ndarray, "4 4"]
+    world_T_camera: Float64[np.ndarray, "4 4"]
+    step: Float64[np.ndarray, "6 6"] | None
+    images: Still | None
+    look: Look
+    tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
+    """Earlier keyframes that it was aligned with, and the guess of that,"""
+    linked: set[int] = field(default_factory=set)
+    """and those to which that led to an edge."""
+
+
+def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.ndarray, "*n"]:
+    """How far motions shift the image of things at a distance (m), about, in radians."""
+    length, angle = size(a_T_b)
+    return angle + length / max(distance, 0.1)
+
+
+class Keyframes:
+    """The keyframes of a run, in their order.
+
+    Args:
+        camera: Of the frames as they come, without distortion.
+        most: Keyframes that keep their images.
+    """
+
+    def __init__(self, camera: Camera, most: int = MAX_IMAGES):
+        self.full, self.camera, self.most = camera, camera.level(1), most
+        self.all: list[Keyframe] = []
+
+    def is_due(self, world_T_camera: Float64[np.ndarray, "4 4"], segment: int) -> bool:
+        """Whether a frame at a pose of the odometry should become one."""
+        if not self.all or self.all[-1].segment != segment:
+            return True
+        last = self.all[-1]
+        return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.look.distance) > SPACING)
+
+    def make(
+        self,
+        frame: Frame,
+        index: int,
+        segment: int,
+        world_T_odometry: Float64[np.ndarray, "4 4"],
+        twist: Float64[np.ndarray, " 6"],
+        step: Float64[np.ndarray, "6 6"] | None = None,
+    ) -> Keyframe:
+        """A frame as the next keyframe, which it is not yet.
+
+        Args:
+            frame: The images.
+            index: In the sequence.
+            segment: Of the odometry's trajectory.
+            world_T_odometry: Its pose.
+            twist: Motion of the points in the camera at its moment, m/s and rad/s.
+            step: Covariance of the odometry's motion from the last keyframe; None: unknown.
+        """
+        delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+        images = still(frame.grey, frame.depth, self.full, twist, delay)
+        return Keyframe(
+            number=len(self.all),
+            index=index,
+            timestamp=frame.timestamp,
+            segment=segment,
+            world_T_odometry=np.array(world_T_odometry),
+            world_T_camera=np.array(world_T_odometry),
+            step=step,
+            images=images,
+            look=Look.of(images, self.camera),
+        )
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Keep a keyframe, placed as the last one of its segment was corrected; another one's images are given up where
+        there are too many.
+        """
+        before = next((other for other in reversed(self.all) if other.segment == keyframe.segment), None)
+        if before is not None:
+            correction = before.world_T_camera @ inverse(before.world_T_odometry)
+            keyframe.world_T_camera = correction @ keyframe.world_T_odometry
+        self.all.append(keyframe)
+        self._thin()
+
+    def searchable(self) -> list[Keyframe]:
+        """Those that have their images."""
+        return [keyframe for keyframe in self.all if keyframe.images is not None]
+
+    def _thin(self) -> None:
+        """Where there are too many images, give up those of the later one of the two keyframes that are nearest to each
+        other: the older a keyframe, the more a loop to it tells.
+        """
+        kept = self.searchable()
+        if len(kept) <= self.most:
+            return
+        poses = np.stack([keyframe.world_T_camera for keyframe in kept])
+        earlier = [shift(inverse(poses[i]) @ poses[:i], USUAL_DISTANCE).min() for i in range(1, len(kept) - 1)]
+        kept[1 + int(np.argmin(earlier))].images = None

@@ -1,0 +1,226 @@
+"""The map of a run: keyframes as it goes, loops between them, and in the end a trajectory that fits all of them."""
+
+import time
+from collections import OrderedDict
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.mapping.candidates import MOST, find_candidates
+from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
+from gavo_jax.mapping.motions import carried, log
+from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
+from gavo_jax.mapping.relocalisation import Place, Recogniser
+from gavo_jax.mapping.verification import Edge, Verifier
+from gavo_jax.odometry.driver import Found, Step
+from gavo_jax.trajectory import inverse
+
+STEP_FLOOR = 5e-4
+"""Metres and radians that a step of the odometry is off by beside what its covariance says."""
+UNKNOWN = 1.0
+"""Metres and radians that stand for a motion of which nothing is known."""
+GROWTH = 1.25
+"""Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
+FIRST = 20
+"""Keyframes of the first one."""
+SOUGHT_OF_SEGMENT = 5
+"""Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
+MOST_IN_THE_END = 2
+"""Candidates of each keyframe when loops are looked for once more in the end."""
+REMEMBERED = 64
+"""Frames since a keyframe whose covariance is kept, for those that refer to them."""
+
+
+class Loops(NamedTuple):
+    """What a map says of a run."""
+
+    keyframes: list[Keyframe]
+    edges: list[Edge]
+    solution: Solution
+
+
+class Mapper:
+    """Watches a run and keeps its map.
+
+    Args:
+        camera: Of the frames, without distortion.
+        most: Keyframes that keep their images.
+
+    Raises:
+        GavoError: GTSAM is not installed.
+    """
+
+    def __init__(self, camera: Camera, most: int = MAX_IMAGES):
+        require_gtsam()
+        self.keyframes = Keyframes(camera, most)
+        self.verifier = Verifier(self.keyframes.camera)
+        self.recogniser = Recogniser(self.keyframes.camera, self.verifier)
+        self.edges: list[Edge] = []
+        self._place: Place | None = None
+        self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
+        self._first: Frame | None = None
+        self._newest: tuple[Frame, Step, Float64[np.ndarray, " 6"]] | None = None
+        self._next, self._scale = FIRST, 1.0
+
+    def warm_up(self) -> float:
+        """Compile what is needed, or load it; the seconds this took."""
+        start = time.perf_counter()
+        self.verifier.warm_up()
+        return time.perf_counter() - start
+
+    def watch(self, frame: Frame | None, step: Step | None) -> None:
+        """Take notice of a frame (None: it could not be read) with its step (None: it is the first)."""
+        if step is None:
+            self._first = frame
+            return
+        if step.lost:
+            return
+        seconds = step.timestamp - step.reference_timestamp
+        motion = np.asarray(step.alignment.target_T_reference, np.float64)
+        twist = log(motion) / max(seconds, 1e-3)
+        if self._first is not None and not self.keyframes.all:
+            self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist))
+        self._first = None
+        due, is_found = self.is_due(step), step.origin == "relocalised"
+        if is_found:
+            twist = np.zeros(6)
+        else:
+            self._follow(step, motion)
+        if frame is not None and due:
+            known = None if is_found else self._known.get(_key(step.timestamp))
+            keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known)
+            self._add(keyframe)
+            if is_found:
+                self._tie(keyframe)
+            self._newest = None
+        elif frame is not None:
+            self._newest = frame, step, twist
+
+    def find(self, frame: Frame) -> Found | None:
+        """Where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
+        self._place = None
+        lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
+        self._place = place = self.recogniser.find(lost, self.keyframes.searchable())
+        if place is None or place.edge.alignment is None:
+            return None
+        world_T_camera = place.keyframe.world_T_odometry @ place.edge.earlier_T_later
+        return Found(place.edge.alignment, place.keyframe.timestamp, world_T_camera, place.keyframe.segment)
+
+    def is_due(self, step: Step) -> bool:
+        """Whether a step's frame will become a keyframe."""
+        if step.lost or step.origin == "relocalised":
+            return not step.lost
+        return self.keyframes.is_due(step.world_T_camera, step.segment)
+
+    def replay(self, sequence: Sequence, steps: list[Step]) -> None:
+        """Take notice of what a run did before it was cut short; only what becomes a keyframe is decoded."""
+        self.watch(_decoded(sequence, 0), None)
+        for step in steps:
+            self.watch(_decoded(sequence, step.index) if self.is_due(step) else None, step)
+
+    def finish(self) -> Loops:
+        """Make the last frame a keyframe, look for loops once more with what is known now, and optimise."""
+        if self._newest is not None:
+            frame, step, twist = self._newest
+            known = self._known.get(_key(step.timestamp))
+            self._add(self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known))
+            self._newest = None
+        if not self.keyframes.all:
+            return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
+        self._optimise(reweighted=1)
+        self._join()
+        for keyframe in self.keyframes.searchable():
+            self._close(keyframe, MOST_IN_THE_END)
+        return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
+
+    def _join(self) -> None:
+        """Look for segments that nothing ties to others, by their first keyframes."""
+        tied = {
+            keyframes[number].segment
+            for edge in self.edges
+            for number in (edge.earlier, edge.later)
+            if (keyframes := self.keyframes.all)[edge.earlier].segment != keyframes[edge.later].segment
+        }
+        kept = self.keyframes.searchable()
+        for segment in sorted({keyframe.segment for keyframe in kept} - {0} - tied):
+            own = [keyframe for keyframe in kept if keyframe.segment == segment]
+            others = [keyframe for keyframe in kept if keyframe.segment < segment]
+            for keyframe in own[:SOUGHT_OF_SEGMENT]:
+                place = self.recogniser.find(keyframe, others)
+                if place is not None:
+                    self._link(keyframe, place.edge)
+                    break
+
+    def _follow(self, step: Step, motion: np.ndarray) -> None:
+        """Keep the covariance of the motion since the last keyframe."""
+        before = self._known.get(_key(step.reference_timestamp))
+        covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
+        if before is not None and np.isfinite(covariance).all():
+            self._known[_key(step.timestamp)] = carried(motion, before + covariance)
+            if len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+
+    def _add(self, keyframe: Keyframe) -> None:
+        self.keyframes.add(keyframe)
+        self._known.clear()
+        self._known[_key(keyframe.timestamp)] = np.zeros((6, 6))
+        self._close(keyframe)
+        if len(self.keyframes.all) >= self._next:
+            self._next = int(GROWTH * len(self.keyframes.all)) + 1
+            self._optimise()
+
+    def _tie(self, keyframe: Keyframe) -> None:
+        """Tie a keyframe to the one that it was found by, or that it is found by now: a replay has not looked yet."""
+        if self._place is None:
+            others = [other for other in self.keyframes.searchable() if other is not keyframe]
+            self._place = self.recogniser.find(keyframe, others)
+        if self._place is not None:
+            self._link(keyframe, self._place.edge._replace(later=keyframe.number))
+        self._place = None
+
+    def _link(self, keyframe: Keyframe, edge: Edge) -> None:
+        if edge.earlier not in keyframe.linked:
+            keyframe.linked.add(edge.earlier)
+            self.edges.append(edge)
+
+    def _close(self, keyframe: Keyframe, most: int = MOST) -> None:
+        """Look for loops that a keyframe closes."""
+        earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
+        candidates = find_candidates(keyframe, earlier, self.keyframes.camera, most)
+        for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
+            keyframe.tried[candidate.earlier.number] = candidate.later_T_earlier
+            if edge is not None:
+                self._link(keyframe, edge)
+
+    def _optimise(self, reweighted: int = 0) -> Solution:
+        """Move all keyframes to where odometry and loops want them."""
+        keyframes = self.keyframes.all
+        poses = np.stack([keyframe.world_T_camera for keyframe in keyframes])
+        solution = optimise(poses, self.odometry_edges(), self.edges, self._scale, reweighted)
+        self._scale = solution.scale
+        for keyframe, pose in zip(keyframes, solution.world_T_camera, strict=True):
+            keyframe.world_T_camera = pose
+        return solution
+
+    def odometry_edges(self) -> list[Edge]:
+        """The odometry's motions from keyframe to keyframe."""
+        keyframes = self.keyframes.all
+        edges = []
+        for a, b in zip(keyframes, keyframes[1:], strict=False):
+            covariance = UNKNOWN**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
+            edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
+        return edges
+
+
+def _decoded(sequence: Sequence, index: int) -> Frame | None:
+    try:
+        return sequence[index]
+    except FrameError:
+        return None
+
+
+def _key(stamp: float) -> str:
+    return f"{stamp:.6f}"

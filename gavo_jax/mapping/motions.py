@@ -1,0 +1,62 @@
+"""Rigid motions in double precision on the host: what chains of many need, and graphs of them."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from gavo_jax.trajectory import inverse
+
+
+def log(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 6"]:
+    """ξ = (v, w) of a rigid motion, equation (3)'s inverse: metres and radians."""
+    w = Rotation.from_matrix(a_T_b[:3, :3]).as_rotvec()
+    return np.concatenate([np.linalg.solve(_left_jacobian(w), a_T_b[:3, 3]), w])
+
+
+def exp(xi: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
+    """The rigid motion of a twist (v, w), equation (3)."""
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(xi[3:]).as_matrix()
+    result[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]
+    return result
+
+
+def between(
+    start: Float64[np.ndarray, "4 4"], end: Float64[np.ndarray, "4 4"], share: float
+) -> Float64[np.ndarray, "4 4"]:
+    """The pose at a share of the way from one pose to another, along the screw that joins them."""
+    return start @ exp(share * log(inverse(start) @ end))
+
+
+def adjoint(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
+    """A with a_T_b · exp(δ) = exp(A δ) · a_T_b."""
+    result = np.zeros((6, 6))
+    rotation = a_T_b[:3, :3]
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[:3, 3:] = cross(a_T_b[:3, 3]) @ rotation
+    return result
+
+
+def carried(a_T_b: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
+    """The covariance of Aδ, for a step δ in b seen as one in a."""
+    step = adjoint(a_T_b)
+    return step @ covariance @ step.T
+
+
+def cross(a: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Matrix of the cross product with a vector."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+def size(a_T_b: Float64[np.ndarray, "*n 4 4"]) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
+    """Length (m) and angle (rad) of rigid motions."""
+    cosine = (np.trace(a_T_b[..., :3, :3], axis1=-2, axis2=-1) - 1.0) / 2.0
+    return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _left_jacobian(w: np.ndarray) -> np.ndarray:
+    """V with exp(v, w) moved by V v."""
+    angle, hat = float(np.linalg.norm(w)), cross(w)
+    if angle < 1e-4:
+        return np.eye(3) + 0.5 * hat + hat @ hat / 6.0
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * hat + (angle - np.sin(angle)) / angle**3 * (hat @ hat)

@@ -1,0 +1,112 @@
+"""A frame as a camera without rolling shutter would have taken it, at half its size, its depth read at the same moment.
+
+A keyframe is aligned with others from other times, where neither frame's motion is the motion between the two. So what
+its own motion did to it is taken out once, and everything after sees plain images of one moment each.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.pyramid import EDGE_TOLERANCE
+from gavo_jax.image.shutter import row_time
+
+HALVING = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0
+"""As of `pyramid.halve_grey`."""
+UNKNOWN_DEPTH = 2.0
+"""Metres that a pixel is taken to be away where the whole image has no reading."""
+
+
+class Still(NamedTuple):
+    """What a keyframe keeps of its images: a camera of half the size, `Camera.level(1)`."""
+
+    grey: UInt8[np.ndarray, "h w"]
+    depth: UInt16[np.ndarray, "h w"]
+    """In the camera's units, 0 = no reading."""
+
+
+def still(
+    grey: UInt8[np.ndarray, "height width"],
+    depth: UInt16[np.ndarray, "height width"],
+    camera: Camera,
+    twist: Float[np.ndarray, " 6"],
+    depth_delay: float = 0.0,
+) -> Still:
+    """Images of one moment from those that a moving camera took.
+
+    A point P of the frame's moment is seen in row v at exp(t ξ̂) P, t = `row_time`(v) readouts; its depth is read a
+    delay later. To first order each pixel looks grey and depth up where its point was then.
+
+    Args:
+        grey: Intensities.
+        depth: Raw depth, 0 = no reading.
+        camera: Of the images, without distortion.
+        twist: Motion of the points in the camera, (v, w) in m/s and rad/s.
+        depth_delay: Seconds from the colour image's moment to the depth image's.
+    """
+    grey, depth, camera = halve_grey(grey), halve_depth(depth), camera.level(1)
+    twist = np.asarray(twist, np.float32)
+    if not np.any(twist):
+        return Still(grey, depth)
+    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
+    flow = _flow(camera, u, v, _filled_inverse_depth(depth, camera), twist)
+    seconds = np.float32(camera.readout) * row_time(v, camera)
+    seconds = seconds + np.float32(camera.readout / camera.height) * flow[1] * seconds
+    if camera.readout:
+        column, row = u + seconds * flow[0], v + seconds * flow[1]
+        grey = cv2.remap(grey, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    seconds = seconds + np.float32(depth_delay)
+    column, row = u + seconds * flow[0], v + seconds * flow[1]
+    read = cv2.remap(depth, column, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    moved = read - seconds * (read * flow[2] + np.float32(twist[2] * camera.depth_scale))
+    top = np.iinfo(np.uint16).max
+    depth = np.where((read > 0) & (moved > 0) & (moved < top), np.round(moved), 0.0).astype(np.uint16)
+    return Still(grey, depth)
+
+
+def _flow(
+    camera: Camera, u: np.ndarray, v: np.ndarray, q: np.ndarray, twist: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motion of each pixel along u and v, pixels a second, and the rotation's part in its depth's relative rate."""
+    x, y = to_ray(camera, u, v)
+    (a, b, c), (wx, wy, wz) = twist[:3], twist[3:]
+    forward = wx * y - wy * x
+    away = forward + c * q
+    along_u = camera.fx * (wy - wz * y + a * q - x * away)
+    along_v = camera.fy * (wz * x - wx + b * q - y * away)
+    return along_u.astype(np.float32), along_v.astype(np.float32), forward.astype(np.float32)
+
+
+def _filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """1/z [1/m], gaps filled from their surroundings."""
+    known = depth > 0
+    q = np.where(known, camera.depth_scale / np.maximum(depth, 1), 0.0).astype(np.float32)
+    usual = np.float32(np.median(q[known])) if known.any() else np.float32(1.0 / UNKNOWN_DEPTH)
+    size = (2 * (camera.width // 16) + 1,) * 2
+    count = cv2.blur(known.astype(np.float32), size)
+    around = cv2.blur(q, size)
+    return np.where(known, q, np.where(count > 0.01, around / np.maximum(count, 0.01), usual))
+
+
+def halve_grey(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
+    """Half the size, as the pyramid does it."""
+    height, width = (size // 2 * 2 for size in grey.shape)
+    blurred = cv2.sepFilter2D(
+        grey[:height, :width], cv2.CV_32F, HALVING, HALVING, anchor=(1, 1), borderType=cv2.BORDER_REPLICATE
+    )
+    return np.clip(np.round(blurred[::2, ::2]), 0, 255).astype(np.uint8)
+
+
+def halve_depth(depth: UInt16[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h2 w2"]:
+    """Half the size: of each 2 × 2 block the mean of the nearest surface's readings, as the pyramid does it."""
+    height, width = (size // 2 * 2 for size in depth.shape)
+    block = depth[:height, :width].reshape(height // 2, 2, width // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
+    readings = np.where(block > 0, block.astype(np.float32), np.inf)
+    nearest = readings.min(axis=0)
+    kept = readings <= nearest / (1.0 - EDGE_TOLERANCE)
+    kept &= np.isfinite(readings)
+    mean = np.where(kept, readings, 0.0).sum(axis=0) / np.maximum(kept.sum(axis=0), 1)
+    return np.round(mean).astype(np.uint16).reshape(height // 2, width // 2)

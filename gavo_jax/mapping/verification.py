@@ -1,0 +1,139 @@
+"""Whether two keyframes show the same place, and where they stand to each other: aligned there and back."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.alignment.pairs import Images, align_rows
+from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.camera import Camera
+from gavo_jax.mapping.candidates import MOST, Candidate
+from gavo_jax.mapping.motions import between, carried, size
+from gavo_jax.mapping.settling import Still
+from gavo_jax.settings import AlignmentOptions, Settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
+
+SETTINGS = Settings(
+    GaussNewton(iterations=(12, 12, 15, 20, 0), patience=2),
+    AlignmentOptions(
+        points=(4800, 1200, 1200, 1200, 1200), depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3), views=(1, 1, 1, 1, 1)
+    ),
+)
+"""Gauss-Newton from the guess, both ways. The images have half the size, so that a level here is the next coarser one
+of the frame's."""
+MIN_OVERLAP = 0.5
+"""Of the alignment, either way."""
+MAX_DISAGREEMENT = (0.02, 0.02)
+"""Metres and radians between the motions found there and back."""
+FLOOR = 1e-3
+"""Metres and radians that a pair of keyframes is off by beside what its covariance says: each keyframe's velocity,
+hence its rolling shutter, is known to a few per cent."""
+SHARED = 4.0
+"""On the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
+
+
+class Edge(NamedTuple):
+    """What is known of the motion between two keyframes."""
+
+    earlier: int
+    later: int
+    earlier_T_later: Float64[np.ndarray, "4 4"]
+    covariance: Float64[np.ndarray, "6 6"]
+    """Of δ in earlier_T_later · exp(δ), metres and radians."""
+    overlap: float = 1.0
+    disagreement: tuple[float, float] = (0.0, 0.0)
+    """Metres and radians between there and back."""
+    alignment: Alignment | None = None
+    """There: the earlier keyframe is the reference."""
+
+
+@dataclass(frozen=True)
+class Verifier:
+    """Aligns candidates both ways, from the guess.
+
+    Attributes:
+        camera: Of the keyframes' images.
+        settings: How.
+    """
+
+    camera: Camera
+    settings: Settings = SETTINGS
+
+    def warm_up(self) -> None:
+        """Compile the program, or load it."""
+        size = (MOST, self.camera.height, self.camera.width)
+        nothing = Images(np.zeros(size, np.uint8), np.zeros(size, np.uint16))
+        self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
+
+    def verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+        """Edges of the candidates that stand; None for the others."""
+        edges: list[Edge | None] = []
+        for start in range(0, len(candidates), MOST):
+            edges += self._verify(candidates[start : start + MOST])
+        return edges
+
+    def _verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+        """Align there, and back only what stands; each from the guess, so that they are two opinions."""
+        guesses = [candidate.later_T_earlier for candidate in candidates]
+        sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
+        there = self._one_way(sides[0], sides[1], guesses)
+        standing = [k for k in range(len(candidates)) if _stands(there[k])]
+        earlier, later = ([side[k] for k in standing] for side in sides)
+        back = self._one_way(later, earlier, [inverse(guesses[k]) for k in standing])
+        edges: list[Edge | None] = [None] * len(candidates)
+        for k, result in zip(standing, back, strict=True):
+            if _stands(result):
+                edges[k] = _edge(candidates[k], there[k], result)
+        return edges
+
+    def _one_way(
+        self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]
+    ) -> list[Alignment]:
+        if not guesses:
+            return []
+        padding = [(0, MOST - len(guesses)), (0, 0), (0, 0)]
+
+        def stacked(side: list[Still | None]) -> Images:
+            known = [images for images in side if images is not None]
+            return Images(
+                np.pad(np.stack([images.grey for images in known]), padding),
+                np.pad(np.stack([images.depth for images in known]), padding),
+            )
+
+        result = self._align(stacked(references), stacked(targets), np.pad(np.stack(guesses), padding), len(guesses))
+        return [jax.tree.map(lambda leaf, k=k: leaf[k], result) for k in range(len(guesses))]
+
+    def _align(self, references: Images, targets: Images, guesses: np.ndarray, count: int) -> Alignment:
+        keys = jax.random.split(jax.random.key(0), len(guesses))
+        sides = [Images(jnp.asarray(side.grey), jnp.asarray(side.depth)) for side in (references, targets)]
+        rows = align_rows(sides, self.camera, self.settings, keys, jnp.asarray(guesses, jnp.float32)[:, None], count)
+        return on_host(rows)
+
+
+def _stands(result: Alignment) -> bool:
+    return result.status == AlignmentStatus.OK and float(result.overlap) >= MIN_OVERLAP
+
+
+def _edge(candidate: Candidate, there: Alignment, back: Alignment) -> Edge | None:
+    """The edge of a candidate that was aligned there and back, if these agree."""
+    by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
+    metres, radians = (float(part) for part in size(inverse(by_way_there) @ by_way_back))
+    if metres > MAX_DISAGREEMENT[0] or radians > MAX_DISAGREEMENT[1]:
+        return None
+    covariance = carried(inverse(by_way_there), np.asarray(there.covariance, np.float64))
+    covariance = 0.5 * (covariance + np.asarray(back.covariance, np.float64))
+    return Edge(
+        candidate.earlier.number,
+        candidate.later.number,
+        between(by_way_there, by_way_back, 0.5),
+        SHARED * (covariance + FLOOR**2 * np.eye(6)),
+        float(min(there.overlap, back.overlap)),
+        (metres, radians),
+        there._replace(status=AlignmentStatus.OK),
+    )

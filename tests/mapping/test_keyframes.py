@@ -1,0 +1,189 @@
+"""Keyframes: settled, bounded in number, found again; the driver that asks for them."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from small import CAMERA
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.mapping.candidates import find_candidates
+from gavo_jax.mapping.correction import correct, loop_figures
+from gavo_jax.mapping.keyframes import Keyframes
+from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.mapping.motions import exp, log, size
+from gavo_jax.mapping.settling import still
+from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.driver import Found, Odometry, Step
+from gavo_jax.odometry.run import guessed, trajectory_of
+from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
+from gavo_jax.settings import Settings
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import Trajectory, inverse
+
+RATE = 10.0
+
+
+def there_and_back(frames: int) -> Trajectory:
+    """To the side and back again, with a turn."""
+    way = 0.5 * (1.0 - np.cos(2 * np.pi * np.arange(frames) / (frames - 1)))
+    body = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.3], [0.0, 0.0, 0.0, 1.0]])
+    poses = np.stack([body @ exp(np.array([0.35, 0.02, 0.0, 0.02, 0.3, 0.03]) * w) for w in way])
+    return Trajectory(np.arange(frames) / RATE, poses)
+
+
+WALK = SyntheticSequence(trajectory=there_and_back(25), noise=NONE, camera=CAMERA)
+
+
+def test_a_settled_frame_is_that_of_a_global_shutter():
+    rolling = replace(CAMERA, readout=0.06)
+    path = there_and_back(25)
+    skewed = SyntheticSequence(trajectory=path, noise=NONE, camera=rolling)[6]
+    straight = WALK[6]
+    truth = WALK.ground_truth.world_T_camera
+    back = inverse(truth[7]) @ truth[5]
+    twist = log(back) * RATE / 2
+    plain, settled, wanted = (
+        still(frame.grey, frame.depth, rolling, motion)
+        for frame, motion in ((skewed, np.zeros(6)), (skewed, twist), (straight, np.zeros(6)))
+    )
+
+    def off(images) -> float:
+        inner = (slice(4, -4), slice(6, -6))
+        return float(np.abs(images.grey[inner].astype(float) - wanted.grey[inner]).mean())
+
+    assert off(settled) < 0.5 * off(plain)
+    known = (settled.depth > 0) & (wanted.depth > 0)
+    assert np.median(np.abs(settled.depth[known].astype(float) - wanted.depth[known])) < 25  # 5 mm
+
+
+def test_images_are_bounded_and_the_likest_are_candidates():
+    truth = WALK.ground_truth.world_T_camera
+    keyframes = Keyframes(CAMERA, most=10)
+    for i in range(25):
+        keyframes.add(keyframes.make(WALK[i], i, 0, inverse(truth[0]) @ truth[i], np.zeros(6)))
+    kept = keyframes.searchable()
+    assert len(keyframes.all) == 25 and len(kept) == 10
+    assert max(k.index for k in kept) == 24
+    found = find_candidates(keyframes.all[24], kept[:-1], keyframes.camera)
+    assert found and all(c.likeness > 0.8 and c.overlap >= 0.5 for c in found)
+    assert all(c.later.timestamp - c.earlier.timestamp >= 1.0 for c in found)
+    numbers = sorted(c.earlier.number for c in found)
+    assert all(b - a >= 3 for a, b in zip(numbers, numbers[1:], strict=False))
+
+
+def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:
+    """Steps of an odometry that is off by a little more in each, and says so."""
+    truth, world, steps = sequence.ground_truth.world_T_camera, np.eye(4), []
+    for i in range(1, len(sequence)):
+        motion = inverse(inverse(truth[i - 1]) @ truth[i] @ exp(drift))
+        world = world @ inverse(motion)
+        alignment = no_alignment(AlignmentStatus.OK)._replace(
+            target_T_reference=motion, covariance=np.diag(drift**2 + 1e-6)
+        )
+        steps.append(Step(i, (i - 1) / RATE, i / RATE, alignment, world, 0.0, False))
+    return steps
+
+
+def test_loops_bring_the_end_back_to_where_it_was():
+    pytest.importorskip("gtsam")
+    mapper, steps = Mapper(CAMERA), drifting(WALK, np.array([2e-3, -1e-3, 1e-3, 0.0, 1e-3, 5e-4]))
+    mapper.watch(WALK[0], None)
+    for step in steps:
+        mapper.watch(WALK[step.index], step)
+    loops, causal = mapper.finish(), trajectory_of(0.0, steps)
+    trajectory = correct(causal, loops)
+    truth = WALK.ground_truth.world_T_camera
+    end = inverse(truth[0]) @ truth[-1]
+    before, after = (size(inverse(end) @ of.world_T_camera[-1]) for of in (causal, trajectory))
+    assert loop_figures(loops)["loops"] > 0 == loop_figures(loops)["loops_refused"]
+    assert before[0] > 0.03 and after[0] < 0.15 * before[0] and after[1] < 0.2 * before[1]
+    again = Mapper(CAMERA)
+    again.replay(WALK, steps)
+    np.testing.assert_allclose(
+        [keyframe.world_T_odometry for keyframe in again.keyframes.all],
+        [keyframe.world_T_odometry for keyframe in loops.keyframes[: len(again.keyframes.all)]],
+    )
+    assert [(e.earlier, e.later) for e in again.edges] == [
+        (e.earlier, e.later) for e in loops.edges[: len(again.edges)]
+    ]
+
+
+class Sure:
+    """An aligner that finds no motion of dark frames or of what comes right after them."""
+
+    def __init__(self):
+        self.was_dark = False
+
+    def warm_up(self) -> float:
+        return 0.0
+
+    def start(self, frame: Frame) -> Any:
+        return 0
+
+    def predict(self, state: Any, elapsed: float) -> np.ndarray:
+        return np.eye(4)
+
+    def align(self, state: Any, frame: Frame, clock: Any) -> Attempt:
+        status = AlignmentStatus.HIGH_ERROR if clock.elapsed > 1.5 / RATE else AlignmentStatus.OK
+        result = no_alignment(status)._replace(overlap=np.float32(1.0), error=np.float32(1.0))
+        return Attempt(0, result, status is AlignmentStatus.OK)
+
+
+class Knows:
+    """A map that knows where a frame is."""
+
+    asked = 0
+
+    def __init__(self, segment: int | None = 0):
+        self.segment = segment
+
+    def find(self, frame: Frame) -> Found | None:
+        self.asked += 1
+        if self.segment is None:
+            return None
+        pose = exp(np.array([0.5, 0, 0, 0, 0, 0]))
+        return Found(no_alignment(AlignmentStatus.OK), 0.1, pose, self.segment)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_covered_lens_is_followed_by_the_map(known):
+    relocaliser = Knows(0 if known else None)
+    driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=relocaliser)
+    steps = []
+    for i in range(16):
+        frame = replace(WALK[i], timestamp=i / RATE)
+        if 4 <= i < 9:
+            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        step = driver.register(frame, frame.timestamp)
+        if step is not None:
+            steps.append(step)
+    origins = [step.origin for step in steps]
+    assert origins[:3] == ["tracked"] * 3 and origins[3:8] == ["guessed"] * 5
+    assert origins[8] == ("relocalised" if known else "guessed")
+    assert [step.segment for step in steps[8:]] == [0 if known else 1] * 7
+    assert relocaliser.asked == (1 if known else 7)
+    assert not steps[8].lost == known
+    row = dict(zip(FRAME_COLUMNS, frame_row(steps[8]), strict=True))
+    assert row["origin"] == origins[8]
+    if known:
+        np.testing.assert_allclose(steps[-1].world_T_camera[0, 3], 0.5)
+    trajectory = trajectory_of(0.0, steps)
+    assert guessed(steps).sum() == (5 if known else 6) and len(guessed(steps)) == len(trajectory)
+
+
+def test_a_frame_is_found_in_the_map_and_another_room_is_not():
+    pytest.importorskip("gtsam")
+    mapper = Mapper(CAMERA)
+    truth = WALK.ground_truth.world_T_camera
+    for i in range(0, 12, 2):
+        keyframe = mapper.keyframes.make(WALK[i], i, 0, inverse(truth[0]) @ truth[i], np.zeros(6))
+        mapper.keyframes.add(keyframe)
+    found = mapper.find(WALK[5])
+    assert found is not None and found.segment == 0
+    metres, radians = size(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
+    assert metres < 0.03 and radians < 0.03
+    assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0]) is None

@@ -1,0 +1,115 @@
+"""The pose graph: right loops correct it, wrong ones don't, and the trajectory between keyframes follows."""
+
+import numpy as np
+import pytest
+
+from gavo_jax.mapping.correction import correct, joined
+from gavo_jax.mapping.keyframes import Keyframe, Look
+from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.motions import adjoint, between, exp, log
+from gavo_jax.mapping.pose_graph import Solution, optimise
+from gavo_jax.mapping.verification import Edge
+from gavo_jax.trajectory import Trajectory, inverse
+
+pytest.importorskip("gtsam")
+RNG = np.random.default_rng(3)
+SIGMA = 0.003
+COUNT = 40
+
+
+def circle() -> np.ndarray:
+    """Twice round a circle, looking ahead."""
+    step = exp(np.array([0.0, 0.0, 0.1, 0.0, 4 * np.pi / COUNT, 0.0]))
+    poses = [np.eye(4)]
+    for _ in range(COUNT - 1):
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
+
+
+TRUTH = circle()
+
+
+def edge(a: int, b: int, sigma: float, motion: np.ndarray | None = None) -> Edge:
+    motion = inverse(TRUTH[a]) @ TRUTH[b] if motion is None else motion
+    return Edge(a, b, motion @ exp(sigma * RNG.normal(size=6)), sigma**2 * np.eye(6))
+
+
+ODOMETRY = [edge(i, i + 1, SIGMA) for i in range(COUNT - 1)]
+LOOPS = [edge(i, i + COUNT // 2, 0.001) for i in range(0, COUNT // 2, 3)]
+FALSE = [edge(int(a), int(b), 0.001, exp(0.3 * RNG.normal(size=6))) for a, b in ((1, 30), (4, 22), (5, 38), (0, 17))]
+
+
+def dead_reckoned() -> np.ndarray:
+    poses = [np.eye(4)]
+    for motion in ODOMETRY:
+        poses.append(poses[-1] @ motion.earlier_T_later)
+    return np.stack(poses)
+
+
+def error(poses: np.ndarray) -> float:
+    return float(np.linalg.norm(poses[:, :3, 3] - TRUTH[:, :3, 3], axis=1).mean())
+
+
+def test_loops_take_most_of_the_drift_away():
+    start = dead_reckoned()
+    solution = optimise(start, ODOMETRY, LOOPS)
+    assert error(solution.world_T_camera) < 0.7 * error(start)
+    assert (solution.weights > 0.5).all()
+    assert np.abs(solution.residuals).max() < 0.01
+    np.testing.assert_allclose(solution.world_T_camera[0], np.eye(4), atol=1e-5)
+
+
+def test_planted_false_loops_change_nothing():
+    start = dead_reckoned()
+    clean, spoilt = optimise(start, ODOMETRY, LOOPS), optimise(start, ODOMETRY, LOOPS + FALSE)
+    assert (spoilt.weights[len(LOOPS) :] < 0.5).all()
+    np.testing.assert_allclose(spoilt.world_T_camera, clean.world_T_camera, atol=2e-3)
+
+
+def test_false_loops_alone_leave_the_odometry_as_it_was():
+    start = dead_reckoned()
+    np.testing.assert_allclose(optimise(start, ODOMETRY, FALSE).world_T_camera, start, atol=1e-6)
+    np.testing.assert_array_equal(optimise(start, ODOMETRY, []).world_T_camera, start)
+
+
+def keyframe(number: int, timestamp: float, odometry: np.ndarray, corrected: np.ndarray, segment: int = 0) -> Keyframe:
+    look = Look(np.zeros((3, 4), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
+    return Keyframe(number, number, timestamp, segment, odometry, corrected, None, None, look)
+
+
+def solved(keyframes: list[Keyframe], edges: list[Edge]) -> Loops:
+    nothing = np.zeros((len(edges), 6))
+    return Loops(keyframes, edges, Solution(np.zeros((0, 4, 4)), np.ones(len(edges)), nothing, 1.0))
+
+
+def test_corrections_change_over_between_keyframes():
+    poses = np.stack([exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(5)])
+    raised = exp(np.array([0.0, 0.04, 0.0, 0.0, 0.0, 0.0])) @ poses[4]
+    loops = solved([keyframe(0, 0.0, poses[0], poses[0]), keyframe(1, 4.0, poses[4], raised)], [])
+    corrected = correct(Trajectory(np.arange(5.0), poses), loops)
+    np.testing.assert_allclose(corrected.world_T_camera[:, 1, 3], [0.0, 0.01, 0.02, 0.03, 0.04], atol=1e-9)
+    np.testing.assert_allclose(corrected.world_T_camera[:, 0, 3], poses[:, 0, 3], atol=1e-9)
+
+
+def test_guesses_are_put_on_the_way_between_what_is_known():
+    poses = np.stack([np.eye(4)] * 5)
+    poses[4, 0, 3] = 0.4
+    loops = solved([keyframe(0, 0.0, poses[0], poses[0]), keyframe(1, 4.0, poses[4], poses[4])], [])
+    guessed = np.array([False, True, True, True, False])
+    corrected = correct(Trajectory(np.arange(5.0), poses), loops, guessed)
+    np.testing.assert_allclose(corrected.world_T_camera[:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-9)
+
+
+def test_a_loop_joins_segments():
+    frames = [keyframe(i, float(i), np.eye(4), np.eye(4), segment=i) for i in range(3)]
+    loops = solved(frames, [edge(0, 2, 0.001)])
+    np.testing.assert_array_equal(joined(np.array([0, 0, 1, 1, 2]), loops), [0, 0, 1, 1, 0])
+
+
+def test_motions_are_their_own_inverses():
+    for xi in (np.zeros(6), 1e-6 * np.arange(6.0), np.array([0.3, -0.2, 0.5, 0.4, -1.0, 0.8])):
+        np.testing.assert_allclose(log(exp(xi)), xi, atol=1e-9)
+    a, b = exp(RNG.normal(size=6)), exp(RNG.normal(size=6))
+    np.testing.assert_allclose(between(a, b, 1.0), b, atol=1e-9)
+    step = 1e-4 * RNG.normal(size=6)
+    np.testing.assert_allclose(a @ exp(step), exp(adjoint(a) @ step) @ a, atol=1e-7)
