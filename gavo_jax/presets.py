@@ -108,13 +108,13 @@ WIDE_OBJECTIVE = AlignmentOptions(
     outside_cost=1.0,
     bounds=(1.0, 1.2),
 )
-"""Motions of up to 1 m and 70° from the guess: thousands of scouts, then 96 populations at level 4, of which the
-16 best distinct ones go on to level 3 and 4 to level 2. A point out of view costs as much as a typical one in view,
-so that leaving the view neither pays nor is shunned. Exposure changes over such motions, so residuals are taken about
-their mean, and while a few modes compete that grey tells apart badly, depth counts as much as grey does; at the finest
-levels, which decide how far the result is off, less. Over a wide baseline one frame may be blurred and each sees what
-the other does not, so both directions count; the winner is refined by Gauss-Newton from the coarsest level again, on
-more points than tracking takes."""
+"""Motions of up to 1 m and 70° from the guess: thousands of scouts, then 96 populations at level 4, of which the 16
+that most speaks for go on to level 3 and 4 are refined; beside them what the features of a single pair ask for. A point
+out of view costs as much as a typical one in view, so that leaving the view neither pays nor is shunned. Exposure
+changes over such motions, so residuals are taken about their mean. Once a mode is refined, grey alone tells its
+neighbours apart badly and depth counts as much; at the finest levels, which decide how far the result is off, less.
+Over a wide baseline one frame may be blurred and each sees what the other does not, so both directions count, on more
+points than tracking takes."""
 
 
 _registered: dict[str, Settings] = {}

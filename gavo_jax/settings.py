@@ -27,8 +27,9 @@ class AlignmentOptions:
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
             (static); see `Objective`.
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
-        refine: Whether the solver stops where islands no longer compete, and the motion that won is taken through all
-            levels once more by Gauss-Newton, with the brightness and scales that are known only then (static).
+        refine: Whether candidates are chosen by the evidence for them instead of by E, and the best ones are taken
+            through all levels by Gauss-Newton, with the brightness and scales that are known only then (static). The
+            solver stops where islands no longer compete. See `alignment.contest`.
         features: What finds the features of two images whose motion competes with what the search finds, where `refine`
             is set (static). Of single pairs alone (`align`), not of a sequence's frames.
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).

@@ -38,6 +38,7 @@ def hold_contest(
     search: Callable[[], tuple[Float[Array, "k 4 4"], Any]],
     aliases: Float[Array, "a 4 4"],
     refine: Callable[[Float[Array, "4 4"], Bool[Array, ""]], Entry],
+    always: bool = False,
 ) -> tuple[Entry, Float[Array, ""], Any]:
     """Refine what is known and, unless that decides it, what a search finds; then the winner on the finest level.
 
@@ -46,10 +47,11 @@ def hold_contest(
         search: Finds K motions, and whatever else is to be kept of it.
         aliases: Motions after which the reference looks as before (`aliases.self_motions`).
         refine: Takes a motion to the nearest one that the frames speak for, on the finest level or on all the others.
+        always: Whether to search even where what is known decides it (static).
 
     Returns:
         The winner; its evidence over a rival's of another mode, of the points that each sees, +inf without one; and
-        what was kept of the search, zeros if there was none.
+        what was kept of the search, not-a-number if there was none.
     """
     found, kept = jax.eval_shape(search)
     places = max(known.shape[0], found.shape[0], aliases.shape[0])
@@ -85,12 +87,17 @@ def hold_contest(
         entered = jax.lax.map(enter, entries)
         rows = jax.tree.map(lambda all, new: all.at[number].set(new), rows, entered)
         best = _best(rows).evidence
-        decided = (best.total > STRONG_TOTAL) & (best.seen > STRONG_SEEN)
+        decided = (not always) & (best.total > STRONG_TOTAL) & (best.seen > STRONG_SEEN)
         return jnp.where((number == KNOWN) & decided, ALIASES, number + 1), rows, kept
 
-    start = (jnp.int32(KNOWN), rows, like(kept))
+    start = (jnp.int32(KNOWN), rows, jax.tree.map(_unknown, kept))
     _, rows, kept = jax.lax.while_loop(lambda carry: carry[0] <= WINNER, hold_round, start)
     return jax.tree.map(lambda leaf: leaf[WINNER, 0], rows), _lead(rows), kept
+
+
+def _unknown(leaf: jax.ShapeDtypeStruct) -> jax.Array:
+    """Not-a-number; 0 where there are whole numbers."""
+    return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0, leaf.dtype)
 
 
 def _competing(rows: Entry) -> Entry:

@@ -90,8 +90,12 @@ def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Flo
     reference = few.reference
     has_reading = reference.points.q > 0
     r = few.residuals(motion)
-    grey_spread = jnp.maximum(jnp.sqrt(2.0) * jnp.std(reference.grey, where=has_reading), LEAST_GREY_SPREAD)
-    depth_spread = jnp.maximum(jnp.sqrt(2.0) * jnp.std(reference.points.q, where=has_reading), LEAST_DEPTH_SPREAD)
+    # a frame without any reading has no spread
+    of_two = [
+        jnp.sqrt(2.0) * jnp.nan_to_num(jnp.std(values, where=has_reading))
+        for values in (reference.grey, reference.points.q)
+    ]
+    grey_spread, depth_spread = map(jnp.maximum, of_two, (LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD))
     depth = jnp.where(few.use_depth, r.depth_valid, 0.0)
     hidden = depth * (r.depth > HIDDEN * DEPTH_SCALE)
     fits = r.inside * jnp.where(depth > 0, jnp.abs(r.depth) < HIDDEN * DEPTH_SCALE, 0.3)

@@ -132,6 +132,10 @@ def align(
 ) -> Alignment:
     """Estimate the motion of the camera between two RGB-D frames.
 
+    Each image counts as taken at one moment, its depth with it, also where stamps and the camera's `readout` are known:
+    the velocity that a rolling shutter or a delay of depth asks for is not the motion between frames far apart, and
+    over a gap the candidate's own motion would be a wrong one. The driver, which knows it, takes both into account.
+
     Args:
         reference: Frame t: a `Frame`, or a pair of arrays (grey, depth) of [H, W]; depth in units of
             `camera.depth_scale` a metre, 0 = no reading.

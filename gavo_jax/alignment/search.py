@@ -149,7 +149,7 @@ def align_views(
             second = jax.tree.map(lambda leaf: leaf[min(1, len(levels.numbers) - 1)], visits)
             itself = comparable_objective(second, target, options, None)
             aliases = self_motions(itself, exchanged.target)
-        winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine)
+        winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine, record)
         search = Search(winner.motion[None], box, winner.brightness, lead)
         centre = winner.motion
         # nothing competes any more
