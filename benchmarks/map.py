@@ -25,8 +25,12 @@ from gavo_jax.trajectory import inverse
 FARTHEST = 4.0
 """Metres: depth beyond is not in the map."""
 
-SIZE, ABOVE, BEHIND, VIEW = (1280, 960), -0.25, -0.9, 55.0
+SIZE, ABOVE, BEHIND, VIEW = (1000, 750), -0.25, -0.75, 55.0
 """Of the picture: pixels, metres above and behind the first camera, degrees from side to side."""
+
+
+BACKGROUND = 45
+"""Grey level where nothing is."""
 
 
 def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -39,7 +43,7 @@ def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.nda
 
 
 def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB of the mesh as a camera sees it, by casting a ray through each pixel; white where there is nothing."""
+    """RGB of the mesh as a camera sees it, by casting a ray through each pixel; dark where there is nothing."""
     open3d = import_open3d()
     tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
     rays = open3d.t.geometry.RaycastingScene()
@@ -54,7 +58,7 @@ def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[
     corners = scene.colors[faces[np.where(seen, triangle, 0)]].astype(float)
     weights = np.stack([1 - share.sum(-1), share[..., 0], share[..., 1]], axis=-1)
     color = np.einsum("hwkc,hwk->hwc", corners, weights)
-    return np.where(seen[..., None], np.rint(np.clip(color, 0, 255)), 255).astype(np.uint8)
+    return np.where(seen[..., None], np.rint(np.clip(color, 0, 255)), BACKGROUND).astype(np.uint8)
 
 
 def looking_on() -> Float[np.ndarray, "4 4"]:
@@ -95,7 +99,7 @@ def main(
     camera, frame = sequence.camera, sequence[index]
     depth = frame.depth / camera.depth_scale
     v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
-    points = camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u])
+    points = np.asarray(camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u]))
     away = distances(scene, points @ step.world_T_camera[:3, :3].T + step.world_T_camera[:3, 3])
     figures = {"median_m": float(np.median(away)), "p90_m": float(np.percentile(away, 90)), "points": len(away)}
     rows = [

@@ -75,7 +75,7 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
     for scene, name in ((cloud, "a.ply"), (cloud, "a.pcd"), (mesh, "b.ply"), (mesh, "b.obj")):
         scene.write(tmp_path / name)
     assert len(open3d.io.read_point_cloud(str(tmp_path / "a.pcd")).points) == len(cloud.points)
-    assert len(open3d.io.read_triangle_mesh(str(tmp_path / "b.ply")).triangles) == len(mesh.triangles)
+    assert len(open3d.io.read_triangle_mesh(str(tmp_path / "b.ply")).triangles) == len(np.asarray(mesh.triangles))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pcd", "a.ply", "b.obj", "b.ply"]
 
 

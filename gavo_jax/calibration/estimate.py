@@ -48,6 +48,10 @@ ROUNDS = 2
 TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0}
 """One standard deviation from which on a number is not determined: seconds, seconds, share, pixels."""
 
+SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0}
+"""Deviation that all pairs share, so that their scatter tells nothing of it: how far off rendered frames of a known
+camera come out. Seconds, seconds, share, pixels."""
+
 STEPS_DEVIATION = 0.04
 """Share by which cameras of that make differ in the factor of their steps."""
 SNAP = 0.08
@@ -243,9 +247,9 @@ def _judged(leasts: dict[str, Least], trial: _Trial) -> dict[str, Found]:
     found = {}
     for name, least in leasts.items():
         kind, unit, how = _KINDS[name]
-        most = TOO_UNSURE[kind] * (getattr(trial.camera, name) if kind == "focal_length" else 1.0)
-        if least.deviation < most:
-            found[name] = Found(least.value, least.deviation, unit, how)
+        scale = getattr(trial.camera, name) if kind == "focal_length" else 1.0
+        if least.deviation < TOO_UNSURE[kind] * scale:
+            found[name] = Found(least.value, float(np.hypot(least.deviation, SHARED[kind] * scale)), unit, how)
         else:
             found[name] = Found(None, None, unit, "the motion in these frames leaves it open")
     return found

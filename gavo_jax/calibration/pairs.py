@@ -130,9 +130,12 @@ class Kinematics(NamedTuple):
             velocity[2:-2] = (7 * (between[1:-2] + between[2:-1]) - between[:-3] - between[3:]) / 12
         acceleration = np.zeros_like(velocity)
         acceleration[1:-1] = (between[1:] - between[:-1]) / ((seconds[1:] + seconds[:-1]) / 2)
-        rows = (velocity, acceleration, np.concatenate([between, between[-1:]]))
-        guesses = jnp.concatenate([matched.target_T_reference, jnp.eye(4)[None]])
-        return cls(*(jnp.asarray(row, jnp.float32) for row in rows), guesses)
+        return cls(
+            jnp.asarray(velocity, jnp.float32),
+            jnp.asarray(acceleration, jnp.float32),
+            jnp.asarray(np.concatenate([between, between[-1:]]), jnp.float32),
+            jnp.concatenate([matched.target_T_reference, jnp.eye(4)[None]]),
+        )
 
 
 class Matched(NamedTuple):

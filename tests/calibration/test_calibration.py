@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small import CAMERA
@@ -30,7 +31,7 @@ def shaken(stamps: np.ndarray) -> Trajectory:
     for t in stamps:
         turn = [0.08 * np.sin(14 * t), 0.07 * np.sin(11 * t + 1), 0.03 * np.sin(9 * t)]
         shift = [0.04 * np.sin(12 * t + 2), 0.03 * np.sin(10 * t), 0.02 * np.sin(8 * t)]
-        poses.append(LEVEL @ np.asarray(exp(np.array([*shift, *turn], np.float32)), np.float64))
+        poses.append(LEVEL @ np.asarray(exp(jnp.array([*shift, *turn])), np.float64))
     return Trajectory(stamps, np.stack(poses))
 
 

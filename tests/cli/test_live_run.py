@@ -1,6 +1,7 @@
 """`gavo run` over a live device: a stand-in that plays a few rendered frames."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,8 @@ from command import runner
 from small import CAMERA, NEWTON
 
 from gavo_jax import presets
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.devices import register_device
 from gavo_jax.datasets.live import LiveImages
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
@@ -23,12 +26,15 @@ class Player:
 
     name = "player"
 
-    def __init__(self, camera=CAMERA, frames=FRAMES):
+    def __init__(self, camera: Camera = CAMERA, frames: Iterable[Frame] = FRAMES):
         self.camera, self.coming = camera, iter(frames)
 
     def read(self):
         frame = next(self.coming, None)
-        return frame and LiveImages(frame.color, frame.depth, frame.timestamp, None)
+        if frame is None:
+            return None
+        assert frame.color is not None
+        return LiveImages(frame.color, frame.depth, frame.timestamp, None)
 
     def close(self):
         pass

@@ -89,6 +89,7 @@ def test_images_of_another_size_or_type_are_refused(changes, words):
 def test_frames_are_rectified():
     raw = images(3)
     frame, plain = frame_of(raw, LENS, color=True), frame_of(raw, CAMERA, color=True)
+    assert plain.color is not None
     np.testing.assert_array_equal(frame.color, LENS.undistort_image(plain.color))
     np.testing.assert_array_equal(frame.depth, LENS.undistort_depth(plain.depth))
     assert not np.array_equal(frame.grey, plain.grey)

@@ -1,6 +1,8 @@
 import csv
 import json
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from evo.tools import file_interface
@@ -14,7 +16,7 @@ from gavo_jax.trajectory import Trajectory
 STAMPS = 1305031102.175304 + np.arange(4) / 30
 TRAJECTORY = Trajectory(
     STAMPS,
-    np.stack([np.asarray(exp(np.float32([0.1 * k, 0.2, -0.3, 0.05 * k, 0.4, -0.2])), np.float64) for k in range(4)]),
+    np.stack([np.asarray(exp(jnp.array([0.1 * k, 0.2, -0.3, 0.05 * k, 0.4, -0.2])), np.float64) for k in range(4)]),
     np.array([0, 0, 1, 1]),
 )
 
@@ -47,7 +49,9 @@ def test_bag_holds_the_poses_and_is_replaced(tmp_path):
     for trajectory in (TRAJECTORY[:2], TRAJECTORY):
         write_trajectory(trajectory, tmp_path / "bag", "bag")
     with AnyReader([tmp_path / "bag"]) as reader:
-        messages = [(stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()]
+        messages: list[tuple[int, Any]] = [
+            (stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()
+        ]
         assert {c.topic for c in reader.connections} == {POSES}
     stamps = [m.header.stamp.sec + m.header.stamp.nanosec * 1e-9 for _, m in messages]
     np.testing.assert_allclose(stamps, STAMPS, atol=1e-6)
