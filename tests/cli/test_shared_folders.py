@@ -115,8 +115,9 @@ def rows_of(out: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells}
 
 
-def test_a_changed_experiment_is_told_apart_from_what_it_was(gavo):
+def test_a_changed_experiment_is_told_apart_from_what_it_was(gavo, monkeypatch):
     """Frames and settings of one name are not one method, and are not paired by seed."""
+    monkeypatch.setenv("COLUMNS", "200")
     for frames, iterations in ((40, 8), (34, 8), (34, 9)):
         toml = write("e.toml", EXPERIMENT, seeds=3, frames=frames, iterations=iterations)
         done = gavo("experiment", toml, "--output", "out")

@@ -153,6 +153,7 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
         return preset.solver.damping, 1.0 / preset.solver.damping
 
     monkeypatch.setattr(tuning, "measure", measured)
+    monkeypatch.setenv("COLUMNS", "120")
     out = tmp_path / "study"
     assert main(["tune", str(tuned), "--output", str(out)]) == 0
     assert "Pareto front" in capsys.readouterr().out and (out / "study.db").exists()
