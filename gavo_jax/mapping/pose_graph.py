@@ -8,10 +8,13 @@ loop decides where it ends.
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from scipy.stats import chi2
 
 from gavo_jax.errors import GavoError
+from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.verification import Edge
+from gavo_jax.trajectory import inverse
 
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """GTSAM's order of a twist."""
@@ -19,6 +22,10 @@ PROBABILITY = 0.99
 """That the residual of a right loop stays below what makes a loop count as wrong."""
 REWEIGHTED = 2
 """Times that the odometry's weight is told anew and the graph optimised with it."""
+SECOND_CHANCES = 4
+"""Times that the loops which fit are told anew."""
+IMPOSSIBLE = 1.0 - 1e-6
+"""That the residual of a right loop against the odometry alone stays below what makes a loop look wrong beforehand."""
 MISTRUST = 4.0
 """On the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
 SCALES = (0.1, MISTRUST)
@@ -82,18 +89,68 @@ def optimise(
     for number, pose in enumerate(poses):
         start.insert(number, _pose(gtsam, pose))
     trusted = len(odometry) + 1
-    doubting = _graph(gtsam, poses[0], odometry, loops, MISTRUST)
-    values, weights = _without_false_loops(gtsam, doubting, start, trusted)
-    kept = [edge for edge, weight in zip(loops, weights, strict=True) if weight > COUNTED]
-    for attempt in range(reweighted + 1):
-        # what the search for false loops ends with may still lean to those that it gave up last
-        graph = _graph(gtsam, poses[0], odometry, kept, scale)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        if kept and attempt < reweighted:
-            scale = float(np.clip(scale * _surprise(graph, values, trusted), *SCALES))
+    # the search for false loops may lose its way among many wild ones, and odometry may drift further than it says:
+    # of both ways to begin the one that more loops agree with
+    plausible = _plausible(poses, odometry, loops)
+    beginnings = [plausible] if plausible.all() else [plausible, np.ones(len(loops), bool)]
+    found = []
+    for beginning in beginnings:
+        values, counted = start, np.zeros(len(loops), bool)
+        if beginning.any():
+            doubting = _graph(gtsam, poses[0], odometry, _chosen(loops, beginning), MISTRUST)
+            values, weights = _without_false_loops(gtsam, doubting, start, trusted)
+            counted[beginning] = weights > COUNTED
+        found.append(_settled(gtsam, values, counted, poses[0], odometry, loops, scale))
+    values, counted = max(found, key=lambda one: int(one[1].sum()))
+    for _ in range(reweighted if counted.any() else 0):
+        graph = _graph(gtsam, poses[0], odometry, _chosen(loops, counted), scale)
+        scale = float(np.clip(scale * _surprise(graph, values, trusted), *SCALES))
+        values, counted = _settled(gtsam, values, counted, poses[0], odometry, loops, scale)
     solved = np.stack([values.atPose3(number).matrix() for number in range(len(poses))])
     residuals = np.stack([_residual(gtsam, values, edge) for edge in loops])
-    return Solution(solved, weights, residuals, scale)
+    return Solution(solved, counted.astype(np.float64), residuals, scale)
+
+
+def _chosen(loops: list[Edge], which: Bool[np.ndarray, " loops"]) -> list[Edge]:
+    return [edge for edge, chosen in zip(loops, which, strict=True) if chosen]
+
+
+def _settled(
+    gtsam: Any,
+    values: Any,
+    counted: Bool[np.ndarray, " loops"],
+    first: np.ndarray,
+    odometry: list[Edge],
+    loops: list[Edge],
+    scale: float,
+) -> tuple[Any, Bool[np.ndarray, " loops"]]:
+    """The optimum with the loops that count, told anew by whether they fit it until that changes nothing."""
+    before = counted
+    for _ in range(SECOND_CHANCES):
+        graph = _graph(gtsam, first, odometry, _chosen(loops, counted), scale)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        before, counted = counted, np.array([_fits(gtsam, values, edge) for edge in loops])
+        if (counted == before).all():
+            break
+    return values, before
+
+
+def _plausible(
+    poses: Float64[np.ndarray, "n 4 4"], odometry: list[Edge], loops: list[Edge]
+) -> Bool[np.ndarray, " loops"]:
+    """Which loops are within what odometry that drifts can be off by."""
+    chain, spread = [poses[0]], [np.zeros((6, 6))]
+    for edge in odometry:
+        chain.append(chain[-1] @ edge.earlier_T_later)
+        spread.append(spread[-1] + carried(chain[-1], edge.covariance))
+    result = []
+    for edge in loops:
+        said = inverse(chain[edge.earlier]) @ chain[edge.later]
+        residual = log(inverse(edge.earlier_T_later) @ said)
+        drifted = carried(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
+        squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
+        result.append(squared < chi2.ppf(IMPOSSIBLE, 6))
+    return np.array(result)
 
 
 def _graph(gtsam: Any, first: np.ndarray, odometry: list[Edge], loops: list[Edge], scale: float) -> Any:
@@ -130,6 +187,12 @@ def _surprise(graph: Any, values: Any, trusted: int) -> float:
     own = jacobian[rows]
     redundancy = own.shape[0] - np.einsum("ij,jk,ik->", own, covariance, own, optimize=True)
     return float(((residual[rows] ** 2).sum() + BELIEF) / (redundancy + BELIEF))
+
+
+def _fits(gtsam: Any, values: Any, edge: Edge) -> bool:
+    """Whether what the poses say of a loop is within what its covariance allows."""
+    residual = _residual(gtsam, values, edge)
+    return bool(residual @ np.linalg.solve(edge.covariance, residual) < chi2.ppf(PROBABILITY, 6))
 
 
 def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:

@@ -114,6 +114,21 @@ def test_run_writes_its_files(gavo, pristine, tmp_path):
     assert evaluated.status == 0 and f"{metrics['rpe_translation_rmse_m_per_s']:.6f}" in evaluated.out
 
 
+def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
+    pytest.importorskip("gtsam")
+    out, camera = tmp_path / "out", ("--camera", pristine / "camera.toml")
+    command = ("run", pristine, *camera, "--output", out, *FAST, "--loops")
+    assert gavo(*command).status == 0
+    metrics = read_json(out / "metrics.json")
+    assert {"odometry_rpe_translation_rmse_m_per_s", "odometry_ate_translation_rmse_m", "loops"} <= set(metrics)
+    assert len(Trajectory.read_tum(out / "trajectory.txt")) == len(Trajectory.read_tum(out / "odometry.txt")) == 36
+    loops = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
+    assert len(loops) == metrics["loops"] + metrics["loops_refused"]
+    assert {row["origin"] for row in read_rows(out)} == {"tracked"}
+    assert gavo(*command, "--resume").status == 0
+    assert gavo(*command[:-1]).status == 0 and not (out / "odometry.txt").exists() and not (out / "loops.csv").exists()
+
+
 def test_same_seed_same_bytes_and_default_folder(gavo, clip, tmp_path):
     arguments = ("run", "clip", "--camera", clip / "camera.toml", *FAST, "--frames", 3, "--seed", 7)
     assert gavo(*arguments).status == 0
