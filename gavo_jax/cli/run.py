@@ -15,10 +15,10 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
+from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
-from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import RECORDING, environment
 from gavo_jax.output.run_folder import RunFolder
@@ -48,7 +48,7 @@ def run(options: Run) -> int:
     with RunFolder(path, getattr(sequence, "files", ())) as folder, viewer:
         odometry = Odometry(sequence.camera, settings, seed=options.seed, record=viewer.wants_populations)
         config = _config(options, settings, sequence)
-        blank = blank_state(sequence.camera, settings.solver, settings.alignment)
+        blank = blank_of(odometry.aligner)
         progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
@@ -117,6 +117,8 @@ def _with_shortcuts(settings: Settings, options: Run) -> Settings:
         odometry = replace(odometry, reference=options.reference)
     if options.on_lost is not None:
         odometry = replace(odometry, on_lost=options.on_lost)
+    if options.bodies is not None:
+        odometry = replace(odometry, bodies=options.bodies)
     return replace(settings, odometry=odometry)
 
 

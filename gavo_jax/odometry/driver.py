@@ -16,6 +16,7 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
+from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
@@ -49,6 +50,8 @@ class Step:
     """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
     segment: int = 0
     """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
+    bodies: tuple[Body, ...] = ()
+    """What moves on its own, where the settings ask for that; see docs/bodies.md."""
 
 
 MAX_HELD = 3
@@ -134,6 +137,7 @@ class Odometry:
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
         candidates: tuple[Population, ...] = ()
+        bodies: tuple[Body, ...] = ()
         if before.tracker is None:
             fit = usable if finding.use is Use.ALL else None
             after = before if fit is None else self._restart(before, fit)
@@ -144,6 +148,10 @@ class Odometry:
             attempt = self.aligner.align(before.tracker, usable, clock_of(before, usable))
             after, result, lost = self._advance(before, usable, finding, attempt)
             candidates = attempt.candidates
+            size = (self.camera.height, self.camera.width)
+            bodies = tuple(
+                in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
+            )
         self.progress, self.candidates = after, candidates
         if before.last_index == 0:
             return None
@@ -158,6 +166,7 @@ class Odometry:
             lost,
             self.settings.odometry.on_lost if lost else "",
             after.segment,
+            bodies,
         )
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:

@@ -22,6 +22,7 @@ from gavo_jax.trajectory import write_lines
 from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
+BODIES = "bodies.csv"
 CHECKPOINT = "checkpoint.npz"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""
