@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.identity import Roll, parts
+from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.datasets.base import Frame
@@ -27,6 +27,8 @@ from gavo_jax.status import AlignmentStatus, bit
 
 DOUBTFUL = 0.1
 """Share of what was at rest that moves, from which on a motion may not be the camera's."""
+MAJORITY = 0.5
+"""Support from which on a motion is taken for the camera's although its points agree badly."""
 ROUNDS = 3
 """Of searching without what moves by the last round's motion, at most."""
 GAIN = 0.01
@@ -175,7 +177,8 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     motion has nearly as much support, or much of the image speaks against both, it may be a body's.
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
-    if float(belief.contradicted) < DOUBTFUL and known and not int(result.findings) & ~EXCUSED:
+    seen = known or float(belief.contradicted) > LEAST
+    if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~EXCUSED:
         result = result._replace(status=AlignmentStatus.OK, findings=0)
         attempt = attempt._replace(result=result, usable=True)
     rivals = [other for other in tried if other.rank[0] and not _agree(other.attempt, attempt)]

@@ -72,7 +72,7 @@ SATURATED = 250.0
 """Grey level from which an image may have been cut off."""
 SLACK = 0.4
 """Pixels that a true motion may seem off by: shutter, stamps and registration of depth."""
-SLACK_OF_FLOW = 0.1
+SLACK_OF_FLOW = 0.04
 """The same for each pixel that the image moves by between neighbouring frames."""
 FEW = 16
 """One pixel of so many tells the brightness."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Integer
 
 LEAST = 0.008
 """Share of the image that a body covers at least."""
-SHOWS = 0.025
+SHOWS = 0.03
 """Evidence, as a share of the image that is known to move, that shows a body,"""
 KEEPS = 0.006
 """and that one needs that was known in the frame before."""
@@ -38,11 +38,10 @@ class Roll(NamedTuple):
     @classmethod
     def empty(cls, size: tuple[int, int]) -> "Roll":
         """Nothing is known, of an image of some height and width."""
-        none = np.zeros(MOST, np.int32)
         return cls(
             np.zeros(size, np.int32),
-            none,
-            none,
+            np.zeros(MOST, np.int32),
+            np.zeros(MOST, np.int32),
             np.zeros((MOST, 6), np.float32),
             np.ones(MOST, np.float32),
             np.int32(0),  # pyright: ignore[reportArgumentType]
