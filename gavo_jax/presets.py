@@ -177,7 +177,9 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         return Settings(
             _paper_solver(method),
             PAPER_OBJECTIVE,
-            OdometryOptions(reference="previous", prior=False, synchronise=False, rolling_shutter=False, recover=False),
+            OdometryOptions(
+                reference="previous", prior=False, synchronise=False, rolling_shutter=False, recover=False, bodies="off"
+            ),
         )
     if name == "default":
         return Settings(_DEFAULT[method], AlignmentOptions(), OdometryOptions())

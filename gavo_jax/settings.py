@@ -98,6 +98,8 @@ class OdometryOptions:
             sequence tells both stamps.
         rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
+        bodies: Whether what moves on its own is left out of the search: `off` no, `mask` yes; `track` finds each body's
+            own motion, too. See docs/bodies.md.
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
         loops: Whether a map of keyframes is kept, which closes loops: the trajectory is then corrected by them.
     """
@@ -108,6 +110,7 @@ class OdometryOptions:
     synchronise: bool = static(True)
     rolling_shutter: bool = static(True)
     recover: bool = static(True)
+    bodies: Literal["off", "mask", "track"] = static("mask")
     on_lost: Literal["hold", "predict", "stop"] = static("hold")
     loops: bool = static(False)
 

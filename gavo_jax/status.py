@@ -29,6 +29,7 @@ class AlignmentStatus(enum.IntEnum):
     NOT_RIGID = 16
     IMPLAUSIBLE_MOTION = 17
     DEPTH_MISMATCH = 18
+    MOVING_BODY = 19
 
     @property
     def sentence(self) -> str:
@@ -56,10 +57,12 @@ _SENTENCES = {
     AlignmentStatus.NOT_RIGID: "The result is no rigid motion: this machine computes wrong numbers (see gavo doctor).",
     AlignmentStatus.IMPLAUSIBLE_MOTION: "A camera can hardly move like that: the image may not belong to its stamp.",
     AlignmentStatus.DEPTH_MISMATCH: "Depth does not agree with the motion that the images show.",
+    AlignmentStatus.MOVING_BODY: "The motion may be that of a body that covers much of the image, not the camera's.",
 }
 
 GRAVITY = (
     AlignmentStatus.AMBIGUOUS,
+    AlignmentStatus.MOVING_BODY,
     AlignmentStatus.LOW_TEXTURE,
     AlignmentStatus.IMPLAUSIBLE_MOTION,
     AlignmentStatus.DEPTH_MISMATCH,

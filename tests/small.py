@@ -9,8 +9,8 @@ from gavo_jax.solvers.genetic import GeneticAlgorithm
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 PLAIN_ERROR = AlignmentOptions(robust_scale=False, brightness=False, depth=False, last_step=False, loss=l2)
 """Grey alone: half as long to compile as the default one."""
-ALONE = OdometryOptions(recover=False)
-"""No second search behind the first one."""
+ALONE = OdometryOptions(recover=False, bodies="off")
+"""No second search behind the first one, and nothing that looks for bodies."""
 NEWTON = Settings(GaussNewton(iterations=(0, 0, 0, 10, 20)), PLAIN_ERROR, ALONE)
 GENETIC = Settings(
     GeneticAlgorithm(population=(0, 0, 0, 8, 16), iterations=(0, 0, 0, 6, 8)), AlignmentOptions(last_step=False), ALONE

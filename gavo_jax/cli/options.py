@@ -71,6 +71,11 @@ class Run(Search, Source):
         arg(metavar="{hold,predict,stop}", help_behavior_hint="(default: the preset's)"),
     ] = None
     """After a pair without a usable motion: stand still, keep the last motion, or end the run."""
+    bodies: Annotated[
+        Literal["off", "mask", "track"] | None,
+        arg(metavar="{off,mask,track}", help_behavior_hint="(default: the preset's)"),
+    ] = None
+    """What moves on its own: part of the scene; left out of the search; or that, and its own motion found, too."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-METHOD-PRESET)")] = (
         None
     )

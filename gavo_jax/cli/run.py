@@ -19,10 +19,10 @@ from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics, errors_before
 from gavo_jax.odometry.run import guessed, trajectory_of
-from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, environment
 from gavo_jax.output.loops import write_loops
@@ -69,7 +69,7 @@ def run(options: Run) -> int:
             relocaliser=mapper,
         )
         config = _config(options, settings, sequence)
-        blank = blank_state(sequence.camera, settings.solver, settings.alignment)
+        blank = blank_of(odometry.aligner)
         progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
@@ -166,6 +166,8 @@ def _with_shortcuts(settings: Settings, options: Run) -> Settings:
         odometry = replace(odometry, reference=options.reference)
     if options.on_lost is not None:
         odometry = replace(odometry, on_lost=options.on_lost)
+    if options.bodies is not None:
+        odometry = replace(odometry, bodies=options.bodies)
     return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
 
 

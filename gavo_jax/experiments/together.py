@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.bodies.scene import AwareState
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -133,10 +135,6 @@ def _track_stack(
     return jax.vmap(one)(states, clocks, keys, settings)
 
 
-NEW_ROW: Any = object()
-"""Stands for a lane's state after its first attempt at a frame: a row of the new stack."""
-
-
 @dataclass
 class _Stacked:
     """The search of one run of a stack: its first attempt at a frame was made with the others'."""
@@ -144,6 +142,8 @@ class _Stacked:
     search: Search
     made: Alignment | None = None
     """That attempt's result; None where there is none, and the run is on its own."""
+    state: Callable[[], TrackerState] | None = None
+    """Gives the state after that attempt: a row of the new stack."""
 
     def warm_up(self) -> float:
         """The stack's program compiles with its first frame."""
@@ -156,9 +156,9 @@ class _Stacked:
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
         """The attempt that was made."""
-        if self.made is None:
+        if self.made is None or self.state is None:
             return self.search.align(state, frame, clock)
-        return Attempt(NEW_ROW, self.made, self.made.status == AlignmentStatus.OK)
+        return Attempt(self.state(), self.made, self.made.status == AlignmentStatus.OK)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """As of a single run."""
@@ -183,33 +183,35 @@ class _Stack:
     def register(self, frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
         """Track one more frame by all lanes; each decides by itself what becomes of it."""
         before = [lane.progress for lane in self.lanes]
-        after = None
         if isinstance(frame, Frame) and all(progress.tracker is not None for progress in before):
-            after = self._attempt(frame, before)
+            self._attempt(frame, before)
         steps = [lane.register(frame, timestamp) for lane in self.lanes]
-        for i, (lane, stacked) in enumerate(zip(self.lanes, self._searches, strict=True)):
-            if lane.progress.tracker is NEW_ROW:
-                lane.progress = lane.progress._replace(tracker=_row(after, i))
+        for stacked in self._searches:
             stacked.made = None
         return steps
 
-    def _attempt(self, frame: Frame, before: Sequence[Progress]) -> TrackerState:
-        """Align a frame by all lanes in one call; each lane keeps its own result, the stack of states is returned."""
+    def _attempt(self, frame: Frame, before: Sequence[Progress]) -> None:
+        """Align a frame by all lanes in one call; each lane keeps its own result and a way to its state."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
         clocks = self._rows([clock_of(progress, frame) for progress in numbered])
         keys = jnp.stack([stacked.search.key for stacked in self._searches])
-        states = self._rows([progress.tracker for progress in before])
+        states = self._rows([_tracker_of(progress.tracker) for progress in before])
         images = jnp.asarray(frame.grey), jnp.asarray(frame.depth)
         after, results = _track_stack(states, *images, clocks, keys, self._camera, self._settings)
         host = jax.device_get(results)
         for i, stacked in enumerate(self._searches):
             stacked.made = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
-        return after
+            stacked.state = partial(_row, after, i)
 
     def _rows(self, values: Sequence[Any]) -> Any:
         """Stack R pytrees of numbers, laid out over the devices."""
         stacked = jax.tree.map(lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *values)
         return jax.device_put(stacked, self._sharding)
+
+
+def _tracker_of(state: Any) -> TrackerState:
+    """The tracker's part of a lane's state, which may know of bodies too."""
+    return state.tracker if isinstance(state, AwareState) else state
 
 
 def _as_array(leaf: Any) -> jax.Array:

@@ -17,6 +17,7 @@ from jaxtyping import Float64, PRNGKeyArray
 from gavo_jax import presets
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
+from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
@@ -39,6 +40,8 @@ class Attempt(NamedTuple):
     """and whether the frame may then become the reference."""
     candidates: tuple[Population, ...] = ()
     """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
+    bodies: tuple[Seen, ...] = ()
+    """What moves on its own, as far as that was asked."""
 
 
 class Aligner(Protocol):
@@ -130,7 +133,7 @@ def _by_level(populations: Population | None) -> tuple[Population, ...]:
 
 def traced_part(options: OdometryOptions) -> OdometryOptions:
     """The options that shape the program; the others are reset, so that they cause no second compilation."""
-    return replace(options, recover=True, on_lost="hold", loops=False)
+    return replace(options, recover=True, bodies="off", on_lost="hold", loops=False)
 
 
 @dataclass(frozen=True)
@@ -247,9 +250,31 @@ def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: 
 
 
 def with_recovery(aligner: Aligner, search: Search) -> Aligner:
-    """An aligner with second thoughts, where the search's settings ask for that: without a depth that does not agree,
-    and with the wide search behind it.
+    """An aligner with second thoughts, where the search's settings ask for that: of bodies that move, without a depth
+    that does not agree, and with the wide search behind it.
     """
     if not search.settings.odometry.recover:
+        return with_bodies(aligner, search)
+    careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
+
+    def behind() -> Aligner:
+        wide = wide_search(search)
+        return with_bodies(wide, wide)
+
+    return Recovering(careful, behind)
+
+
+def blank_of(aligner: Any) -> Any:
+    """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
+    while not hasattr(aligner, "blank_state"):
+        aligner = aligner.first
+    return aligner.blank_state()
+
+
+def with_bodies(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner that leaves out what moves on its own, where the search's settings ask for that."""
+    if search.settings.odometry.bodies == "off":
         return aligner
-    return Recovering(DoubtingDepth(aligner, search), lambda: wide_search(search))
+    from gavo_jax.bodies.aligner import BodyAware  # which is made of what is defined here
+
+    return BodyAware(aligner, search)

@@ -16,6 +16,7 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
+from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
@@ -53,6 +54,8 @@ class Step:
     origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
     """Of the pose: from the reference, from a keyframe of the map (then that is the pair's reference), or from nothing
     (a lost pair)."""
+    bodies: tuple[Body, ...] = ()
+    """What moves on its own, where the settings ask for that; see docs/bodies.md."""
 
 
 class Found(NamedTuple):
@@ -171,6 +174,7 @@ class Odometry:
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
         candidates: tuple[Population, ...] = ()
+        bodies: tuple[Body, ...] = ()
         if before.tracker is None:
             fit = usable if finding.use is Use.ALL else None
             after = before if fit is None else self._restart(before, fit)
@@ -181,6 +185,10 @@ class Odometry:
             attempt = self.aligner.align(before.tracker, usable, clock_of(before, usable))
             after, result, lost = self._advance(before, usable, finding, attempt)
             candidates = attempt.candidates
+            size = (self.camera.height, self.camera.width)
+            bodies = tuple(
+                in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
+            )
         origin, reference_timestamp = "guessed" if lost else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -191,6 +199,7 @@ class Odometry:
                 adrift=0,
             )
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
+            bodies = ()  # those that were seen moved against the last frame, which is not the reference any more
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         self.progress, self.candidates = after, candidates
@@ -208,6 +217,7 @@ class Odometry:
             self.settings.odometry.on_lost if lost else "",
             after.segment,
             origin,
+            bodies,
         )
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:

@@ -16,7 +16,6 @@ import numpy as np
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.driver import Progress
-from gavo_jax.odometry.tracking import TrackerState
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 
@@ -71,7 +70,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     write_bytes(path, data.getvalue())
 
 
-def load_checkpoint(path: Path, blank: TrackerState) -> Checkpoint:
+def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
     """Read what `save_checkpoint` wrote.
 
     Args:

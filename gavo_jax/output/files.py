@@ -24,6 +24,7 @@ from gavo_jax.version import __version__
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
 ODOMETRY, LOOPS = "odometry.txt", "loops.csv"
 """What a run with loops adds: the trajectory as it was before they corrected it, and the loops."""
+BODIES = "bodies.csv"
 CHECKPOINT = "checkpoint.npz"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""

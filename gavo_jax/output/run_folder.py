@@ -18,9 +18,10 @@ import numpy as np
 from gavo_jax.errors import GavoError
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Progress, Step
-from gavo_jax.odometry.tracking import TrackerState
+from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (
+    BODIES,
     CHECKPOINT,
     CONFIG,
     FRAMES,
@@ -145,16 +146,20 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, ODOMETRY, LOOPS, FRAMES, RECORDING, VIEW)
+        remove_files(
+            self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, ODOMETRY, LOOPS, FRAMES, BODIES, RECORDING, VIEW
+        )
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
-        self._open({self._poses: None, FRAMES: None})
+        self._open(dict.fromkeys(self._growing(config)))
         self._files[FRAMES].append(",".join(FRAME_COLUMNS))
+        if BODIES in self._files:
+            self._files[BODIES].append(",".join(BODY_COLUMNS))
         self._files[self._poses].append(TRAJECTORY_HEADER)
         self._files[self._poses].append(format_tum_row(timestamp, np.eye(4)))
         self._whole = (self._marks(), self._seen.up_to(0), None)
 
-    def resume(self, config: Mapping[str, Any], blank: TrackerState) -> Progress | None:
+    def resume(self, config: Mapping[str, Any], blank: Any) -> Progress | None:
         """Open the files of a run that was cut short, without what came after its last checkpoint.
 
         Args:
@@ -178,7 +183,7 @@ class RunFolder:
         if not kept.exists():
             return None
         progress, files, images = load_checkpoint(kept, blank)
-        if set(files) != {self._poses, FRAMES}:
+        if set(files) != set(self._growing(config)):
             raise GavoError(f"{kept}: not a whole checkpoint: run again without --resume")
         if self._seen.up_to(progress.last_index) != images:
             raise GavoError(
@@ -189,6 +194,11 @@ class RunFolder:
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         return progress
+
+    def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:
+        """Files that grow with a run."""
+        bodies = getattr(config.get("odometry"), "bodies", "off")
+        return (self._poses, FRAMES) if bodies == "off" else (self._poses, FRAMES, BODIES)
 
     def finished(self) -> dict[str, Any] | None:
         """The metrics of an earlier run in this folder that came to its end; None where there is none.
@@ -211,9 +221,10 @@ class RunFolder:
         Raises:
             GavoError: the disk is full, or the like; the files then end with the last whole row.
         """
-        row = io.StringIO()
-        csv.writer(row, lineterminator="").writerow(frame_row(step))
-        self._files[FRAMES].append(row.getvalue())
+        self._files[FRAMES].append(_as_line(frame_row(step)))
+        if BODIES in self._files:
+            for body in body_rows(step):
+                self._files[BODIES].append(_as_line(body))
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
             if step.segment != self._segment:
                 comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
@@ -274,6 +285,12 @@ class RunFolder:
             self._cut()
             for file in self._files.values():
                 file.close()
+
+
+def _as_line(values: Sequence[Any]) -> str:
+    row = io.StringIO()
+    csv.writer(row, lineterminator="").writerow(values)
+    return row.getvalue()
 
 
 def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:

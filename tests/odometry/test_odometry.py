@@ -17,6 +17,7 @@ import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
+from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -36,7 +37,7 @@ from gavo_jax.trajectory import Trajectory
 
 CAMERA = DEFAULT_CAMERA.level(1)
 FRAMES = 12
-PLAIN = OdometryOptions(recover=False)
+PLAIN = OdometryOptions(recover=False, bodies="off")
 """No wide search where a pair looks wrong: what happens to lost pairs is the subject here."""
 FRAME_TO_FRAME = replace(PLAIN, reference="previous", prior=False)
 
@@ -615,9 +616,10 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
 def test_the_wide_search_stands_behind_the_default_one() -> None:
     aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
     assert isinstance(aligner, Recovering) and isinstance(aligner.first, DoubtingDepth)
-    search, wide = aligner.first.first, aligner.second()
-    assert isinstance(search, Search) and aligner.first.alone is search
-    assert isinstance(wide, Search) and wide.key == search.key
+    first, alone, second = aligner.first.first, aligner.first.alone, aligner.second()
+    assert isinstance(first, BodyAware) and isinstance(alone, BodyAware) and isinstance(second, BodyAware)
+    search, wide = first.search, second.search
+    assert first.first is search and alone.search is search and second.first is wide and wide.key == search.key
     assert wide.settings.alignment.scouts > 0 and wide.settings.odometry.reference == "previous"
     assert wide.settings.solver.levels == SOLVER.levels
     assert wide.settings.alignment.points == search.settings.alignment.points

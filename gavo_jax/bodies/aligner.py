@@ -1,0 +1,205 @@
+"""The camera's motion among bodies that move: several motions are kept, the image is shared out among them, one chosen.
+
+`BodyAware` stands before a search. Where the motion that the search finds explains the image, and nothing was known to
+move, that is all.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float64, Integer
+
+from gavo_jax.alignment.judgement import UNDETERMINED
+from gavo_jax.bodies.belief import Belief
+from gavo_jax.bodies.identity import LEAST, Roll, parts
+from gavo_jax.bodies.motions import find_motions
+from gavo_jax.bodies.scene import AwareState, Retina
+from gavo_jax.datasets.base import Frame
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search
+from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.se3 import exp, log
+from gavo_jax.status import AlignmentStatus, bit
+
+DOUBTFUL = 0.1
+"""Share of what was at rest that moves, from which on a motion may not be the camera's."""
+MAJORITY = 0.5
+"""Support from which on a motion is taken for the camera's although its points agree badly."""
+ROUNDS = 3
+"""Of searching without what moves by the last round's motion, at most."""
+GAIN = 0.01
+"""Support that a round has to add for another one to follow."""
+LARGE = 0.25
+"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
+MAX_CARRIED = 8
+"""for so many frames."""
+NEARLY_AS_GOOD = 0.85
+"""Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
+SUSPICIOUS = 0.02
+"""Share of the image with bodies, away from where some were, from which on other motions are asked."""
+FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
+"""Of a motion that is worth asking about."""
+EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
+"""What a body may cause by hiding what the points saw."""
+
+
+class Candidate(NamedTuple):
+    """A motion that may be the camera's."""
+
+    attempt: Attempt
+    belief: Belief
+    """Of the last frame's pixels."""
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The larger, the better."""
+        return self.attempt.result.status in FOUND, float(self.belief.support)
+
+
+@dataclass(frozen=True)
+class BodyAware:
+    """An aligner that asks what of the image its motion explains.
+
+    Attributes:
+        first: Makes the first attempt at a frame.
+        search: What that is; it makes all others.
+    """
+
+    first: Aligner
+    search: Search
+
+    @cached_property
+    def retina(self) -> Retina:
+        """What sees bodies."""
+        return Retina(self.search.camera, self.search.settings)
+
+    @property
+    def tracks(self) -> bool:
+        """Whether bodies' motions are found."""
+        return self.search.settings.odometry.bodies == "track"
+
+    def warm_up(self) -> float:
+        """Of the search."""
+        return self.first.warm_up()
+
+    def blank_state(self) -> AwareState:
+        """The state before the first frame, in the shapes and types of every state."""
+        tracker = self.search.blank_state()
+        return AwareState(tracker, self.retina.blank(), tracker.previous if self.tracks else None)
+
+    def start(self, frame: Frame) -> AwareState:
+        """A scene in which nothing is known to move."""
+        tracker = self.first.start(frame)
+        return AwareState(tracker, self.retina.first(tracker), tracker.previous if self.tracks else None)
+
+    def predict(self, state: AwareState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """Of the search."""
+        return self.search.predict(state.tracker, elapsed)
+
+    def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:
+        """Align, and look what moves."""
+        scene, retina = state.scene, self.retina
+        before = np.asarray(scene.roll.labels) > 0
+        attempt = self.first.align(state.tracker, frame, clock)
+        belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+        found, carried = _bodies(belief, before), 0
+        arisen = np.mean((found > 0) & ~_near(before))
+        if arisen > SUSPICIOUS or (not attempt.usable and (np.any(before) or np.any(found))):
+            attempt = self._share_out(state, frame, clock, attempt)
+            if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
+                attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
+            belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+            found = _bodies(belief, before)
+        roll = Roll(*map(np.asarray, scene.roll))
+        seen = ()
+        if np.any(found) or np.any(roll.numbers):
+            roll, seen = find_motions(self, state, frame, clock, attempt, found, belief)
+        tracker: TrackerState = attempt.state
+        whole = tracker.previous if self.tracks else None
+        after = retina.renewed(scene, tracker, attempt.result.target_T_reference, belief)
+        after = after._replace(roll=roll, carried=np.asarray(carried, np.int32))
+        if np.any(found):
+            tracker = retina.without(tracker, found > 0)
+        return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
+
+    def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
+        """The motion that most of what was at rest agrees with.
+
+        Those that may be the camera's are the one that was found, that of what it leaves unexplained, and that of what
+        the last motion, gone on with, explains. The best is searched for again without what moves by it.
+        """
+        scene, tracker, retina = state.scene, state.tracker, self.retina
+
+        def search_without(mask: Array) -> Candidate:
+            attempt = self.search.align(retina.without(tracker, mask), frame, clock)
+            return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
+
+        found = Candidate(first, retina.look_back(scene, first.state, first.result.target_T_reference))
+        predicted = retina.look_back(scene, first.state, exp(tracker.motion * (clock.elapsed / tracker.seconds)))
+        tried = [found]
+        if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
+            tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]
+        best = max(tried, key=lambda candidate: candidate.rank)
+        for _ in range(ROUNDS):
+            again = search_without((best.belief.moving > 0) | best.belief.hidden)
+            gain = float(again.belief.support) - float(best.belief.support)
+            if gain < -GAIN or again.rank[0] < best.rank[0]:
+                break
+            best = again
+            if gain < GAIN:
+                break
+        return _judged(best, tried, bool(np.any(np.asarray(scene.roll.labels))))
+
+    def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+        """The attempt with the motion that the camera has if it goes on as before."""
+        motion = self.predict(state, float(clock.elapsed))
+        xi = np.asarray(log(jnp.asarray(motion, jnp.float32)))
+        result = attempt.result._replace(
+            target_T_reference=motion,
+            xi=xi,
+            covariance=np.diag(np.full(6, UNDETERMINED**2, np.float32)),
+            status=AlignmentStatus.MOVING_BODY,
+            findings=bit(AlignmentStatus.MOVING_BODY),
+        )
+        tracker: TrackerState = attempt.state
+        tracker = tracker._replace(keyframe=tracker.previous, motion=jnp.asarray(xi), usual=state.tracker.usual)
+        return attempt._replace(state=tracker, result=result, usable=True)
+
+
+def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
+    """The best candidate's attempt with what the image as a whole says of it.
+
+    What all of the image at rest speaks for is not wrong because a body hides what its points saw. And where another
+    motion has nearly as much support, or much of the image speaks against both, it may be a body's.
+    """
+    attempt, result, belief = best.attempt, best.attempt.result, best.belief
+    seen = known or float(belief.contradicted) > LEAST
+    if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~EXCUSED:
+        result = result._replace(status=AlignmentStatus.OK, findings=0)
+        attempt = attempt._replace(result=result, usable=True)
+    rivals = [other for other in tried if other.rank[0] and not _agree(other.attempt, attempt)]
+    if any(float(other.belief.support) > NEARLY_AS_GOOD * float(belief.support) for other in rivals):
+        findings = int(result.findings) | bit(AlignmentStatus.MOVING_BODY)
+        status = AlignmentStatus.MOVING_BODY if result.status == AlignmentStatus.OK else result.status
+        attempt = attempt._replace(result=result._replace(status=status, findings=findings))
+    return attempt
+
+
+def _agree(one: Attempt, other: Attempt) -> bool:
+    """Whether two motions are the same, to a centimetre and half a degree."""
+    between = np.linalg.inv(one.result.target_T_reference) @ other.result.target_T_reference
+    return bool(np.linalg.norm(between[:3, 3]) < 0.01 and np.linalg.norm(cv2.Rodrigues(between[:3, :3])[0]) < 0.01)
+
+
+def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:
+    moving, known = jax.device_get((belief.moving, belief.known))
+    return parts(moving, known, before)
+
+
+def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """A mask with a border as wide as a body moves from frame to frame."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0

@@ -1,0 +1,194 @@
+"""What belongs to a body: evidence gathered over area and over time, shared out along surfaces.
+
+Each pixel has a belief between -1 (static) and +1 (moving on its own). It is carried along with the surface that it
+lies on, moved by what the new image says, and smoothed among neighbours that no depth edge separates.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.bodies.evidence import Evidence, View, gather_evidence
+from gavo_jax.camera import Camera
+from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
+
+KEPT = 0.85
+"""Part of a belief that stays from frame to frame where nothing new is known."""
+FAR = 12.0
+"""Depth evidence beyond which what is seen is another surface and not the same one, moved."""
+
+
+class Belief(NamedTuple):
+    """Of every pixel of a view, what is known of it and what is concluded."""
+
+    known: Float[Array, "h w"]
+    """From -1, static, to 1, moving; from the pixel itself and its past."""
+    moving: Float[Array, "h w"]
+    """The same shared out along surfaces: positive where the pixel is taken to be a body's."""
+    support: Float[Array, ""]
+    """Share of what was known to be static that is seen at rest."""
+    contradicted: Float[Array, ""]
+    """Share of it that moves."""
+    hidden: Bool[Array, "h w"]
+    """Which pixels the first of the others does not see, as something stands before them."""
+    arisen: Float[Array, ""]
+    """Share of the image that moves and was not known to."""
+
+
+@partial(jax.jit, static_argnames="carried")
+def form_belief(
+    here: View,
+    others: View,
+    others_T_here: Float[Array, "v 4 4"],
+    camera: Camera,
+    before: Float[Array, "h w"],
+    *,
+    carried: bool,
+) -> Belief:
+    """What a motion makes of every pixel of a view.
+
+    Args:
+        here: The view.
+        others: V others that it is compared with; the first is its neighbour in time, the others further off.
+        others_T_here: The motions into them.
+        camera: Of the views' level.
+        before: What was known before: of the first of the others' pixels where it is to be `carried`, else of these.
+        carried: See `before`.
+    """
+    evidence = gather_evidence(here, others, others_T_here, camera)
+    known = _carry(before, evidence) if carried else before
+    moves, rests = _weigh(evidence)
+    moves, rests = _box(moves), _box(rests)
+    news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
+    after = jnp.clip(KEPT * known + 0.5 * news, -1.0, 1.0)
+    grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
+    moving = share_out(after, grey, evidence.inverse_depth)
+    has = (evidence.inverse_depth > 0).astype(jnp.float32)
+    credit = jnp.clip(0.1 - known, 0.0, 1.0) * has
+    hidden = evidence.depth[0] < -FAR
+    at_rest = (moving < 0) & ~hidden & (evidence.seen[0] > 0)
+    total = jnp.maximum(jnp.sum(credit), 1.0)
+    arisen = has * (moving > 0) * (known <= 0)
+    return Belief(
+        after,
+        moving,
+        jnp.sum(credit * at_rest) / total,
+        jnp.sum(credit * (moving > 0)) / total,
+        hidden,
+        jnp.mean(arisen),
+    )
+
+
+def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """How far each pixel speaks for moving, and how far for rest; 0 to 1."""
+    views = e.grey.shape[0]
+    lenient = jnp.where(jnp.arange(views) > 0, 2.0, 1.0)[:, None, None]
+    jump = jnp.abs(e.depth)
+    small = e.depth > 0
+    small |= jump < FAR * lenient
+    consistent = (jump < 3.0 * lenient) | (e.measured == 0)
+    by_grey = consistent * jnp.clip(e.grey / (1.5 * lenient) - 1.0, 0.0, 1.0)
+    by_depth = small * jnp.clip(jump / (3.0 * lenient) - 1.0, 0.0, 1.0)
+    moves = jnp.max(e.seen * jnp.maximum(by_grey, by_depth), axis=0)
+    at_rest = e.seen[0] * consistent[0] * (e.grey[0] < 1.0)
+    told = 0.1 + 0.4 * jnp.clip(e.texture[0] / 6.0, 0.0, 1.0)
+    rests = at_rest * told * (1.0 - moves)
+    return moves, rests
+
+
+def _carry(before: Float[Array, "h w"], e: Evidence) -> Float[Array, "h w"]:
+    """What was known of the surfaces that the pixels lie on, where these were seen in the first other view."""
+    height, width = before.shape
+    u, v = jnp.round(e.place[0]).astype(jnp.int32)
+    u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
+    same = (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < 5.0))
+    return jnp.where(same, before[v, u], 0.0)
+
+
+def _box(image: Float[Array, "h w"], radius: int = 2) -> Float[Array, "h w"]:
+    """Mean over a square of pixels."""
+    size = 2 * radius + 1
+    padded = jnp.pad(image, radius, mode="edge")
+    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, (size, size), (1, 1), "VALID") / size**2
+
+
+ROUNDS = (8, 12, 50)
+"""Of smoothing at each resolution, finest first, each half the one before."""
+DATA_WEIGHT = 0.3
+DEPTH_EDGE = 0.015
+"""Relative step of inverse depth that hardly lets anything across,"""
+GREY_EDGE = 25.0
+"""and step of grey, in grey levels, where depth is missing."""
+
+
+def share_out(
+    known: Float[Array, "h w"], grey: Float[Array, "h w"], inverse_depth: Float[Array, "h w"]
+) -> Float[Array, "h w"]:
+    """Beliefs smoothed among neighbours on one surface, from a coarse image to the full one.
+
+    It minimises Σ c (m − b)² + Σ w (m − m')² over the pixels' m and pairs of neighbours m, m', where c is the strength
+    of a pixel's own belief b and w is small across an edge of depth.
+    """
+    stack = [(known, jnp.abs(known) + 0.01, grey, inverse_depth)]
+    while len(stack) < len(ROUNDS) and min(stack[-1][0].shape) >= 16:
+        b, c, g, q = stack[-1]
+        stack.append((_mean(b), _mean(c), halve_grey(g), halve_inverse_depth(q)))
+    m = stack[-1][0]
+    for (b, c, g, q), rounds in zip(reversed(stack), reversed(ROUNDS[: len(stack)]), strict=True):
+        if m.shape != b.shape:
+            m = _enlarge(m, b.shape)
+        m = _settle(m, b, DATA_WEIGHT * c, _links(g, q), rounds)
+    return m
+
+
+def _settle(
+    m: Float[Array, "h w"],
+    b: Float[Array, "h w"],
+    c: Float[Array, "h w"],
+    links: tuple[Float[Array, "h w"], Float[Array, "h w"]],
+    rounds: int,
+) -> Float[Array, "h w"]:
+    """Some rounds of Jacobi's method."""
+    across, down = links
+    data = c * jnp.clip(3.0 * b, -1.0, 1.0)
+    weight = c + across + jnp.pad(across, ((0, 0), (1, 0)))[:, :-1] + down + jnp.pad(down, ((1, 0), (0, 0)))[:-1]
+
+    def smooth(_: int, m: jax.Array) -> jax.Array:
+        right, below = jnp.pad(m, ((0, 0), (0, 1)))[:, 1:], jnp.pad(m, ((0, 1), (0, 0)))[1:]
+        from_left = jnp.pad(across * m, ((0, 0), (1, 0)))[:, :-1]
+        from_above = jnp.pad(down * m, ((1, 0), (0, 0)))[:-1]
+        return (data + across * right + down * below + from_left + from_above) / weight
+
+    return jax.lax.fori_loop(0, rounds, smooth, m)
+
+
+def _links(grey: Float[Array, "h w"], q: Float[Array, "h w"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """How firmly each pixel is tied to the next one on its right and to the one below; 0 at the image's end."""
+
+    def tie(axis: int) -> jax.Array:
+        end = [(0, 0), (0, 0)]
+        end[axis] = (0, 1)
+        first = [slice(None), slice(None)]
+        first[axis] = slice(1, None)
+        after_q, after_grey = (jnp.pad(a, end)[tuple(first)] for a in (q, grey))
+        both = (q > 0) & (after_q > 0)
+        nearest = jnp.maximum(jnp.maximum(q, after_q), 1e-3)
+        by_depth = jnp.exp(-(((q - after_q) / (DEPTH_EDGE * nearest + 0.003)) ** 2))
+        by_grey = 0.3 * jnp.exp(-(((grey - after_grey) / GREY_EDGE) ** 2))
+        place = jax.lax.broadcasted_iota(jnp.int32, q.shape, axis)
+        return jnp.where(place < q.shape[axis] - 1, jnp.where(both, by_depth, by_grey) + 1e-3, 0.0)
+
+    return tie(1), tie(0)
+
+
+def _mean(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
+    height, width = (size // 2 * 2 for size in image.shape)
+    return image[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+
+
+def _enlarge(image: Float[Array, "h w"], shape: tuple[int, ...]) -> Float[Array, "h2 w2"]:
+    doubled = jnp.repeat(jnp.repeat(image, 2, axis=0), 2, axis=1)
+    return jnp.pad(doubled, [(0, size - had) for size, had in zip(shape, doubled.shape, strict=True)], mode="edge")

@@ -1,0 +1,146 @@
+"""How far a motion explains a whole image, pixel by pixel, against other images of the same scene.
+
+A search weighs few points, the steepest ones; here every pixel of one level has its say, as a body is known by its area
+and not by its contrast.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, UInt32
+
+from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.levels import Levels, image_plane
+from gavo_jax.image.sampling import Target, look_up, sample_depth, sample_grey
+from gavo_jax.image.shutter import row_time
+from gavo_jax.image.warp import Points, Warped, warp
+from gavo_jax.objective.error import Residuals
+from gavo_jax.objective.estimates import estimate_brightness
+
+WIDEST = 160
+"""Pixels: the finest level searched that is not wider is the one that bodies are seen on."""
+
+
+class View(NamedTuple):
+    """One level of a frame, packed as a `Target`, and how the camera moved while its rows were exposed."""
+
+    image: Target
+    """[h, w]."""
+    sweep: Float[Array, "*v 6"]
+    """Twist of the points in the camera during one readout; 0 where all rows are exposed at once."""
+
+
+def seen_level(levels: Levels) -> int:
+    """Place, among the levels searched, of the one that bodies are seen on."""
+    narrow = [place for place, (_, width) in enumerate(levels.sizes) if width <= WIDEST]
+    return narrow[-1] if narrow else 0
+
+
+def view_of(packed: Target, levels: Levels, sweep: Float[Array, " 6"]) -> View:
+    """The level that bodies are seen on, from all packed levels of a frame."""
+    place = seen_level(levels)
+    (row, column), (height, width) = levels.layout.corners[place], levels.sizes[place]
+    cut: list[UInt32[Array, "h w"]] = [channel[row : row + height, column : column + width] for channel in packed]
+    return View(Target(*cut), sweep)
+
+
+class Evidence(NamedTuple):
+    """What every pixel of a view says of a motion, by each of V others; [V, h, w]."""
+
+    grey: Float[Array, "v h w"]
+    """Grey residual over what noise and a small shift of the image would give; 0 where that cannot be told."""
+    depth: Float[Array, "v h w"]
+    """The same of inverse depth: positive where the pixel shows a surface nearer than the one seen there before."""
+    texture: Float[Array, "v h w"]
+    """How far grey would tell a wrong motion: its gradient over what noise gives."""
+    seen: Float[Array, "v h w"]
+    """1 where the pixel has depth and lies inside the other view, else 0."""
+    measured: Float[Array, "v h w"]
+    """1 where the other view has depth there as well."""
+    inverse_depth: Float[Array, "h w"]
+    """Of the pixels, 1/m; 0 where there is no reading."""
+    place: Float[Array, "v 2 h w"]
+    """Column and row where the pixel lies in the other view."""
+
+
+GREY_NOISE = 4.0
+"""Grey levels, interpolation and compression included."""
+DEPTH_NOISE = 0.006
+"""1/m: twice the quantisation of a structured-light sensor."""
+SATURATED = 250.0
+"""Grey level from which an image may have been cut off."""
+SLACK = 0.4
+"""Pixels that a true motion may seem off by: shutter, stamps and registration of depth."""
+SLACK_OF_FLOW = 0.04
+"""The same for each pixel that the image moves by between neighbouring frames."""
+FEW = 16
+"""One pixel of so many tells the brightness."""
+
+
+def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera) -> Evidence:
+    """Every pixel of a view seen in V other views.
+
+    Args:
+        here: The view whose pixels are asked.
+        others: The views they are compared with, a leading axis V on every leaf.
+        others_T_here: Maps points of the camera here into the cameras of the others.
+        camera: Of the views' level.
+    """
+    plane = image_plane(camera)
+    height, width = here.image.grey.shape
+    u, v = jnp.arange(width, dtype=jnp.float32), jnp.arange(height, dtype=jnp.float32)[:, None]
+    u, v = (jnp.broadcast_to(a, (height, width)).reshape(-1) for a in (u, v))
+    one = jnp.ones_like(u)
+    itself = Warped(u, v, one, one)
+    words = look_up(here.image, itself, plane)
+    grey, depth = sample_grey(words, itself), sample_depth(words, itself)
+    q = jnp.where((depth.valid > 0) & (u < width - 1) & (v < height - 1), depth.value, 0.0)
+    points = _swept(Points(*to_ray(plane, u, v), q), here.sweep, -row_time(v, plane))
+
+    def against(image: Target, sweep: Float[Array, " 6"], other_T_here: Float[Array, "4 4"]) -> Residuals:
+        first = warp(points, other_T_here, plane)
+        x, y = to_ray(plane, first.u, first.v)
+        there = _swept(Points(x, y, first.inverse_depth), sweep, row_time(first.v, plane) * first.inside)
+        there = there._replace(q=jnp.where(first.inside > 0, there.q, 0.0))
+        seen = warp(there, jnp.eye(4), plane)
+        words = look_up(image, seen, plane)
+        sample, surface = sample_grey(words, seen), sample_depth(words, seen)
+        depth = (seen.inverse_depth - surface.value) * surface.valid * seen.inside
+        return Residuals(
+            sample.value - grey.value, depth, seen.inside, surface.valid * seen.inside, seen, sample, surface
+        )
+
+    r = jax.vmap(against)(others.image, others.sweep, others_T_here)
+    few: Residuals = jax.tree.map(lambda leaf: leaf[:, ::FEW], r)
+    views = r.grey.shape[0]
+    seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
+    brightness = estimate_brightness(seen_grey[:, ::FEW], few)
+    residual = jnp.abs(r.grey_sample.value - brightness.seen(seen_grey))
+    own = jnp.hypot(grey.along_u, grey.along_v)
+    steep = jnp.maximum(own, jnp.hypot(r.grey_sample.along_u, r.grey_sample.along_v))
+    slope = jnp.hypot(r.depth_sample.along_u, r.depth_sample.along_v)
+    flow = jnp.hypot(r.warped.u[0] - u, r.warped.v[0] - v) * r.inside[0]
+    slack = SLACK + SLACK_OF_FLOW * flow
+    shape = (views, height, width)
+    clipped = jnp.maximum(seen_grey, r.grey_sample.value) > SATURATED
+    told = r.inside * jnp.where(clipped, 0.0, 1.0)
+    return Evidence(
+        grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
+        depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
+        texture=(told * steep / GREY_NOISE).reshape(shape),
+        seen=r.inside.reshape(shape),
+        measured=r.depth_valid.reshape(shape),
+        inverse_depth=q.reshape(height, width),
+        place=jnp.stack([r.warped.u, r.warped.v], axis=1).reshape(views, 2, height, width),
+    )
+
+
+def _swept(points: Points, sweep: Float[Array, " 6"], share: Float[Array, " n"]) -> Points:
+    """Points moved along a share of a small twist, each along its own."""
+    (v, w), (x, y, q) = (sweep[:3], sweep[3:]), points
+    z = 1.0 + share * (w[0] * y - w[1] * x + v[2] * q)
+    z = jnp.where(z > 0.1, z, 1.0)
+    moved_x = (x + share * (w[1] - w[2] * y + v[0] * q)) / z
+    moved_y = (y + share * (w[2] * x - w[0] + v[1] * q)) / z
+    return Points(moved_x, moved_y, q / z)

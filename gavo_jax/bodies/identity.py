@@ -1,0 +1,117 @@
+"""From a mask to bodies: which parts of it hang together, and which body of the frame before each one is."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+LEAST = 0.008
+"""Share of the image that a body covers at least."""
+SHOWS = 0.03
+"""Evidence, as a share of the image that is known to move, that shows a body,"""
+KEEPS = 0.006
+"""and that one needs that was known in the frame before."""
+THICK = 6 / 160
+"""Radius, over the image's width, of a disc that lies within a body."""
+MOST = 8
+"""Bodies at a time; the largest ones count."""
+UNSEEN = 15
+"""Frames after which a body that is not seen is forgotten."""
+
+
+class Roll(NamedTuple):
+    """The bodies that are known, and where they were seen last."""
+
+    labels: Integer[np.ndarray, "h w"]
+    """Number of the body that each pixel of the last frame shows, 0 for none."""
+    numbers: Integer[np.ndarray, " n"]
+    """Of the bodies that are known; 0 where there is none."""
+    ages: Integer[np.ndarray, " n"]
+    """Frames since each was seen."""
+    motions: Float[np.ndarray, "n 6"]
+    """Twist of each one's last motion in the camera, and `seconds` the time it took."""
+    seconds: Float[np.ndarray, " n"]
+    last: Integer[np.ndarray, ""]
+    """The largest number given so far."""
+
+    @classmethod
+    def empty(cls, size: tuple[int, int]) -> "Roll":
+        """Nothing is known, of an image of some height and width."""
+        return cls(
+            np.zeros(size, np.int32),
+            np.zeros(MOST, np.int32),
+            np.zeros(MOST, np.int32),
+            np.zeros((MOST, 6), np.float32),
+            np.ones(MOST, np.float32),
+            np.int32(0),  # pyright: ignore[reportArgumentType]
+        )
+
+
+def parts(
+    moving: Float[np.ndarray, "h w"],
+    known: Float[np.ndarray, "h w"],
+    before: Bool[np.ndarray, "h w"],
+) -> Integer[np.ndarray, "h w"]:
+    """Parts of a mask that hang together and are bodies: 1, 2, … from the largest one; else 0.
+
+    What is thin, or of which little is known, is none: along edges of a true motion depth and grey disagree, too. Less
+    will do for a body that was known.
+
+    Args:
+        moving: Positive where something moves; see `Belief`.
+        known: See `Belief`.
+        before: Where bodies were in the frame before.
+    """
+    mask = moving > 0
+    labels = np.zeros(mask.shape, np.int32)
+    if mask.mean() < LEAST:
+        return labels
+    found = 0
+    count, split, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    thick = THICK * mask.shape[1]
+    for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA]) + 1:
+        if stats[k, cv2.CC_STAT_AREA] < LEAST * mask.size or found == MOST:
+            break
+        part = split == k
+        was_known = np.mean(before[part]) > 0.3
+        evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
+        if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else SHOWS):
+            found += 1
+            labels[part] = found
+    return labels
+
+
+def identify(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
+    """Give each part of a mask the number of the known body that it overlaps most, or a new one.
+
+    Args:
+        found: Of `parts`, in the new frame.
+        roll: Of the frame before, its labels moved to where they are expected in the new one.
+    """
+    overlaps = sorted(
+        (-int(np.sum((found == part) & (roll.labels == number))), part, number)
+        for part in range(1, int(found.max(initial=0)) + 1)
+        for number in roll.numbers[roll.numbers > 0]
+    )
+    given: dict[int, int] = {}
+    for overlap, part, number in overlaps:
+        if overlap < 0 and part not in given and number not in given.values():
+            given[part] = int(number)
+    last = int(roll.last)
+    for part in range(1, int(found.max(initial=0)) + 1):
+        if part not in given:
+            last += 1
+            given[part] = last
+    labels = np.array([0, *(given[part] for part in range(1, len(given) + 1))], np.int32)[found]
+    lasting = [i for i, n in enumerate(roll.numbers) if n > 0 and n not in given.values() and roll.ages[i] < UNSEEN]
+    for i in lasting:  # hidden, or at rest for a moment: where it was seen it is expected
+        labels = np.where((labels == 0) & (roll.labels == roll.numbers[i]), roll.numbers[i], labels)
+    after = Roll.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels)
+    entries = [(n, 0) for n in given.values()] + [(int(roll.numbers[i]), int(roll.ages[i]) + 1) for i in lasting]
+    for place, (number, age) in enumerate(entries[:MOST]):
+        after.numbers[place], after.ages[place] = number, age
+        for old in np.flatnonzero(roll.numbers == number):
+            after.motions[place], after.seconds[place] = roll.motions[old], roll.seconds[old]
+    return after._replace(last=np.int32(last))  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,90 @@
+"""Which bodies a frame shows, and how each has moved: the same search on a body's own points."""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64, Integer
+
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.bodies.belief import Belief
+from gavo_jax.bodies.identity import Roll, identify
+from gavo_jax.bodies.records import Seen
+from gavo_jax.bodies.scene import AwareState, Retina
+from gavo_jax.camera import to_ray
+from gavo_jax.datasets.base import Frame
+from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
+from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.plausibility import Usual
+from gavo_jax.odometry.tracking import Clock
+
+if TYPE_CHECKING:
+    from gavo_jax.bodies.aligner import BodyAware
+
+
+def find_motions(
+    aware: "BodyAware",
+    state: AwareState,
+    frame: Frame,
+    clock: Clock,
+    attempt: Attempt,
+    found: Integer[np.ndarray, "h w"],
+    belief: Belief,
+) -> tuple[Roll, tuple[Seen, ...]]:
+    """The bodies of a new frame by their numbers, with their motions where these are asked for.
+
+    Args:
+        aware: Who asks.
+        state: Before the frame.
+        frame: The new one.
+        clock: When it was taken.
+        attempt: The camera's motion.
+        found: Parts of the new frame that are bodies.
+        belief: Of its pixels.
+    """
+    before = Roll(*map(np.asarray, state.scene.roll))
+    roll = identify(found, before)
+    moving = np.asarray(belief.moving)
+    depth = _inverse_depth(attempt, aware.retina)
+    seen = []
+    for place, (number, age) in enumerate(zip(roll.numbers, roll.ages, strict=True)):
+        part = (roll.labels == number) & (found > 0)
+        if number == 0 or age > 0 or not np.any(part):
+            continue
+        alignment = None
+        if aware.tracks and np.any(before.labels == number):
+            alignment = _align(aware, state, frame, clock, before, int(number))
+            if np.all(np.isfinite(alignment.xi)):
+                roll.motions[place], roll.seconds[place] = alignment.xi, clock.elapsed
+        field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
+        seen.append(Seen(int(number), field, float(np.mean(part)), _centroid(part, depth, aware.retina), alignment))
+    return roll, tuple(seen)
+
+
+def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: Roll, number: int) -> Alignment:
+    """Motion of a body in the camera, by the search on its own points in the last frame."""
+    place = int(np.flatnonzero(before.numbers == number)[0])
+    whole = state.whole
+    assert whole is not None
+    tracker = state.tracker._replace(
+        previous=whole,
+        keyframe=whole,
+        motion=jnp.asarray(before.motions[place], jnp.float32),
+        seconds=jnp.float32(before.seconds[place]),
+        usual=Usual.unknown(),
+    )
+    return aware.search.align(aware.retina.without(tracker, before.labels != number), frame, clock).result
+
+
+def _inverse_depth(attempt: Attempt, retina: Retina) -> Float64[np.ndarray, "h w"]:
+    """1/z of the new frame's pixels; 0 where there is no reading."""
+    return (np.asarray(retina.view(attempt.state).image.depth) & 65535) * INVERSE_DEPTH_STEP
+
+
+def _centroid(part: np.ndarray, inverse_depth: Float64[np.ndarray, "h w"], retina: Retina) -> Float64[np.ndarray, " 3"]:
+    """Mean of the points that the pixels of a mask show, in the camera; not-a-number without any reading."""
+    v, u = np.nonzero(part & (inverse_depth > 0))
+    if len(u) == 0:
+        return np.full(3, np.nan)
+    x, y = to_ray(retina.camera, u, v)
+    return np.mean(np.stack([x, y, np.ones_like(x)]) / inverse_depth[v, u], axis=1)

@@ -1,0 +1,86 @@
+"""What is told of a body: where it is, how it moved, how well that is known."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.trajectory import inverse
+
+
+class Seen(NamedTuple):
+    """A body in one frame, as the camera sees it."""
+
+    number: int
+    """The same from frame to frame, from 1."""
+    field: Float[np.ndarray, "h w"]
+    """Of the level that bodies are seen on; positive where the body is."""
+    share: float
+    """Of the image."""
+    centroid: Float64[np.ndarray, " 3"]
+    """Of the points of it that are seen, metres, in the camera."""
+    alignment: Alignment | None = None
+    """Its motion in the camera, from the reference frame to this one; None where it was not asked for, or where the
+    body was not seen before."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body in one frame, in the world of the run."""
+
+    number: int
+    """The same from frame to frame, from 1."""
+    share: float
+    """Of the image that it covers."""
+    centroid: Float64[np.ndarray, " 3"]
+    """Of the part of it that is seen, metres, in the world."""
+    displacement: Float64[np.ndarray, " 3"]
+    """Way of that centroid since the reference frame, metres, in the world; not-a-number where it is not known."""
+    rotation: Float64[np.ndarray, " 3"]
+    """Rotation vector since then, radians, in the world; likewise."""
+    alignment: Alignment | None
+    """Its motion in the camera from the reference frame to this one: covariance and status are of it. None where it
+    was not asked for, or where the body was not seen before."""
+    field: Float[np.ndarray, "h w"]
+    """Where it is in the image, on a coarse level of it; see `mask`."""
+    size: tuple[int, int]
+    """Height and width of the image."""
+
+    @cached_property
+    def mask(self) -> Bool[np.ndarray, "height width"]:
+        """Pixels of the image, without distortion, that the body covers."""
+        height, width = self.size
+        return cv2.resize(self.field, (width, height), interpolation=cv2.INTER_LINEAR) > 0
+
+    @property
+    def status(self) -> str:
+        """In a word: that of its motion; `seen` where there is none."""
+        return "seen" if self.alignment is None else self.alignment.status.name.lower()
+
+
+def in_world(
+    seen: Seen,
+    world_T_camera: Float64[np.ndarray, "4 4"],
+    world_T_reference: Float64[np.ndarray, "4 4"],
+    size: tuple[int, int],
+) -> Body:
+    """A body where the camera's poses say that it is.
+
+    Args:
+        seen: By the camera.
+        world_T_camera: Of the frame.
+        world_T_reference: Of the frame that its motion is from.
+        size: Height and width of the image.
+    """
+    centroid = world_T_camera[:3, :3] @ seen.centroid + world_T_camera[:3, 3]
+    displacement = rotation = np.full(3, np.nan)
+    if seen.alignment is not None:
+        motion = world_T_camera @ np.asarray(seen.alignment.target_T_reference) @ inverse(world_T_reference)
+        before = inverse(motion)
+        displacement = centroid - (before[:3, :3] @ centroid + before[:3, 3])
+        rotation = cv2.Rodrigues(motion[:3, :3])[0].reshape(3)
+    return Body(seen.number, seen.share, centroid, displacement, rotation, seen.alignment, seen.field, size)

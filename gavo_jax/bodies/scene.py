@@ -1,0 +1,137 @@
+"""What is kept of earlier frames' images, to tell what moves in the next one."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Integer
+
+from gavo_jax.alignment.visits import levels_of
+from gavo_jax.bodies.belief import Belief, form_belief
+from gavo_jax.bodies.evidence import View, seen_level, view_of
+from gavo_jax.bodies.identity import Roll
+from gavo_jax.bodies.masking import without_points
+from gavo_jax.camera import Camera
+from gavo_jax.image.levels import ImagePlane, Levels
+from gavo_jax.image.sampling import Target
+from gavo_jax.objective.points import Reference
+from gavo_jax.odometry.tracking import TrackerState
+from gavo_jax.se3 import rigid_inverse
+from gavo_jax.settings import Settings
+
+OLD = 7
+"""Frames after which an older view takes the place of the one before."""
+
+
+class Scene(NamedTuple):
+    """What is known of the last frame's image, and of older ones to compare the next one with."""
+
+    known: Float[Array, "h w"]
+    """See `Belief`; of the last frame's pixels."""
+    roll: Roll
+    """The bodies that it shows."""
+    views: View
+    """Of the last frame, of an older one and of one between them, [3]: what moves slowly shows in the older one."""
+    views_T_last: Float[Array, "3 4 4"]
+    """Motions from the last frame's camera into these."""
+    age: Integer[np.ndarray, ""]
+    """Frames since the one between them."""
+    carried: Integer[np.ndarray, ""]
+    """Frames for which the last motion has stood in for one that could not be found."""
+
+
+class AwareState(NamedTuple):
+    """State of a search and what is known of the scene."""
+
+    tracker: TrackerState
+    """Its references have no points on bodies."""
+    scene: Scene
+    whole: Reference | None = None
+    """The last frame's points with those on bodies; kept where bodies are tracked."""
+
+
+@dataclass(frozen=True)
+class Retina:
+    """The level of the pyramid that bodies are seen on, and how beliefs are formed there.
+
+    Attributes:
+        full: Camera of level 0.
+        settings: Of the search.
+    """
+
+    full: Camera
+    settings: Settings
+
+    @cached_property
+    def levels(self) -> Levels:
+        """The levels searched."""
+        return levels_of(self.full, self.settings.solver, self.settings.alignment)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Of the level that bodies are seen on."""
+        return self.full.level(self.levels.numbers[seen_level(self.levels)])
+
+    @cached_property
+    def planes(self) -> ImagePlane:
+        """Of the levels searched."""
+        return self.levels.planes(self.full)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of that level."""
+        return self.camera.height, self.camera.width
+
+    def view(self, tracker: TrackerState) -> View:
+        """Of a tracker's last frame."""
+        return view_of(tracker.previous_image, self.levels, tracker.motion * (self.full.readout / tracker.seconds))
+
+    def blank(self) -> Scene:
+        """A scene before the first frame, in the shapes and types of every scene."""
+        words: Any = np.zeros((3, *self.size), np.uint32)
+        views = View(Target(words, words), jnp.zeros((3, 6)))
+        nothing: Any = np.zeros((), np.int32)
+        return Scene(
+            jnp.zeros(self.size), Roll.empty(self.size), views, jnp.tile(jnp.eye(4), (3, 1, 1)), nothing, nothing
+        )
+
+    def first(self, tracker: TrackerState) -> Scene:
+        """A scene of which one frame is known."""
+        return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), self.view(tracker)))
+
+    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
+        """What a motion makes of the new frame's pixels."""
+        views = jax.tree.map(lambda leaf: leaf[:2], scene.views)
+        others_T_here = _moved(scene, target_T_reference)[:2]
+        return form_belief(self.view(tracker), views, others_T_here, self.camera, scene.known, carried=True)
+
+    def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
+        """What a motion makes of the last frame's pixels."""
+        last = jax.tree.map(lambda leaf: leaf[0], scene.views)
+        new = jax.tree.map(lambda leaf: leaf[None], self.view(tracker))
+        motion = jnp.asarray(target_T_reference, jnp.float32)[None]
+        return form_belief(last, new, motion, self.camera, scene.known, carried=False)
+
+    def renewed(self, scene: Scene, tracker: TrackerState, target_T_reference: Any, belief: Belief) -> Scene:
+        """The scene with the new frame as its last one."""
+        others_T_here, age = _moved(scene, target_T_reference), int(scene.age) + 1
+        keep = (1, 2)
+        if age >= OLD:
+            keep, age = (2, 0), 0
+        views = jax.tree.map(
+            lambda new, old: jnp.stack([new, *(old[k] for k in keep)]), self.view(tracker), scene.views
+        )
+        views_T_here = jnp.stack([jnp.eye(4), *(others_T_here[k] for k in keep)])
+        return scene._replace(known=belief.known, views=views, views_T_last=views_T_here, age=np.asarray(age, np.int32))
+
+    def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
+        """A tracker whose references have lost the points on a mask."""
+        return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
+
+
+def _moved(scene: Scene, target_T_reference: Any) -> Float[Array, "3 4 4"]:
+    """Motions from the new frame into the views of the scene."""
+    return scene.views_T_last @ rigid_inverse(jnp.asarray(target_T_reference, jnp.float32))
