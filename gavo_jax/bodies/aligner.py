@@ -105,23 +105,22 @@ class BodyAware:
         scene, retina = state.scene, self.retina
         before = np.asarray(scene.roll.labels) > 0
         attempt = self.first.align(state.tracker, frame, clock)
-        belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
-        found, carried = _bodies(belief, before), 0
+        look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+        found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
         if arisen > SUSPICIOUS or (not attempt.usable and (np.any(before) or np.any(found))):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
                 attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
-            belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
-            found = _bodies(belief, before)
+            look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+            found = _bodies(look.belief, before)
         roll = Roll(*map(np.asarray, scene.roll))
         seen = ()
         if np.any(found) or np.any(roll.numbers):
-            roll, seen = find_motions(self, state, frame, clock, attempt, found, belief)
+            roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
         whole = tracker.previous if self.tracks else None
-        after = retina.renewed(scene, tracker, attempt.result.target_T_reference, belief)
-        after = after._replace(roll=roll, carried=np.asarray(carried, np.int32))
+        after = retina.renewed(scene, look)._replace(roll=roll, carried=np.asarray(carried, np.int32))
         if np.any(found):
             tracker = retina.without(tracker, found > 0)
         return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
