@@ -4,6 +4,7 @@
 move, that is all.
 """
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -83,8 +84,11 @@ class BodyAware:
         return self.search.settings.odometry.bodies == "track"
 
     def warm_up(self) -> float:
-        """Of the search."""
-        return self.first.warm_up()
+        """Compile what every frame needs: the search, and the look at what it explains."""
+        seconds, start = self.first.warm_up(), time.perf_counter()
+        state = self.blank_state()
+        jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
+        return seconds + time.perf_counter() - start
 
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
