@@ -95,7 +95,7 @@ def beliefs(sequence: Carded) -> list[Belief]:
     views = []
     for index in range(FRAMES):
         frame = sequence[index]
-        pyramid = build_pyramid(frame.grey, frame.depth, CAMERA.depth_scale)
+        pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
         views.append(view_of(prepare_target(pyramid, retina.levels), retina.levels, jnp.zeros(6)))
     known, found = jnp.zeros(retina.size), []
     for before, here in pairwise(views):
