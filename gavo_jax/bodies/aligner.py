@@ -36,7 +36,7 @@ GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
 """Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
-MAX_CARRIED = 8
+MAX_CARRIED = 15
 """for so many frames."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
