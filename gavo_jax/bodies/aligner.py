@@ -4,6 +4,7 @@
 move, that is all.
 """
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -35,7 +36,7 @@ GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
 """Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
-MAX_CARRIED = 8
+MAX_CARRIED = 15
 """for so many frames."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
@@ -83,8 +84,11 @@ class BodyAware:
         return self.search.settings.odometry.bodies == "track"
 
     def warm_up(self) -> float:
-        """Of the search."""
-        return self.first.warm_up()
+        """Compile what every frame needs: the search, and the look at what it explains."""
+        seconds, start = self.first.warm_up(), time.perf_counter()
+        state = self.blank_state()
+        jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
+        return seconds + time.perf_counter() - start
 
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
@@ -105,23 +109,22 @@ class BodyAware:
         scene, retina = state.scene, self.retina
         before = np.asarray(scene.roll.labels) > 0
         attempt = self.first.align(state.tracker, frame, clock)
-        belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
-        found, carried = _bodies(belief, before), 0
+        look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+        found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
         if arisen > SUSPICIOUS or (not attempt.usable and (np.any(before) or np.any(found))):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
                 attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
-            belief = retina.look(scene, attempt.state, attempt.result.target_T_reference)
-            found = _bodies(belief, before)
+            look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+            found = _bodies(look.belief, before)
         roll = Roll(*map(np.asarray, scene.roll))
         seen = ()
         if np.any(found) or np.any(roll.numbers):
-            roll, seen = find_motions(self, state, frame, clock, attempt, found, belief)
+            roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
         whole = tracker.previous if self.tracks else None
-        after = retina.renewed(scene, tracker, attempt.result.target_T_reference, belief)
-        after = after._replace(roll=roll, carried=np.asarray(carried, np.int32))
+        after = retina.renewed(scene, look)._replace(roll=roll, carried=np.asarray(carried, np.int32))
         if np.any(found):
             tracker = retina.without(tracker, found > 0)
         return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)

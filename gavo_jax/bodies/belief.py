@@ -17,6 +17,8 @@ from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
 KEPT = 0.85
 """Part of a belief that stays from frame to frame where nothing new is known."""
+NOTHING = 0.004
+"""Share of the image known to move below which no body is looked for: sharing out takes longer than all else."""
 FAR = 12.0
 """Depth evidence beyond which what is seen is another surface and not the same one, moved."""
 
@@ -65,7 +67,11 @@ def form_belief(
     news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
     after = jnp.clip(KEPT * known + 0.5 * news, -1.0, 1.0)
     grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
-    moving = share_out(after, grey, evidence.inverse_depth)
+    moving = jax.lax.cond(
+        jnp.mean(jnp.maximum(after, 0.0)) > NOTHING,
+        lambda: share_out(after, grey, evidence.inverse_depth),
+        lambda: -jnp.ones_like(after),
+    )
     has = (evidence.inverse_depth > 0).astype(jnp.float32)
     credit = jnp.clip(0.1 - known, 0.0, 1.0) * has
     hidden = evidence.depth[0] < -FAR

@@ -1,7 +1,7 @@
 """What is kept of earlier frames' images, to tell what moves in the next one."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -53,6 +53,16 @@ class AwareState(NamedTuple):
     """The last frame's points with those on bodies; kept where bodies are tracked."""
 
 
+class Look(NamedTuple):
+    """A new frame, by some motion."""
+
+    belief: Belief
+    """Of its pixels."""
+    views: View
+    """The scene's, should that be its motion, and `views_T_here` the motions into them."""
+    views_T_here: Float[Array, "3 4 4"]
+
+
 @dataclass(frozen=True)
 class Retina:
     """The level of the pyramid that bodies are seen on, and how beliefs are formed there.
@@ -102,11 +112,17 @@ class Retina:
         """A scene of which one frame is known."""
         return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), self.view(tracker)))
 
-    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
+    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
         """What a motion makes of the new frame's pixels."""
-        views = jax.tree.map(lambda leaf: leaf[:2], scene.views)
-        others_T_here = _moved(scene, target_T_reference)[:2]
-        return form_belief(self.view(tracker), views, others_T_here, self.camera, scene.known, carried=True)
+        keep = (1, 2) if int(scene.age) + 1 < OLD else (2, 0)
+        return _look(
+            (scene.known, scene.views, scene.views_T_last),
+            (tracker.previous_image, tracker.motion, tracker.seconds),
+            np.asarray(target_T_reference, np.float32),
+            np.array(keep, np.int32),
+            self.full,
+            self.levels,
+        )
 
     def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
         """What a motion makes of the last frame's pixels."""
@@ -115,23 +131,37 @@ class Retina:
         motion = jnp.asarray(target_T_reference, jnp.float32)[None]
         return form_belief(last, new, motion, self.camera, scene.known, carried=False)
 
-    def renewed(self, scene: Scene, tracker: TrackerState, target_T_reference: Any, belief: Belief) -> Scene:
+    def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
-        others_T_here, age = _moved(scene, target_T_reference), int(scene.age) + 1
-        keep = (1, 2)
-        if age >= OLD:
-            keep, age = (2, 0), 0
-        views = jax.tree.map(
-            lambda new, old: jnp.stack([new, *(old[k] for k in keep)]), self.view(tracker), scene.views
+        age = (int(scene.age) + 1) % OLD
+        return scene._replace(
+            known=look.belief.known,
+            views=look.views,
+            views_T_last=look.views_T_here,
+            age=np.asarray(age, np.int32),
         )
-        views_T_here = jnp.stack([jnp.eye(4), *(others_T_here[k] for k in keep)])
-        return scene._replace(known=belief.known, views=views, views_T_last=views_T_here, age=np.asarray(age, np.int32))
 
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
         return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
 
 
-def _moved(scene: Scene, target_T_reference: Any) -> Float[Array, "3 4 4"]:
-    """Motions from the new frame into the views of the scene."""
-    return scene.views_T_last @ rigid_inverse(jnp.asarray(target_T_reference, jnp.float32))
+@partial(jax.jit, static_argnames="levels")
+def _look(
+    known: tuple[Float[Array, "h w"], View, Float[Array, "3 4 4"]],
+    new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
+    target_T_reference: Float[Array, "4 4"],
+    keep: Integer[Array, " 2"],
+    camera: Camera,
+    levels: Levels,
+) -> Look:
+    """One program for all that is asked about every frame: a call costs more than what it computes."""
+    before, views, views_T_last = known
+    image, motion, seconds = new
+    here = view_of(image, levels, motion * (camera.readout / seconds))
+    views_T_here = views_T_last @ rigid_inverse(target_T_reference)
+    two = jax.tree.map(lambda leaf: leaf[:2], views)
+    seen = camera.level(levels.numbers[seen_level(levels)])
+    belief = form_belief(here, two, views_T_here[:2], seen, before, carried=True)
+    views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)
+    return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]))
