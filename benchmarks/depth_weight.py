@@ -102,7 +102,7 @@ def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
 def measure(clip: str) -> dict[int, dict[str, float]]:
     """Medians over a clip's pairs, level by level."""
     sequence, settings = common.open_clip(clip), presets.preset("gauss-newton")
-    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False))
+    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False, bodies="off"))
     odometry = Odometry(sequence.camera, settings)
     pairs, states = [], []
 

@@ -8,13 +8,13 @@ from gavo_jax.trajectory import inverse
 
 
 def log(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 6"]:
-    """ξ = (v, w) of a rigid motion, equation (3)'s inverse: metres and radians."""
+    """ξ = (v, w) of a rigid motion, metres and radians."""
     w = Rotation.from_matrix(a_T_b[:3, :3]).as_rotvec()
     return np.concatenate([np.linalg.solve(_left_jacobian(w), a_T_b[:3, 3]), w])
 
 
 def exp(xi: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
-    """The rigid motion of a twist (v, w), equation (3)."""
+    """The rigid motion of a twist (v, w)."""
     result = np.eye(4)
     result[:3, :3] = Rotation.from_rotvec(xi[3:]).as_matrix()
     result[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]

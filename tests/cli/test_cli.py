@@ -212,7 +212,12 @@ def test_a_run_that_dies_leaves_nothing_that_looks_whole(gavo, clip, tmp_path, m
     monkeypatch.setattr(tracked, "track", dies)
     with pytest.raises(RuntimeError, match="power"):
         gavo(*arguments)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "frames.csv", "trajectory.txt"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "bodies.csv",
+        "config.json",
+        "frames.csv",
+        "trajectory.txt",
+    ]
 
 
 def test_refused_run_leaves_an_earlier_one_alone(gavo, clip, tmp_path):

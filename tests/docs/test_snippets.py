@@ -55,7 +55,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         settings = settings if isinstance(settings, gavo.Settings) else gavo.Settings(settings, PLAIN_ERROR, ALONE)
         return align(reference, target, camera, settings, **more)
 
-    monkeypatch.setattr(gavo, "SyntheticSequence", lambda frames: room(min(frames, FRAMES), camera=CAMERA, speed=0.2))
+    def small_room(frames: int, **more: Any) -> gavo.SyntheticSequence:
+        return room(min(frames, FRAMES), camera=CAMERA, speed=0.2, **more)
+
+    monkeypatch.setattr(gavo, "SyntheticSequence", small_room)
     monkeypatch.setattr(gavo, "align", small_align)
     monkeypatch.setattr(gavo, "GeneticAlgorithm", lambda: GENETIC.solver)
     monkeypatch.setattr(gavo, "AlignmentOptions", lambda **own: options(**plain | own))

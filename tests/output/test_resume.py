@@ -19,6 +19,7 @@ from small import CAMERA, GENETIC
 from gavo_jax.cli import main, run
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Progress, track
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.tracking import blank_state
@@ -294,7 +295,7 @@ def test_a_driver_goes_on_from_a_saved_progress(tmp_path, settings: Settings, at
             break
     save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(first.progress, {"frames.csv": Mark(7, "")}))
     second = Odometry(CAMERA, settings)
-    blank = blank_state(CAMERA, settings.solver, settings.alignment)
+    blank = blank_of(second.aligner)
     second.progress, files, _ = load_checkpoint(tmp_path / "checkpoint.npz", blank)
     rest = list(track(sequence, odometry=second))
     assert files == {"frames.csv": Mark(7, "")}
