@@ -2,21 +2,23 @@
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
-from gavo_jax.trajectory import inverse
+from gavo_jax.trajectory import inverse, quaternion_from_rotation
 
 
 def log(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 6"]:
     """ξ = (v, w) of a rigid motion, metres and radians."""
-    w = Rotation.from_matrix(a_T_b[:3, :3]).as_rotvec()
+    *axis, cosine = quaternion_from_rotation(a_T_b[:3, :3])
+    sine = float(np.linalg.norm(axis))
+    w = np.array(axis) * (2.0 * np.arctan2(sine, cosine) / sine if sine > 0 else 2.0)
     return np.concatenate([np.linalg.solve(_left_jacobian(w), a_T_b[:3, 3]), w])
 
 
 def exp(xi: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
     """The rigid motion of a twist (v, w)."""
     result = np.eye(4)
-    result[:3, :3] = Rotation.from_rotvec(xi[3:]).as_matrix()
+    angle, hat = float(np.linalg.norm(xi[3:])), cross(xi[3:])
+    result[:3, :3] += np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (hat @ hat)
     result[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]
     return result
 

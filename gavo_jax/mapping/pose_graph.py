@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.motions import carried, log
@@ -149,7 +149,7 @@ def _plausible(
         residual = log(inverse(edge.earlier_T_later) @ said)
         drifted = carried(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
-        result.append(squared < chi2.ppf(IMPOSSIBLE, 6))
+        result.append(squared < chdtri(6, 1.0 - IMPOSSIBLE))
     return np.array(result)
 
 
@@ -192,7 +192,7 @@ def _surprise(graph: Any, values: Any, trusted: int) -> float:
 def _fits(gtsam: Any, values: Any, edge: Edge) -> bool:
     """Whether what the poses say of a loop is within what its covariance allows."""
     residual = _residual(gtsam, values, edge)
-    return bool(residual @ np.linalg.solve(edge.covariance, residual) < chi2.ppf(PROBABILITY, 6))
+    return bool(residual @ np.linalg.solve(edge.covariance, residual) < chdtri(6, 1.0 - PROBABILITY))
 
 
 def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:
