@@ -34,7 +34,7 @@ from gavo_jax.mapping.verification import Edge
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.metrics import ABSOLUTE_ERROR, DRIFT, FRAMES_PER_SECOND, ROTATION_DRIFT
 from gavo_jax.odometry.run import run_odometry, trajectory_of
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -235,7 +235,7 @@ def main(
     settings, results, wanted = with_loops(method), {}, common.names(parts)
     if "clips" in wanted:
         results["clips"] = rows = compare_clips(common.names(clips), settings)
-        print_table(
+        common.print_table(
             "before → after loops",
             ("clip", "absolute m", "drift m/s", "deg/s", "keyframes", "loops", "refused", "frames/s"),
             [
@@ -248,14 +248,14 @@ def main(
         )
     if "false" in wanted:
         results["false"] = rows = plant_false_loops(common.names(clips)[0], settings)
-        print_table(
+        common.print_table(
             f"false loops planted in {common.names(clips)[0]}, {FALSE_TRIES} tries",
             ("share", "planted", "kept", "worst absolute m"),
             [[number(row["share"], 1), row["planted"], row["kept"], number(row["worst_m"], 4)] for row in rows],
         )
     if "synthetic" in wanted:
         results["synthetic"] = rows = measure_walks(settings, seeds)
-        print_table(
+        common.print_table(
             "error at the end of a synthetic loop",
             ("seed", "odometry mm", "deg", "with loops mm", "deg"),
             [
@@ -270,7 +270,7 @@ def main(
         ]
         scenes += [SyntheticSequence(60, seed=seed) for seed in range(4)]
         results["covered"] = found = try_covered(map_of, tried, scenes, settings, tries, foreign_tries)
-        print_table(
+        common.print_table(
             f"covered for {COVERED} frames; {found['false']} of {found['foreign']} found at foreign scenes",
             ("first frame", "found after", "by", "off by mm", "deg", "right"),
             [

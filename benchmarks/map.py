@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gavo_jax import Reading, open_source, run_odometry
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.scene_map import VOXEL, SceneMap, build_map, import_open3d
 from gavo_jax.trajectory import inverse
 
@@ -108,7 +108,7 @@ def main(
         (f"depth of frame {index} from it, median", number(1e3 * figures["median_m"], 2), "mm"),
         ("90th percentile", number(1e3 * figures["p90_m"], 2), "mm"),
     ]
-    print_table(f"map of {clip} by {method}, voxels of {1e3 * voxel:g} mm", ("", "", "unit"), rows)
+    common.print_table(f"map of {clip} by {method}, voxels of {1e3 * voxel:g} mm", ("", "", "unit"), rows)
     if picture_file is not None:
         image = picture(build_map(sequence, run.steps, "mesh", voxel), looking_on())
         cv2.imwrite(str(picture_file), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

@@ -41,7 +41,7 @@ from gavo_jax.evaluation import relative_pose_error, rotation_angle
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import number, print_table
+from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
 from gavo_jax.settings import Settings
@@ -120,8 +120,8 @@ def with_bodies(settings: Settings, mode: str | None) -> Settings:
 
 
 def masks_of(step: Step) -> dict[str, np.ndarray]:
-    """The bodies' masks of a step by their identity, bool [H, W]; none where it knows of none."""
-    return {str(body.identity): np.asarray(body.mask, bool) for body in getattr(step, "bodies", None) or ()}
+    """The bodies' masks of a step by their numbers, bool [H, W]; none where it knows of none."""
+    return {str(body.number): np.asarray(body.mask, bool) for body in getattr(step, "bodies", None) or ()}
 
 
 def read_bodies(folder: Path) -> dict[tuple[str, str], Found]:
@@ -447,7 +447,7 @@ def main(
         for group in groups(some, "method")
     ]
     title = f"{frames} frames, {seeds} seeds, bodies {bodies or 'as by default'}"
-    print_table(title, COLUMNS, [row(summary) for summary in [*parts, *whole]])
+    common.print_table(title, COLUMNS, [row(summary) for summary in [*parts, *whole]])
     standing = {}
     for method in dict.fromkeys(summary.method for summary in whole):
         below, total = standing[method] = below_peers(scores, method)

@@ -362,7 +362,7 @@ def test_found_bodies_are_compared_with_the_true_ones(load, tmp_path: Path) -> N
     assert list(masks) == [1, 2]
     name, overlap = moving.best_match(masks[1], {"7": masks[1], "8": masks[2]})
     assert (name, overlap) == ("7", 1.0) and moving.best_match(masks[1], {}) == (None, 0.0)
-    step = SimpleNamespace(bodies=[SimpleNamespace(identity=7, mask=masks[1])])
+    step = SimpleNamespace(bodies=[SimpleNamespace(number=7, mask=masks[1])])
     assert list(moving.masks_of(step)) == ["7"] and moving.masks_of(SimpleNamespace()) == {}
 
     before, after = room.bodies_truth[0].world_T_part[0, [4, 5]]
