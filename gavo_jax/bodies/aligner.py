@@ -21,7 +21,7 @@ from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.se3 import exp, log
 from gavo_jax.status import AlignmentStatus, bit
@@ -42,6 +42,8 @@ NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
 SUSPICIOUS = 0.02
 """Share of the image with bodies, away from where some were, from which on other motions are asked."""
+SAME = (0.01, 0.01)
+"""Metres and radians within which two motions are the same."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
@@ -184,18 +186,12 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~EXCUSED:
         result = result._replace(status=AlignmentStatus.OK, findings=0)
         attempt = attempt._replace(result=result, usable=True)
-    rivals = [other for other in tried if other.rank[0] and not _agree(other.attempt, attempt)]
+    rivals = [other for other in tried if other.rank[0] and not agree(other.attempt.result, attempt.result, SAME)]
     if any(float(other.belief.support) > NEARLY_AS_GOOD * float(belief.support) for other in rivals):
         findings = int(result.findings) | bit(AlignmentStatus.MOVING_BODY)
         status = AlignmentStatus.MOVING_BODY if result.status == AlignmentStatus.OK else result.status
         attempt = attempt._replace(result=result._replace(status=status, findings=findings))
     return attempt
-
-
-def _agree(one: Attempt, other: Attempt) -> bool:
-    """Whether two motions are the same, to a centimetre and half a degree."""
-    between = np.linalg.inv(one.result.target_T_reference) @ other.result.target_T_reference
-    return bool(np.linalg.norm(between[:3, 3]) < 0.01 and np.linalg.norm(cv2.Rodrigues(between[:3, :3])[0]) < 0.01)
 
 
 def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:

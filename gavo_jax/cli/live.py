@@ -10,6 +10,7 @@ import numpy as np
 
 from gavo_jax.camera_files import load_camera
 from gavo_jax.cli.options import Run
+from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -29,9 +30,6 @@ from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
-
-LOST = 3
-"""As of `cli.run`."""
 
 
 def run_live(options: Run) -> int:

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.evaluation import rotation_angle
 from gavo_jax.trajectory import inverse, quaternion_from_rotation
 
 
@@ -52,8 +53,7 @@ def cross(a: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 
 def size(a_T_b: Float64[np.ndarray, "*n 4 4"]) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
     """Length (m) and angle (rad) of rigid motions."""
-    cosine = (np.trace(a_T_b[..., :3, :3], axis1=-2, axis2=-1) - 1.0) / 2.0
-    return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), rotation_angle(a_T_b[..., :3, :3])
 
 
 def _left_jacobian(w: np.ndarray) -> np.ndarray:

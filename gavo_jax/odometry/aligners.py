@@ -20,6 +20,7 @@ from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.se3 import exp, rigid
 from gavo_jax.settings import OdometryOptions, Settings
@@ -169,7 +170,7 @@ class Recovering:
         if again.usable:
             return again
         confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
-        return attempt._replace(usable=confirmed and _agree(attempt.result, again.result))
+        return attempt._replace(usable=confirmed and agree(attempt.result, again.result))
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the first one."""
@@ -224,10 +225,10 @@ AGREEMENT = (0.02, 0.02)
 """Metres and radians within which two searches ended at the same motion."""
 
 
-def _agree(first: Alignment, second: Alignment) -> bool:
+def agree(first: Alignment, second: Alignment, within: tuple[float, float] = AGREEMENT) -> bool:
+    """Whether two motions are the same within so many metres and radians."""
     between = inverse(np.asarray(first.target_T_reference)) @ second.target_T_reference
-    angle = np.arccos(np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-    return bool(np.linalg.norm(between[:3, 3]) < AGREEMENT[0] and angle < AGREEMENT[1])
+    return bool(np.linalg.norm(between[:3, 3]) < within[0] and rotation_angle(between[:3, :3]) < within[1])
 
 
 def wide_search(search: Search) -> Search:

@@ -10,12 +10,13 @@ import numpy as np
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.output.files import LOOPS
+from gavo_jax.output.frames import DEVIATIONS
 from gavo_jax.trajectory import write_lines
 
 LOOP_COLUMNS = (
     ("earlier", "later", "earlier_timestamp", "later_timestamp", "counted", "overlap")
     + tuple(f"residual_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
-    + tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
+    + DEVIATIONS
     + ("disagreement_m", "disagreement_rad")
 )
 """Indices and stamps of the two frames, whether the loop counts (0: it was found to be wrong), the overlap of the two,
