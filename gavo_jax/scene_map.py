@@ -177,6 +177,38 @@ class MapBuilder:
         )
 
 
+class LiveMap:
+    """A map of frames that come once: those of a run's first segment are fused as they are tracked.
+
+    Args:
+        builder: what fuses them.
+    """
+
+    def __init__(self, builder: MapBuilder) -> None:
+        self._builder = builder
+        self._lost, self._elsewhere = 0, 0
+
+    def watch(self, frame: Frame, step: Step | None) -> None:
+        """Take one more frame; no step: it is the first."""
+        if step is not None and step.lost:
+            self._lost += 1
+        elif step is not None and step.segment:
+            self._elsewhere += 1
+        else:
+            self._builder.add(frame, np.eye(4) if step is None else step.world_T_camera)
+
+    def finish(self, shape: Shape) -> SceneMap:
+        """The map."""
+        return self._builder.extract(shape, _left_out((self._lost, LOST), (self._elsewhere, ELSEWHERE)))
+
+
+LOST, ELSEWHERE, UNREADABLE = "lost", "of another segment", "unreadable"
+
+
+def _left_out(*reasons: tuple[int, str]) -> list[str]:
+    return [f"{count} frames: {why}" for count, why in reasons if count > 0]
+
+
 def build_map(
     sequence: Sequence,
     steps: Iterable[Step],
@@ -216,9 +248,8 @@ def build_map(
                 unreadable += 1
                 continue
             builder.add(frame, corrected.get(float(sequence.timestamps[index]), world_T_camera))
-    reasons = ((len(sequence) - len(poses), "lost"), (int(np.sum(segments != chosen)), "of another segment"))
-    counted = [f"{count} frames: {why}" for count, why in (*reasons, (unreadable, "unreadable")) if count > 0]
-    return builder.extract(shape, counted)
+    lost, elsewhere = len(sequence) - len(poses), int(np.sum(segments != chosen))
+    return builder.extract(shape, _left_out((lost, LOST), (elsewhere, ELSEWHERE), (unreadable, UNREADABLE)))
 
 
 def check_map(path: str | Path, shape: Shape | None = None) -> Shape:

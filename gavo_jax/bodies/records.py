@@ -53,7 +53,11 @@ class Body:
     @cached_property
     def mask(self) -> Bool[np.ndarray, "height width"]:
         """Pixels of the image, without distortion, that the body covers."""
-        height, width = self.size
+        return self.mask_at(self.size)
+
+    def mask_at(self, size: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+        """The same of an image of another height and width."""
+        height, width = size
         return cv2.resize(self.field, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
     @property

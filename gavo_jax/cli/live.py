@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from gavo_jax.camera_files import load_camera
+from gavo_jax.cli.map_file import check_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
@@ -26,6 +27,7 @@ from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
+from gavo_jax.scene_map import LiveMap, MapBuilder
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
@@ -37,6 +39,7 @@ def run_live(options: Run) -> int:
     check_seed(options.seed)
     _refuse_what_cannot_be(options)
     trajectory_formats = formats(options.trajectory_format)
+    shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options = replace(options, method=method, preset=preset)
     device = open_device(options.sequence)
@@ -50,7 +53,8 @@ def run_live(options: Run) -> int:
             compile_seconds = interruptible(odometry.warm_up)
         remove_trajectories(folder.path)
         say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
-        seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings)
+        scene = None if options.map is None else LiveMap(MapBuilder(odometry.camera, options.voxel))
+        seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
         if odometry.progress.last_index < 1:
             raise GavoError(f"{device.name}: ended after {newest.received} frames: at least two are needed")
         steps = folder.steps()
@@ -64,6 +68,8 @@ def run_live(options: Run) -> int:
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)
+        if options.map is not None and scene is not None:
+            write_map(scene.finish(shape), options.map)
     print_run(name, metrics, folder.path, False)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")
     if interrupted:
@@ -79,19 +85,22 @@ def _track(
     folder: RunFolder,
     viewer: Viewer,
     settings: Settings,
+    scene: LiveMap | None,
 ) -> tuple[float, bool]:
     """Track until there is no more; the seconds it took, and whether Ctrl-C came."""
     count, start = 0, time.perf_counter()
     images: LiveImages
     try:
         for images in newest:
-            frame = frame_of(images, camera)
+            frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
             if count == 0:
                 folder.start(_config(options, newest.device, camera, settings), frame.timestamp)
                 viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
                 start = time.perf_counter()
             step = odometry.register(frame, frame.timestamp)
             viewer.watch(frame, step, odometry.candidates)
+            if scene is not None:
+                scene.watch(frame, step)
             if step is not None:
                 folder.add(step, odometry.progress)
             count += 1
@@ -113,7 +122,6 @@ def _refuse_what_cannot_be(options: Run) -> None:
         ("--resume", options.resume),
         ("--start", options.start != 0),
         ("--stride", options.stride != 1),
-        ("--map", options.map is not None),
     ):
         if is_given:
             raise GavoError(f"{option}: not with the live source {options.sequence!r}: record it and run over that")

@@ -7,7 +7,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.screen import say, waiting
-from gavo_jax.scene_map import Shape, build_map, check_map, check_voxel, import_open3d, warn_of
+from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, import_open3d, warn_of
 from gavo_jax.trajectory import Trajectory
 
 
@@ -37,6 +37,15 @@ def save_map(
     """
     with waiting(f"a map of {len(steps) + 1} frames …"):
         scene = build_map(sequence, steps, shape, voxel, trajectory=trajectory)
+    write_map(scene, path)
+
+
+def write_map(scene: SceneMap, path: Path) -> None:
+    """Write a map, and say what is in it.
+
+    Raises:
+        GavoError: it cannot be written.
+    """
     scene.write(path)
     warn_of(scene, path)
     count = f"{len(scene.points)} points" if scene.triangles is None else f"{len(scene.triangles)} triangles"

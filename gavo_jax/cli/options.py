@@ -124,6 +124,8 @@ class View:
     """The output folder of `gavo run`."""
     viewer: Literal["spawn", "web", "save"] = "web"
     """As in `gavo run`; save writes view.rrd into DIR."""
+    search: bool = True
+    """Track the frames once more, so that the particles are seen; without, paths and images are there at once."""
 
 
 @dataclass(frozen=True)

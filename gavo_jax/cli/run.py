@@ -53,7 +53,7 @@ def run(options: Run) -> int:
     shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
-    sequence = open_sequence(options, color=options.map is not None)
+    sequence = open_sequence(options, color=options.map is not None or options.viewer != "none")
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
@@ -136,6 +136,7 @@ def _track(
         speed = (len(tracked.steps) + 1) / (tracked_seconds + time.perf_counter() - start)
         trajectory.write_tum(folder.path / TRAJECTORY)
         write_loops(folder.path, loops)
+        viewer.conclude(trajectory, loops)
         before = compute_metrics(causal, sequence.ground_truth, steps, 0.0, 0.0)
         of_loops = {**errors_before(before), **loop_figures(loops)}
     metrics = {

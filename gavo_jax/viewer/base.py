@@ -10,6 +10,7 @@ from jaxtyping import Float
 from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.mapping.mapper import Loops
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory
 
@@ -39,6 +40,14 @@ class Viewer:
             frame: the frame, or None where it could not be read.
             step: what the odometry said of it; None for the first frame.
             populations: candidates of its search, coarsest level first.
+        """
+
+    def conclude(self, trajectory: Trajectory, loops: Loops) -> None:
+        """Show what a map of the whole run says.
+
+        Args:
+            trajectory: as the map corrects it.
+            loops: the map, with the places that were seen again.
         """
 
     def close(self) -> None:

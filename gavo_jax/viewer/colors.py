@@ -10,6 +10,15 @@ GREY, DARK = (120, 120, 120), (24, 26, 32)
 """Okabe and Ito's colours; blue is best, or below."""
 
 
+BODIES = ((230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))
+"""One after the other for what moves on its own."""
+
+
+def color_of_body(number: int) -> tuple[int, int, int]:
+    """Return the RGB in which a body of that number, from 1, is shown."""
+    return BODIES[(number - 1) % len(BODIES)]
+
+
 def blend(place: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
     """Return RGB from blue (−1) over white (0) to vermilion (1)."""
     channels = [np.interp(place, (-1.0, 0.0, 1.0), values) for values in zip(BLUE, WHITE, VERMILION, strict=True)]

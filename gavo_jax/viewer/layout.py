@@ -19,6 +19,10 @@ IMAGES = {
 """Entities below `images`, and the titles of their views."""
 
 
+GATHERED = ("estimate", "truth", "map", "bodies")
+"""Entities below `world` of which each frame adds a piece."""
+
+
 def make_blueprint() -> Blueprint:
     """Return the layout: search space, trajectories, state and curves above, the four images below.
 
@@ -51,7 +55,7 @@ def make_blueprint() -> Blueprint:
         origin="world",
         name="Trajectory (m): estimate blue, truth white",
         background=DARK,
-        overrides={path: layout.VisibleTimeRanges(everything) for path in ("world/estimate", "world/truth")},
+        overrides={f"world/{name}": layout.VisibleTimeRanges(everything) for name in GATHERED},
     )
     curves = layout.Vertical(
         layout.TextDocumentView(origin="state", name="State"),
@@ -61,7 +65,7 @@ def make_blueprint() -> Blueprint:
     images = [layout.Spatial2DView(origin=f"images/{name}", name=title) for name, title in IMAGES.items()]
     return layout.Blueprint(
         layout.Vertical(
-            layout.Horizontal(search, world, curves, column_shares=[3, 3, 2]),
+            layout.Horizontal(search, world, curves, column_shares=[8, 8, 6]),
             layout.Horizontal(*images),
             row_shares=[5, 2],
         ),

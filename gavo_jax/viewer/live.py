@@ -14,10 +14,11 @@ import sys
 import threading
 import time
 import webbrowser
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Queue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -27,6 +28,7 @@ from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
+from gavo_jax.mapping.mapper import Loops
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer, ViewerMode
@@ -50,8 +52,6 @@ WINDOW_SECONDS = 1.0
 PATIENCE = 60.0
 """Seconds for the server to start, and for the last frames to arrive."""
 NOT_STARTED = "Rerun does not start"
-NOTHING_NEW: Any = ()
-"""In place of a frame, where none came for a while."""
 GUARD = """
 import os, signal, subprocess, sys, threading
 server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
@@ -93,7 +93,8 @@ class RerunViewer(Viewer):
         self.mode, self.recording = mode, recording
         self.url = ""
         """Where a browser finds it, in mode `web`."""
-        self._queue: Queue[Any] = Queue(WAITING_FRAMES)
+        self._queue: Queue[Callable[[Scene], None] | None] = Queue(WAITING_FRAMES)
+        """What is to be added to the scene; None ends it."""
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -119,7 +120,12 @@ class RerunViewer(Viewer):
     def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
         """Queue a frame; waits while `WAITING_FRAMES` others are yet to be shown."""
         self._raise_fault()
-        self._queue.put((frame, step, populations))
+        self._queue.put(lambda scene: scene.add(frame, step, populations))
+
+    def conclude(self, trajectory: Trajectory, loops: Loops) -> None:
+        """Queue what is known in the end."""
+        self._raise_fault()
+        self._queue.put(lambda scene: scene.add_loops(trajectory, loops))
 
     def close(self) -> None:
         """Wait for what is queued.
@@ -190,16 +196,17 @@ class RerunViewer(Viewer):
 
     def _work(self, scene: Scene) -> None:
         """Add what is queued to the scene, and send it every `SECONDS_TOGETHER`, until None comes."""
-        sent, item = time.monotonic(), NOTHING_NEW
-        while item is not None:
+        sent, is_open = time.monotonic(), True
+        while is_open:
             try:
-                item = self._queue.get(timeout=SECONDS_TOGETHER)
+                add, waited = self._queue.get(timeout=SECONDS_TOGETHER), False
             except Empty:
-                item = NOTHING_NEW
+                add, waited = None, True
+            is_open = waited or add is not None
             try:
-                if item and self._fault is None:
-                    scene.add(*item)
-                if not item or time.monotonic() - sent > SECONDS_TOGETHER:
+                if add is not None and self._fault is None:
+                    add(scene)
+                if add is None or time.monotonic() - sent > SECONDS_TOGETHER:
                     scene.send()
                     sent = time.monotonic()
             except Exception as fault:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import cv2
@@ -9,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from gavo_jax.camera import Camera
-from gavo_jax.viewer.colors import RESIDUAL_COLORS
+from gavo_jax.datasets.base import Frame
+from gavo_jax.viewer.colors import RESIDUAL_COLORS, color_of_body
 
 IMAGE_WIDTH = 320
 """Pixels: images are shown at the pyramid level of at most this width."""
@@ -30,8 +32,41 @@ class Shown(NamedTuple):
     grey: UInt8[np.ndarray, "h w"]
     depth: Float[np.ndarray, "h w"]
     """Metres; 0 = no reading."""
+    picture: UInt8[np.ndarray, "h w *channels"]
+    """BGR where the frame has colours, else grey."""
     jpeg: bytes
-    """The grey image, encoded."""
+    """The picture, encoded."""
+
+
+def shrink(frame: Frame, camera: Camera, depth_scale: float) -> Shown:
+    """Return a frame as it is shown.
+
+    Args:
+        frame: as the sequence gives it.
+        camera: of what is shown; see `shown_camera`.
+        depth_scale: of the frame, units per metre.
+    """
+    size, step = (camera.width, camera.height), frame.grey.shape[1] // camera.width
+
+    def resized(image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w *channels"]:
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA) if step > 1 else image
+
+    grey = resized(np.asarray(frame.grey))
+    picture = grey if frame.color is None else cv2.cvtColor(resized(frame.color), cv2.COLOR_RGB2BGR)
+    raw = np.asarray(frame.depth)[step // 2 :: step, step // 2 :: step][: size[1], : size[0]]
+    depth = raw.astype(np.float32) * np.float32(1 / depth_scale)
+    return Shown(frame.timestamp, grey, depth, picture, encode_jpeg(picture))
+
+
+def tinted(
+    picture: UInt8[np.ndarray, "h w *channels"], masks: Iterable[tuple[int, Bool[np.ndarray, "h w"]]]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture as BGR, half of what masks cover in the colours of their bodies' numbers."""
+    shown = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture.copy()
+    for number, mask in masks:
+        color = np.array(color_of_body(number)[::-1], np.float32)
+        shown[mask] = (0.5 * shown[mask] + 0.5 * color).astype(np.uint8)
+    return shown
 
 
 def color_residual(

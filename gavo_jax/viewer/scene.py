@@ -5,19 +5,31 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 
 from gavo_jax.alignment.search import Population
+from gavo_jax.bodies.records import Body
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory, inverse
-from gavo_jax.viewer.colors import BLUE, GREEN, GREY, GREYS, VERMILION, WHITE
+from gavo_jax.viewer.colors import BLUE, GREEN, GREY, GREYS, VERMILION, WHITE, color_of_body, packed
 from gavo_jax.viewer.layout import IMAGES
-from gavo_jax.viewer.pictures import Shown, color_residual, encode_jpeg, rays, shown_camera, warp_target
-from gavo_jax.viewer.search_space import MILLIMETRES, Level, level_of, star_strips
+from gavo_jax.viewer.pictures import (
+    Shown,
+    color_residual,
+    encode_jpeg,
+    rays,
+    shown_camera,
+    shrink,
+    tinted,
+    warp_target,
+)
+from gavo_jax.viewer.search_space import MILLIMETRES, Level, level_of, star_strips, ticks_of
+from gavo_jax.viewer.seen import FARTHEST, SeenCubes
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -52,13 +64,15 @@ class Scene:
 
         self._stream = stream
         self._camera = shown_camera(camera)
-        self._shrink = camera.width // self._camera.width
         self._depth_scale = camera.depth_scale
         self._cloud = np.s_[CLOUD_STRIDE // 2 :: CLOUD_STRIDE, CLOUD_STRIDE // 2 :: CLOUD_STRIDE]
         self._rays = rays(self._camera)[self._cloud]
         self._truth = Truth(stamps, truth)
         self._frame, self._generation = 0, 0
         self._world_T_camera = np.eye(4)
+        self._seen = SeenCubes()
+        self._bodies: dict[int, Float64[np.ndarray, " 3"]] = {}
+        """Where the bodies of the last frame are, by number."""
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
         self._shown: deque[Shown] = deque(maxlen=8)
         """The last frames that could be read; an older one is never a reference."""
@@ -67,13 +81,18 @@ class Scene:
             "search/particles": rr.Points3D,
             "world/camera": rr.Transform3D,
             "world/camera/image": rr.EncodedImage,
-            "world/camera/cloud": rr.Points3D,
+            "world/map": rr.Points3D,
+            "world/bodies": rr.LineStrips3D,
             "world/estimate": rr.LineStrips3D,
             "world/truth": rr.LineStrips3D,
+            "world/corrected": rr.LineStrips3D,
+            "world/loops": rr.LineStrips3D,
             "curves/rmse": rr.Scalars,
             "curves/distance_error": rr.Scalars,
             **{f"images/{name}": rr.EncodedImage for name in IMAGES},
             "search/bounds": rr.Boxes3D,
+            "search/ticks": rr.LineStrips3D,
+            "search/numbers": rr.Points3D,
             "search/error": rr.Arrows3D,
             "search/truth": rr.LineStrips3D,
             "state": rr.TextDocument,
@@ -86,9 +105,11 @@ class Scene:
         self._frame = 0 if step is None else step.index
         world_T_camera = np.eye(4) if step is None else step.world_T_camera
         truth = self._truth.at(self._frame, world_T_camera)
-        shown = None if frame is None else self._shrunk(frame)
+        shown = None if frame is None else shrink(frame, self._camera, self._depth_scale)
+        bodies = () if step is None else step.bodies
         if shown is not None:
-            self._add_camera(world_T_camera, shown)
+            self._add_camera(world_T_camera, shown, bodies, step is None or not step.lost)
+        self._add_paths(bodies)
         if step is not None:
             self._add_trajectory(world_T_camera, truth)
             self._add_images(shown, step)
@@ -100,6 +121,18 @@ class Scene:
         self._world_T_camera, self._last_truth = world_T_camera, truth
         if shown is not None:
             self._shown.append(shown)
+
+    def add_loops(self, trajectory: Trajectory, loops: Loops) -> None:
+        """Add what the map says in the end: where the camera was, and which places it took for the same."""
+        self._add("world/corrected", strips=trajectory.world_T_camera[None, :, :3, 3])
+        if not loops.edges:
+            return
+        places = [keyframe.world_T_camera[:3, 3] for keyframe in loops.keyframes]
+        strips = [np.stack([places[edge.earlier], places[edge.later]]) for edge in loops.edges]
+        colors = [GREEN if weight > COUNTED else GREY for weight in loops.solution.weights]
+        left = np.linalg.norm(loops.solution.residuals[:, :3], axis=1) * MILLIMETRES
+        labels = [f"{residual:.0f} mm left" for residual in left]
+        self._add("world/loops", sizes=[len(strips)], strips=strips, colors=colors, labels=labels)
 
     def send(self) -> None:
         """Send what was added since the last time, each entity's in one call."""
@@ -141,15 +174,20 @@ class Scene:
             "world": [rr.ViewCoordinates.RDF],
             "search": [rr.ViewCoordinates.RDF],
             "world/camera/image": [pinhole, jpeg],
-            "world/camera/cloud": [rr.Points3D.from_fields(radii=points(1.5))],
+            "world/map": [rr.Points3D.from_fields(radii=points(1.5))],
+            "world/bodies": [rr.LineStrips3D.from_fields(radii=points(2.5))],
             "world/estimate": [rr.LineStrips3D.from_fields(colors=[BLUE], radii=points(2))],
             "world/truth": [rr.LineStrips3D.from_fields(colors=[WHITE], radii=points(2))],
+            "world/corrected": [rr.LineStrips3D.from_fields(colors=[GREEN], radii=points(2))],
+            "world/loops": [rr.LineStrips3D.from_fields(radii=points(1), show_labels=False)],
             "curves/rmse": [rr.SeriesLines(colors=[BLUE], widths=[2], names=["RMSE of the pair"])],
             "curves/distance_error": [rr.SeriesLines(colors=[VERMILION], widths=[2], names=["distance error"])],
             **{f"images/{name}": [jpeg] for name in IMAGES},
             "search/particles": [rr.Points3D.from_fields(radii=points(2.5))],
             "search/bounds": [rr.Boxes3D.from_fields(colors=[GREY])],
-            "search/error": [rr.Arrows3D.from_fields(colors=[VERMILION], radii=points(1.5))],
+            "search/ticks": [rr.LineStrips3D.from_fields(colors=[GREY], radii=points(1))],
+            "search/numbers": [rr.Points3D.from_fields(colors=[WHITE], radii=points(0), show_labels=True)],
+            "search/error": [rr.Arrows3D.from_fields(colors=[VERMILION], radii=points(1))],
             "search/truth": [rr.LineStrips3D.from_fields(colors=[GREEN], radii=points(2))],
             "search/last_camera": [last],
             "state": [rr.TextDocument.from_fields(media_type="text/markdown")],
@@ -157,25 +195,42 @@ class Scene:
         for path, archetypes in looks.items():
             self._stream.log(path, *archetypes, static=True)
 
-    def _shrunk(self, frame: Frame) -> Shown:
-        size, k = (self._camera.width, self._camera.height), self._shrink
-        grey = np.asarray(frame.grey)
-        if k > 1:
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        raw = np.asarray(frame.depth)[k // 2 :: k, k // 2 :: k][: size[1], : size[0]]
-        return Shown(
-            frame.timestamp, grey, raw.astype(np.float32) * np.float32(1 / self._depth_scale), encode_jpeg(grey)
-        )
-
-    def _add_camera(self, world_T_camera: Float64[np.ndarray, "4 4"], shown: Shown) -> None:
+    def _add_camera(
+        self, world_T_camera: Float64[np.ndarray, "4 4"], shown: Shown, bodies: tuple[Body, ...], is_placed: bool
+    ) -> None:
         self._add("world/camera", translation=world_T_camera[None, :3, 3], mat3x3=world_T_camera[None, :3, :3])
-        self._add("world/camera/image", blob=[shown.jpeg])
-        self._add("images/target", blob=[shown.jpeg])
+        masks = [(body.number, body.mask_at(shown.grey.shape)) for body in bodies]
+        jpeg = encode_jpeg(tinted(shown.picture, masks)) if masks else shown.jpeg
+        self._add("world/camera/image", blob=[jpeg])
+        self._add("images/target", blob=[jpeg])
+        if is_placed:
+            self._add_points(world_T_camera, shown, masks)
+
+    def _add_points(
+        self,
+        world_T_camera: Float64[np.ndarray, "4 4"],
+        shown: Shown,
+        masks: list[tuple[int, Bool[np.ndarray, "h w"]]],
+    ) -> None:
+        """Add what is seen of the scene for the first time; bodies are no part of it."""
         depth = shown.depth[self._cloud]
-        seen = depth > 0
+        seen = (depth > 0) & (depth < FARTHEST)
+        for _, mask in masks:
+            seen &= ~mask[self._cloud]
         points = self._rays[seen] * depth[seen][:, None]
-        grey = shown.grey[self._cloud][seen]
-        self._add("world/camera/cloud", sizes=[len(points)], positions=points, colors=GREYS[grey])
+        points = points @ world_T_camera[:3, :3].T + world_T_camera[:3, 3]
+        new, picture = self._seen.new(points), shown.picture[self._cloud][seen]
+        colors = GREYS[picture[new]] if picture.ndim == 1 else packed(picture[new, ::-1])
+        self._add("world/map", sizes=[len(new)], positions=points[new], colors=colors)
+
+    def _add_paths(self, bodies: tuple[Body, ...]) -> None:
+        """Add a piece of the path of each body that was seen in the last frame too."""
+        pieces = [(b.number, self._bodies[b.number], b.centroid) for b in bodies if b.number in self._bodies]
+        if pieces:
+            strips = [np.stack([start, end]) for _, start, end in pieces]
+            colors = [color_of_body(number) for number, *_ in pieces]
+            self._add("world/bodies", sizes=[len(pieces)], strips=strips, colors=colors)
+        self._bodies = {body.number: body.centroid for body in bodies}
 
     def _add_trajectory(
         self, world_T_camera: Float64[np.ndarray, "4 4"], truth: Float64[np.ndarray, "4 4"] | None
@@ -206,30 +261,41 @@ class Scene:
         """Add every generation of a frame; return how many there are."""
         if not search:
             return 0
-        sizes = [level.positions.shape[1] for level in search for _ in level.texts]
+        sizes = [level.positions.shape[1] for level in search for _ in level.rmse]
         count = len(sizes)
         generations = list(range(self._generation, self._generation + count))
         positions = np.concatenate([level.positions.reshape(-1, 3) for level in search])
         colors = np.concatenate([level.colors.ravel() for level in search])
         self._add("search/particles", generations, sizes, positions=positions, colors=colors)
-        self._add("state", generations, text=[text for level in search for text in level.texts])
-        starts = np.cumsum([0, *(len(level.texts) for level in search[:-1])]) + self._generation
+        starts = (np.cumsum([0, *(len(level.rmse) for level in search[:-1])]) + self._generation).tolist()
         self._add(
             "search/bounds",
-            starts.tolist(),
+            starts,
             centers=np.stack([level.centre for level in search]),
             half_sizes=np.stack([level.half_sizes for level in search]),
         )
+        self._add_ticks(search, starts)
         if motion is None:
+            self._add("state", generations, text=[text for level in search for text in level.states()])
             return count
         true = motion[:3, 3] * MILLIMETRES
+        arrows = [true - level.positions[:, 0] for level in search]
         best = np.concatenate([level.positions[:, 0] for level in search])
-        arrows = true - best
-        labels = [f"error {error:.1f} mm" for error in np.linalg.norm(arrows, axis=1)]
-        self._add("search/error", generations, origins=best, vectors=arrows, labels=labels)
+        self._add("search/error", generations, origins=best, vectors=np.concatenate(arrows))
+        errors = [np.linalg.norm(arrow, axis=1) for arrow in arrows]
+        states = [text for level, own in zip(search, errors, strict=True) for text in level.states(own)]
+        self._add("state", generations, text=states)
         strips = star_strips(true, max(0.05 * float(np.linalg.norm(true)), 0.5))
         self._add("search/truth", sizes=[len(strips)], strips=strips)
         return count
+
+    def _add_ticks(self, search: list[Level], starts: list[int]) -> None:
+        """Add the scale of each level's box."""
+        ticks = [ticks_of(level.centre, level.half_sizes) for level in search]
+        strips = [strip for own in ticks for strip in own.strips]
+        self._add("search/ticks", starts, [len(own.strips) for own in ticks], strips=strips)
+        places, labels = np.concatenate([own.places for own in ticks]), [text for own in ticks for text in own.labels]
+        self._add("search/numbers", starts, [len(own.labels) for own in ticks], positions=places, labels=labels)
 
 
 def _joined(parts: list[Any]) -> Any:

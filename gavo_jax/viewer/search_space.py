@@ -15,8 +15,8 @@ MAX_PARTICLES = 256
 MILLIMETRES = 1e3
 """Of the search space: its particles lie millimetres apart."""
 KEY = (
-    "Particles: blue is best. White: the last camera. Green star: the true next one. Arrow: error of the best "
-    "particle. Step through a search on the time line `generation`."
+    "RMSE of the best particle, in grey levels. Particles: blue is best. White: the last camera. Green star: the true "
+    "next one. Arrow: from the best particle to it. Step through a search on the time line `generation`."
 )
 
 
@@ -29,8 +29,25 @@ class Level(NamedTuple):
     """RGBA, a byte each. Blue is the level's best error, vermilion that of its worst particles."""
     centre: Float[np.ndarray, " 3"]
     half_sizes: Float[np.ndarray, " 3"]
-    texts: list[str]
-    """A generation's state, as Markdown."""
+    number: int
+    """Of the pyramid's level."""
+    particles: int
+    """Of a generation, shown or not."""
+    rmse: Float[np.ndarray, " g"]
+    """Of each generation's best particle, grey levels."""
+
+    def states(self, errors: Float[np.ndarray, " g"] | None = None) -> list[str]:
+        """Return each generation's state, as Markdown; `errors` are those of the best particles, mm, where known."""
+        heading, count = "| particles | level | DSR | iteration | RMSE |", len(self.rmse)
+        rows = [
+            f"| {self.particles} | {self.number} | 1/{2**self.number} | {i} of {count} | {best:.2f} |"
+            for i, best in enumerate(self.rmse.tolist(), 1)
+        ]
+        if errors is not None:
+            heading += " error |"
+            rows = [f"{row} {error:.1f} mm |" for row, error in zip(rows, errors.tolist(), strict=True)]
+        rule = "|---" * (heading.count("|") - 1) + "|"
+        return [f"{heading}\n{rule}\n{row}\n\n{KEY}" for row in rows]
 
 
 def level_of(population: Population) -> Level | None:
@@ -49,18 +66,14 @@ def level_of(population: Population) -> Level | None:
     place = (np.minimum(rmse, high) - low) * (255 / max(high - low, 1e-6))
     twists = np.concatenate([xi.reshape(-1, 6), np.asarray(population.centre)[None]])
     positions = (camera_positions(twists) * MILLIMETRES).astype(np.float32)
-    level = int(population.level)
-    texts = [
-        f"| particles | level | DSR | iteration | best RMSE |\n|---|---|---|---|---|\n"
-        f"| {count} | {level} | 1/{2**level} | {i} of {iterations} | {best:.2f} grey levels |\n\n{KEY}"
-        for i, best in enumerate(rmse[:, 0].tolist(), 1)
-    ]
     return Level(
         positions[:-1].reshape(*rmse.shape, 3),
         PARTICLE_COLORS[place.astype(np.uint8)],
         positions[-1],
         np.asarray(population.half_widths)[:3] * np.float32(MILLIMETRES),
-        texts,
+        int(population.level),
+        count,
+        rmse[:, 0],
     )
 
 
@@ -73,6 +86,41 @@ def camera_positions(xi: Float[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "
     second = np.where(square < 1e-8, 1 / 6, (safe - np.sin(safe)) / safe**3)
     twice_turned = np.sum(w * v, axis=-1, keepdims=True) * w - square * v
     return -(v - first * np.cross(w, v) + second * twice_turned)
+
+
+class Ticks(NamedTuple):
+    """Ticks along the three edges of a box that meet in the corner which the view looks into: −x, +y, +z."""
+
+    strips: list[Float[np.ndarray, "2 3"]]
+    places: Float[np.ndarray, "t 3"]
+    """Where the labels stand."""
+    labels: list[str]
+
+
+def ticks_of(centre: Float[np.ndarray, " 3"], half_sizes: Float[np.ndarray, " 3"]) -> Ticks:
+    """Return ticks at round numbers of millimetres, three to nine on the longest edge."""
+    low, high = centre - half_sizes, centre + half_sizes
+    corner = np.array([low[0], high[1], high[2]], np.float64)
+    longest = float(np.max(high - low))
+    step = next((s for s in _round_steps(longest) if longest / s <= 8), longest)
+    strips, places, labels = [], [], []
+    for axis, name in enumerate("xyz"):
+        inward = np.zeros(3)
+        across = (axis + 1) % 3
+        inward[across] = 0.02 * longest * np.sign(centre[across] - corner[across])
+        for number in range(int(np.ceil(low[axis] / step)), int(np.floor(high[axis] / step)) + 1):
+            start = corner.copy()
+            start[axis] = number * step
+            strips.append(np.stack([start, start + inward]))
+            places.append(start + 2 * inward)
+            labels.append(f"{name} {number * step:g}")
+    return Ticks(strips, np.array(places).reshape(-1, 3), labels)
+
+
+def _round_steps(length: float) -> list[float]:
+    """1, 2 and 5 times powers of ten, ascending, about a length."""
+    power = np.floor(np.log10(max(length, 1e-6)))
+    return [float(f"{digit}e{int(power + shift)}") for shift in (-2, -1, 0) for digit in (1, 2, 5)]
 
 
 def star_strips(centre: Float[np.ndarray, " 3"], size: float) -> list[Float[np.ndarray, "2 3"]]:

@@ -1,5 +1,6 @@
 """`gavo run` over a live device: a stand-in that plays a few rendered frames."""
 
+import importlib.util
 import json
 from collections.abc import Iterable
 from dataclasses import replace
@@ -15,8 +16,10 @@ from gavo_jax.datasets.devices import register_device
 from gavo_jax.datasets.live import LiveImages
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.scene_map import build_map
 from gavo_jax.trajectory import Trajectory
 
+needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 LENS = replace(CAMERA, distortion=(0.1, -0.1, 0.0, 0.0, 0.0))
 FRAMES = SyntheticSequence(5, noise=NONE, camera=CAMERA, color=True)
 
@@ -61,6 +64,19 @@ def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     assert "0 of 5 frames came while another was tracked" in done.out
 
 
+@needs_open3d
+def test_the_map_of_a_live_run_is_that_of_its_frames(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", Player)
+    path = tmp_path / "seen.ply"
+    done = runner(capsys)(
+        *("run", "player", "--method", "small-newton", "--output", tmp_path / "run", "--map", path, "--voxel", "0.05")
+    )
+    assert done.status == 0, done.err
+    again = build_map(FRAMES, run_odometry(FRAMES, NEWTON).steps, voxel=0.05)
+    assert f"map of 5 frames, {len(again.points)} points" in done.out
+
+
 class Unhurried:
     """As `Newest`, without the thread: every frame is taken."""
 
@@ -83,7 +99,7 @@ class Unhurried:
     ("arguments", "words"),
     [
         (("player", "--resume"), "--resume: not with the live source 'player'"),
-        (("player", "--map", "a.ply"), "--map: "),
+        (("player", "--map", "a.xyz"), "a.xyz: a map ends in .ply"),
         (("player", "--frames", "1"), "at least 2"),
         (("empty",), "ended after 0 frames"),
         (("odd",), "colour image is uint8 of shape"),
@@ -91,8 +107,6 @@ class Unhurried:
 )
 def test_what_cannot_be_is_one_line(arguments, words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.ply").unlink(missing_ok=True)
-    monkeypatch.setattr("gavo_jax.cli.run.check_options", lambda *_: "cloud")
     register_device("player", Player)
     register_device("empty", lambda: Player(frames=()))
     register_device("odd", lambda: Player(camera=replace(CAMERA, width=320)))

@@ -6,19 +6,24 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import jax
 import numpy as np
 import pytest
 from small import CAMERA, GENETIC
 
 from gavo_jax.alignment.search import Population
+from gavo_jax.bodies.records import Body
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry, track
 from gavo_jax.se3 import exp
+from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer import colors, live, pictures, search_space
+from gavo_jax.viewer.seen import SeenCubes
 
 FRAMES, GENERATIONS, PARTICLES = 4, 8 + 6, (16,) * 8 + (8,) * 6
 ENTITIES_OF_A_PAIR = (
@@ -31,7 +36,8 @@ ENTITIES_OF_A_PAIR = (
     "/world/estimate",
     "/world/truth",
 )
-ENTITIES_OF_A_FRAME = ("/images/target", "/world/camera", "/world/camera/cloud", "/world/camera/image")
+ENTITIES_OF_A_FRAME = ("/images/target", "/world/camera", "/world/camera/image")
+ENTITIES_OF_A_LEVEL = ("/search/bounds", "/search/ticks", "/search/numbers")
 ENTITIES_OF_A_GENERATION = ("/search/error", "/search/particles", "/state")
 LEVELS = 2
 
@@ -77,13 +83,14 @@ def rows(run):
     return read_recording(run[2])
 
 
-def test_every_entity_has_its_rows(rows):
+def test_every_entity_has_its_rows(run, rows):
     pairs = FRAMES - 1
     expected = {
         **dict.fromkeys(ENTITIES_OF_A_FRAME, FRAMES),
         **dict.fromkeys(ENTITIES_OF_A_PAIR, pairs),
         **dict.fromkeys(ENTITIES_OF_A_GENERATION, pairs * GENERATIONS),
-        "/search/bounds": pairs * LEVELS,
+        **dict.fromkeys(ENTITIES_OF_A_LEVEL, pairs * LEVELS),
+        "/world/map": 1 + sum(not step.lost for step in run[0]),
     }
     assert {path: len(own) for path, own in rows.items()} == expected
 
@@ -112,8 +119,81 @@ def test_particles_curves_and_path_are_those_of_the_run(run, rows):
         assert np.allclose(component(piece, "strips")[0][1], step.world_T_camera[:3, 3], atol=1e-6)
     texts = [component(row, "text")[0] for row in sorted(rows["/state"], key=lambda row: row["generation"])]
     assert "| 16 | 4 | 1/16 | 1 of 8 |" in texts[0] and "| 8 | 3 | 1/8 | 6 of 6 |" in texts[GENERATIONS - 1]
+    [error] = re.findall(r"\| ([\d.]+) mm \|", texts[0])
+    first = min(rows["/search/error"], key=lambda row: row["generation"])
+    assert float(error) == pytest.approx(np.linalg.norm(component(first, "vectors")[0]), abs=0.06)
     errors = [component(row, "scalars")[0] for row in rows["/curves/distance_error"]]
-    assert len(errors) == FRAMES - 1 and max(errors) < 0.05
+    assert len(errors) == FRAMES - 1 and max(errors) < 0.2  # images of a few thousand pixels
+
+
+def test_the_map_grows_by_what_is_new(rows):
+    counts = [
+        len(component(row, "positions") or []) for row in sorted(rows["/world/map"], key=lambda row: row["frame"])
+    ]
+    assert counts[0] > 200 and sum(counts[1:]) < 0.5 * counts[0] * (FRAMES - 1)
+
+
+def test_a_cube_of_space_is_shown_once():
+    cubes = SeenCubes()
+    points = np.array([[0.01, 0.01, 1.0], [0.02, 0.02, 1.01], [-0.01, 0.01, 1.0], [5e3, -7e3, 1.0]])
+    assert sorted(cubes.new(points).tolist()) == [0, 2, 3]
+    assert cubes.new(points).size == 0
+
+
+def test_bodies_are_tinted_left_out_of_the_map_and_have_paths(run, tmp_path):
+    steps, sequence, _ = run
+    field = np.where(np.arange(CAMERA.width // 8)[None] < CAMERA.width // 16, 1.0, -1.0).repeat(CAMERA.height // 8, 0)
+    bodies = [
+        Body(
+            3, 0.5, np.array([0.1 * i, 0.0, 1.0]), np.zeros(3), np.zeros(3), None, field, (CAMERA.height, CAMERA.width)
+        )
+        for i in range(3)
+    ]
+    shown = live.make_viewer("save", tmp_path / "bodies.rrd")
+    with shown:
+        shown.open("bodies", sequence.camera, sequence.timestamps, None)
+        for i, step in enumerate(steps[:2]):
+            shown.watch(sequence[i], replace(step, bodies=(bodies[i],)))
+    found = read_recording(tmp_path / "bodies.rrd")
+    [path] = found["/world/bodies"]
+    assert np.allclose(component(path, "strips")[0], [[0, 0, 1], [0.1, 0, 1]], atol=1e-6)
+    image = cv2.imdecode(np.frombuffer(bytes(component(found["/images/target"][0], "blob")[0]), np.uint8), 1)
+    spread = np.ptp(image.astype(int), axis=2)
+    assert np.median(spread[:, : image.shape[1] // 3]) > 40 > np.median(spread[:, -image.shape[1] // 3 :])
+    assert min(x for x, *_ in component(found["/world/map"][0], "positions")) > steps[0].world_T_camera[0, 3] - 0.1
+
+
+def test_loops_and_the_corrected_path_are_shown_in_the_end(run, tmp_path):
+    steps, sequence, _ = run
+    poses = np.stack([step.world_T_camera for step in steps])
+    keyframes = [SimpleNamespace(world_T_camera=pose) for pose in poses]
+    edges = [SimpleNamespace(earlier=0, later=2), SimpleNamespace(earlier=1, later=2)]
+    residuals = np.array([[0.003, 0, 0, 0, 0, 0], [0.4, 0, 0, 0, 0, 0]])
+    loops: Any = SimpleNamespace(
+        keyframes=keyframes, edges=edges, solution=SimpleNamespace(weights=np.array([1.0, 0.0]), residuals=residuals)
+    )
+    shown = live.make_viewer("save", tmp_path / "loops.rrd")
+    with shown:
+        shown.open("loops", sequence.camera, sequence.timestamps, None)
+        shown.watch(sequence[0], None)
+        shown.conclude(Trajectory(sequence.timestamps[1:], poses), loops)
+    found = read_recording(tmp_path / "loops.rrd")
+    [row] = found["/world/loops"]
+    assert component(row, "labels") == ["3 mm left", "400 mm left"]
+    assert len(set(component(row, "colors"))) == 2
+    assert np.allclose(component(found["/world/corrected"][0], "strips")[0], poses[:, :3, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("half", [3.0, 40.0, 500.0])
+def test_ticks_stand_at_round_numbers_on_the_box(half):
+    centre, halves = np.array([7.0, -3.0, 0.5]), np.array([half, half, 0.4 * half])
+    ticks = search_space.ticks_of(centre, halves)
+    starts = np.array([strip[0] for strip in ticks.strips])
+    assert len(ticks.labels) == len(starts) >= 8
+    for start, label in zip(starts, ticks.labels, strict=True):
+        axis, value = label.split()
+        assert start["xyz".index(axis)] == pytest.approx(float(value)) and float(f"{float(value):.2g}") == float(value)
+        assert np.sum(np.isclose(np.abs(start - centre), halves)) >= 2
 
 
 def test_a_frame_is_small(run):
@@ -146,7 +226,7 @@ def test_generations_are_sorted_coloured_and_thinned():
     xi = rng.normal(0, 0.01, (3, 2000, 6)).astype(np.float32)
     population = Population(np.int32(3), xi, error, np.zeros(6), np.full(6, 0.5))  # pyright: ignore[reportArgumentType]
     level = search_space.level_of(population)
-    assert level is not None and level.positions.shape[0] == len(level.texts) == 2
+    assert level is not None and level.positions.shape[0] == len(level.rmse) == 2
     assert level.positions.shape[1] <= search_space.MAX_PARTICLES and np.allclose(level.half_sizes, 500.0)
     best = xi[1, np.argmin(error[1])]
     assert np.allclose(level.positions[1, 0], search_space.camera_positions(best[None])[0] * 1e3, atol=1e-3)
@@ -154,7 +234,8 @@ def test_generations_are_sorted_coloured_and_thinned():
     blue, vermilion = colors.packed(np.array([colors.BLUE, colors.VERMILION], np.uint8))
     assert level.colors[overall, 0] == blue and level.colors[0, -1] == vermilion
     assert f"{blue:08x}" == "".join(f"{value:02x}" for value in (*colors.BLUE, 255))
-    assert "| 2000 | 3 |" in level.texts[0] and f"{np.sqrt(error[1].min()):.2f} grey levels" in level.texts[1]
+    texts = level.states()
+    assert "| 2000 | 3 |" in texts[0] and f"| 2 of 2 | {np.sqrt(error[1].min()):.2f} |" in texts[1]
     assert search_space.level_of(population._replace(error=np.full_like(error, np.inf))) is None  # pyright: ignore[reportArgumentType]
 
 
@@ -169,10 +250,7 @@ def test_camera_position_is_the_inverse_motion(size):
 def test_warping_back_gives_the_reference():
     sequence = SyntheticSequence(frames=2, camera=CAMERA)
     truth = sequence.ground_truth.interpolate(sequence.timestamps)[0]
-    reference, target = (
-        pictures.Shown(frame.timestamp, frame.grey, frame.depth / np.float32(CAMERA.depth_scale), b"")
-        for frame in sequence
-    )
+    reference, target = (pictures.shrink(frame, CAMERA, CAMERA.depth_scale) for frame in sequence)
     warped, seen = pictures.warp_target(reference, target, np.linalg.inv(truth[1]) @ truth[0], CAMERA)
     still, _ = pictures.warp_target(reference, target, np.eye(4), CAMERA)
 

@@ -1,0 +1,32 @@
+"""The scene as far as it was seen: one point for each small cube of space, which grows with the run."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+CUBE = 0.03
+"""Metres."""
+FARTHEST = 4.0
+"""Metres; the depth of what is beyond is too uncertain."""
+MOST_POINTS = 300_000
+"""Points that a viewer is sent; some 80 m² of surface at 3 cm."""
+_BITS, _MIDDLE = 21, 1 << 20
+
+
+class SeenCubes:
+    """The cubes of which a point is shown already."""
+
+    def __init__(self) -> None:
+        self._known: set[int] = set()
+
+    def new(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
+        """Return which points are the first of their cubes, and remember these; none once there are `MOST_POINTS`."""
+        if len(self._known) >= MOST_POINTS:
+            return np.zeros(0, np.int64)
+        cubes = np.clip(np.floor(points / CUBE).astype(np.int64) + _MIDDLE, 0, 2 * _MIDDLE - 1)
+        keys = (cubes[:, 0] << 2 * _BITS) | (cubes[:, 1] << _BITS) | cubes[:, 2]
+        unique, first = np.unique(keys, return_index=True)
+        fresh = np.array([key not in self._known for key in unique.tolist()], bool)
+        self._known.update(unique[fresh].tolist())
+        return first[fresh]
