@@ -158,6 +158,7 @@ def test_bodies_are_tinted_left_out_of_the_map_and_have_paths(run, tmp_path):
     [path] = found["/world/bodies"]
     assert np.allclose(component(path, "strips")[0], [[0, 0, 1], [0.1, 0, 1]], atol=1e-6)
     image = cv2.imdecode(np.frombuffer(bytes(component(found["/images/target"][0], "blob")[0]), np.uint8), 1)
+    assert image is not None
     spread = np.ptp(image.astype(int), axis=2)
     assert np.median(spread[:, : image.shape[1] // 3]) > 40 > np.median(spread[:, -image.shape[1] // 3 :])
     assert min(x for x, *_ in component(found["/world/map"][0], "positions")) > steps[0].world_T_camera[0, 3] - 0.1
