@@ -123,6 +123,8 @@ def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | N
     above.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize="small")
     space.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})", zlabel=f"−y, up ({unit})", title="In space")
     _fit_above(above, [scale * path for path in shown])
+    if unit == "mm":
+        _draw_scale(above, unit)
     _fit_in_space(space, [scale * path for path in shown])
     return figure
 
@@ -213,15 +215,17 @@ def plot_basin(
     axes = figure.add_subplot()
     order = np.argsort(motion)
     greys = iter(np.linspace(0.35, 0.75, max(len(success) - len(ours), 1)))
-    for (name, rates), style in zip(success.items(), _styles(), strict=False):
+    colored = _styles()
+    for name, rates in success.items():
         tried = [i for i in order if np.isfinite(rates[i])]
+        style = next(colored)
         if ours and name not in ours:
             style |= {"color": str(next(greys)), "linewidth": 1.0, "markersize": 3}
         axes.plot(motion[tried], rates[tried], label=name, **style)
     axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
     axes.set(ylim=(-0.03, 1.03), xlim=(0, 1.02 * float(np.max(motion))))
     axes.grid(alpha=0.3)
-    figure.legend(fontsize="small", loc="outside right upper")
+    _label_ends(axes)
     return figure
 
 
@@ -310,6 +314,47 @@ def _number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
     axes.secondary_xaxis("top", functions=(frame_at, time_of)).set_xlabel("frame")
 
 
+LABEL_HEIGHT = 0.05
+"""Of the panel's height, between the labels of two curves at least."""
+
+
+def _label_ends(axes: Any) -> None:
+    """Write each curve's name beside its last point, in its colour; names of curves that end together make room."""
+    low, high = axes.get_ylim()
+    curves = sorted((line for line in axes.lines if len(line.get_xdata())), key=lambda line: -line.get_ydata()[-1])
+    places = np.array([(line.get_ydata()[-1] - low) / (high - low) for line in curves])
+    places = _apart(places, LABEL_HEIGHT, (0.0, 1.0))
+    for line, place in zip(curves, places.tolist(), strict=True):
+        axes.annotate(
+            _words(line.get_label()),
+            (line.get_xdata()[-1], line.get_ydata()[-1]),
+            (1.03, place),
+            textcoords="axes fraction",
+            annotation_clip=False,
+            va="center",
+            color=line.get_color(),
+            fontsize="small",
+            arrowprops={"arrowstyle": "-", "color": line.get_color(), "linewidth": 0.5, "relpos": (0.0, 0.5)},
+        )
+
+
+def _apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float, float]) -> Float[np.ndarray, " n"]:
+    """Places in falling order, moved as little as it takes to keep a distance and, if there is room, the limits."""
+    steps = -distance * np.arange(len(places))
+    flat = places - steps  # falling by at least the distance where this does not rise
+    level, blocks = [], []
+    for value in flat.tolist():  # pool adjacent violators
+        level.append(value)
+        blocks.append(1)
+        while len(level) > 1 and level[-1] > level[-2]:
+            count = blocks[-1] + blocks[-2]
+            level[-2:] = [(level[-1] * blocks[-1] + level[-2] * blocks[-2]) / count]
+            blocks[-2:] = [count]
+    lowest, highest = limits
+    spread = np.repeat(level, blocks) + steps
+    return np.maximum(np.minimum(spread, highest + steps), lowest + steps - steps[-1:])
+
+
 def _panels(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
     """Return panels side by side, each with a scale of its own upwards, or all with one."""
     panels = list(figure.subplots(1, count, squeeze=False, sharey=one_scale)[0])
@@ -340,6 +385,18 @@ def _fit_above(axes: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
     axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
 
 
+def _draw_scale(axes: Any, unit: str) -> None:
+    """Draw a bar of a round length, a fifth to a half of the panel, into its lower left corner."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    power = 10.0 ** np.floor(np.log10(right - left))
+    length = max(digit * power for digit in (0.1, 0.2, 0.5, 1.0, 2.0) if digit * power <= 0.5 * (right - left))
+    start, up = left + 0.06 * (right - left), low + 0.06 * (high - low)
+    axes.plot([start, start + length], [up, up], color="black", linewidth=2, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} {unit}", (start + length / 2, up), (0, 3), textcoords="offset points", ha="center", fontsize=7
+    )
+
+
 def _fit_in_space(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
     """Give the three axes of a drawing in space the same scale, a few ticks each, and no more room than is needed."""
     points = np.concatenate(paths)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
@@ -349,6 +406,8 @@ def _fit_in_space(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None
         getattr(space, f"set_{axis}lim")(middle - half[i], middle + half[i])
         space.locator_params(axis=axis, nbins=4 if half[i] > 0.7 * np.max(half) else 1)
     space.tick_params(labelsize="x-small")
+    for axis in (space.xaxis, space.yaxis, space.zaxis):
+        axis.labelpad = 12
     space.set_box_aspect(tuple(half / np.max(half)), zoom=0.85)
 
 

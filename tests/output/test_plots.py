@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from matplotlib.text import Annotation
 
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import distance_error
@@ -145,3 +146,28 @@ def test_basin_curves_run_from_small_to_large_motions():
     assert np.asarray(axes.get_lines()[1].get_xdata()).tolist() == [7.0]  # the other one was not tried
     assert np.asarray(axes.get_lines()[0].get_xdata()).tolist() == [7.0, 20.0]
     assert np.asarray(axes.get_lines()[0].get_ydata()).tolist() == [1.0, 0.5]
+
+
+def test_curves_that_end_together_have_names_apart_in_the_order_of_their_ends():
+    ends = {"ga": 0.9, "sift-pnp": 0.0, "orb-pnp": 0.0, "opencv-rgb": 0.02}
+    success = {name: np.array([1.0, end]) for name, end in ends.items()}
+    (axes,) = plots.plot_basin(np.array([7.0, 20.0]), success, "clip", ["ga"]).axes
+    places = {text.get_text(): text.xyann[1] for text in axes.texts if isinstance(text, Annotation)}
+    assert sorted(places, key=lambda name: -places[name]) == ["ga", "opencv-rgb", "sift-pnp", "orb-pnp"]
+    assert np.diff(sorted(places.values())).min() >= plots.LABEL_HEIGHT - 1e-9
+    assert min(places.values()) >= -1e-9 and max(places.values()) <= 1.0
+    colors = {line.get_label(): line.get_color() for line in axes.lines}
+    assert {text.get_text(): text.get_color() for text in axes.texts} == colors
+
+
+def test_places_move_no_further_than_the_distance_asks_for():
+    assert plots._apart(np.array([0.9, 0.5, 0.5]), 0.1, (0.0, 1.0)) == pytest.approx([0.9, 0.55, 0.45])
+    assert plots._apart(np.array([1.0, 1.0]), 0.1, (0.0, 1.0)) == pytest.approx([1.0, 0.9])
+
+
+def test_a_small_motion_has_a_bar_of_round_length():
+    small, large = (plots.plot_trajectories({"ga": straight(scale)}, None).axes[0] for scale in (0.01, 10.0))
+    (bar,) = [line for line in small.lines if str(line.get_label()).startswith("_")]
+    x = np.asarray(bar.get_xdata(), float)
+    (text,) = [text.get_text() for text in small.texts]
+    assert text == f"{x[1] - x[0]:g} mm" and not large.texts
