@@ -57,6 +57,8 @@ class History(NamedTuple):
     range: float | None = None
     """Median depth of the last good frame, metres, and that frame's stamp."""
     range_timestamp: float = 0.0
+    units_known: bool = False
+    """Whether depths were plausible, and have not jumped since."""
     doubts: int = 0
     """Frames in a row that were refused only for being unlike those before."""
 
@@ -207,12 +209,16 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     usual = median(history.coverages) if history.coverages else coverage
     history = history._replace(coverages=_remember(history.coverages, coverage))
     range_m = float(np.median(readings[::ROW_STEP])) / depth_scale
+    known = history.units_known
     if history.range is not None:
         age = (history.timestamp or 0.0) - history.range_timestamp
-        if abs(math.log(range_m / history.range)) > math.log(MAX_RANGE_RATIO) * max(age / RANGE_AGE, 1.0):
+        jump = abs(math.log(range_m / history.range)) / math.log(MAX_RANGE_RATIO)
+        if jump > max(age / RANGE_AGE, 1.0):
             return _refused(AlignmentStatus.DEPTH_UNITS), history
-    history = history._replace(range=range_m, range_timestamp=history.timestamp or 0.0)
-    if not DEPTH_RANGE[0] < range_m < DEPTH_RANGE[1]:
+        known = known and jump < 1.0
+    plausible = DEPTH_RANGE[0] < range_m < DEPTH_RANGE[1]
+    history = history._replace(range=range_m, range_timestamp=history.timestamp or 0.0, units_known=known or plausible)
+    if not plausible and not known:  # something near may have come before the camera
         return Finding(AlignmentStatus.DEPTH_UNITS, Use.ALL), history
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.bodies.belief import Belief
+from gavo_jax.bodies.consensus import Opinion, dissent_of
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Retina
@@ -32,6 +33,8 @@ MAJORITY = 0.5
 """Support from which on a motion is taken for the camera's although its points agree badly."""
 ROUNDS = 3
 """Of searching without what moves by the last round's motion, at most."""
+RELUCTANT = 1.6
+"""Ratio of dissents from which on the area asks for another motion."""
 GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
@@ -110,7 +113,7 @@ class BodyAware:
         """Align, and look what moves."""
         scene, retina = state.scene, self.retina
         before = np.asarray(scene.roll.labels) > 0
-        attempt = self.first.align(state.tracker, frame, clock)
+        attempt = self._agreed(state, frame, clock, self.first.align(state.tracker, frame, clock))
         look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
@@ -130,6 +133,25 @@ class BodyAware:
         if np.any(found):
             tracker = retina.without(tracker, found > 0)
         return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
+
+    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> Attempt:
+        """The attempt, or a search without what dissents where most of the image's area asks for another motion."""
+        for _ in range(ROUNDS):
+            asked = np.asarray(attempt.result.target_T_reference, np.float32)
+            opinion = self.retina.ask_area(state.scene, attempt.state, asked)
+            if not float(opinion.dissent) > RELUCTANT * float(opinion.least):
+                break
+            again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
+            motion = np.asarray(again.result.target_T_reference, np.float32)
+            if not again.usable or not float(dissent_of(opinion, asked, motion)) * RELUCTANT < float(opinion.dissent):
+                break
+            attempt = again
+        return attempt
+
+    def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
+        """A tracker without the points that dissent, which expects the motion that the others ask for."""
+        motion = log(opinion.target_T_reference) * (tracker.seconds / clock.elapsed)
+        return self.retina.without(tracker, opinion.dissenting)._replace(motion=motion)
 
     def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
         """The motion that most of what was at rest agrees with.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, UInt32
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import Levels, image_plane
-from gavo_jax.image.sampling import Target, look_up, sample_depth, sample_grey
+from gavo_jax.image.sampling import GreySample, Target, look_up, sample_depth, sample_grey
 from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
@@ -87,10 +87,52 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
         others_T_here: Maps points of the camera here into the cameras of the others.
         camera: Of the views' level.
     """
+    width, height = camera.width, camera.height
+    compared = compare(here, others, others_T_here, camera)
+    r, grey, seen_grey, q, (u, v) = compared
+    residual = jnp.abs(r.grey)
+    views = r.grey.shape[0]
+    own = jnp.hypot(grey.along_u, grey.along_v)
+    steep = jnp.maximum(own, jnp.hypot(r.grey_sample.along_u, r.grey_sample.along_v))
+    slope = jnp.hypot(r.depth_sample.along_u, r.depth_sample.along_v)
+    flow = jnp.hypot(r.warped.u[0] - u, r.warped.v[0] - v) * r.inside[0]
+    slack = SLACK + SLACK_OF_FLOW * flow
+    shape = (views, height, width)
+    clipped = jnp.maximum(seen_grey, r.grey_sample.value) > SATURATED
+    told = r.inside * jnp.where(clipped, 0.0, 1.0)
+    return Evidence(
+        grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
+        depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
+        texture=(told * steep / GREY_NOISE).reshape(shape),
+        seen=r.inside.reshape(shape),
+        measured=r.depth_valid.reshape(shape),
+        inverse_depth=q.reshape(height, width),
+        place=jnp.stack([r.warped.u, r.warped.v], axis=1).reshape(views, 2, height, width),
+    )
+
+
+class Compared(NamedTuple):
+    """Pixels of a view beside what V others show there; flat arrays of N."""
+
+    residuals: Residuals
+    """[V, N], grey made as bright as the others."""
+    grey: GreySample
+    """Of the view itself."""
+    seen_grey: Float[Array, "v n"]
+    """The same, once for each of the others."""
+    inverse_depth: Float[Array, " n"]
+    place: tuple[Float[Array, " n"], Float[Array, " n"]]
+    """Column and row."""
+
+
+def compare(
+    here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera, stride: int = 1
+) -> Compared:
+    """Every pixel of a view, or one of `stride` along either side, in V others; arguments as of `gather_evidence`."""
     plane = image_plane(camera)
     height, width = here.image.grey.shape
-    u, v = jnp.arange(width, dtype=jnp.float32), jnp.arange(height, dtype=jnp.float32)[:, None]
-    u, v = (jnp.broadcast_to(a, (height, width)).reshape(-1) for a in (u, v))
+    u, v = jnp.arange(0, width, stride, dtype=jnp.float32), jnp.arange(0, height, stride, dtype=jnp.float32)[:, None]
+    u, v = (jnp.broadcast_to(a, (v.shape[0], u.shape[0])).reshape(-1) for a in (u, v))
     one = jnp.ones_like(u)
     itself = Warped(u, v, one, one)
     words = look_up(here.image, itself, plane)
@@ -112,28 +154,11 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
         )
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)
-    few: Residuals = jax.tree.map(lambda leaf: leaf[:, ::FEW], r)
-    views = r.grey.shape[0]
+    few: Residuals = jax.tree.map(lambda leaf: leaf[:, :: max(1, FEW // stride**2)], r)
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
-    brightness = estimate_brightness(seen_grey[:, ::FEW], few)
-    residual = jnp.abs(r.grey_sample.value - brightness.seen(seen_grey))
-    own = jnp.hypot(grey.along_u, grey.along_v)
-    steep = jnp.maximum(own, jnp.hypot(r.grey_sample.along_u, r.grey_sample.along_v))
-    slope = jnp.hypot(r.depth_sample.along_u, r.depth_sample.along_v)
-    flow = jnp.hypot(r.warped.u[0] - u, r.warped.v[0] - v) * r.inside[0]
-    slack = SLACK + SLACK_OF_FLOW * flow
-    shape = (views, height, width)
-    clipped = jnp.maximum(seen_grey, r.grey_sample.value) > SATURATED
-    told = r.inside * jnp.where(clipped, 0.0, 1.0)
-    return Evidence(
-        grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
-        depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
-        texture=(told * steep / GREY_NOISE).reshape(shape),
-        seen=r.inside.reshape(shape),
-        measured=r.depth_valid.reshape(shape),
-        inverse_depth=q.reshape(height, width),
-        place=jnp.stack([r.warped.u, r.warped.v], axis=1).reshape(views, 2, height, width),
-    )
+    brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
+    r = r._replace(grey=r.grey_sample.value - brightness.seen(seen_grey))
+    return Compared(r, grey, seen_grey, q, (u, v))
 
 
 def _swept(points: Points, sweep: Float[Array, " 6"], share: Float[Array, " n"]) -> Points:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.belief import Belief, form_belief
+from gavo_jax.bodies.consensus import Opinion, ask_area
 from gavo_jax.bodies.evidence import View, seen_level, view_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.masking import without_points
@@ -130,6 +131,13 @@ class Retina:
         new = jax.tree.map(lambda leaf: leaf[None], self.view(tracker))
         motion = jnp.asarray(target_T_reference, jnp.float32)[None]
         return form_belief(last, new, motion, self.camera, scene.known, carried=False)
+
+    def ask_area(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Opinion:
+        """What the area of the last frame says of a motion."""
+        last = jax.tree.map(lambda leaf: leaf[0], scene.views)
+        credit = jnp.clip(0.5 - scene.known, 0.0, 1.0)
+        motion = jnp.asarray(target_T_reference, jnp.float32)
+        return ask_area(last, self.view(tracker), motion, credit, self.camera)
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""

@@ -1,0 +1,158 @@
+"""What the image's area says of a motion: block after block has one vote, whatever its contrast.
+
+A search counts points by how much they tell, so a body of much contrast outweighs a larger, plainer scene, which a
+slightly different motion explains nearly as well. Here every block of the image tells how much better a motion of its
+own would explain it. A plain block tells that as firmly as a rich one, by all its pixels together.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.bodies.evidence import View, compare
+from gavo_jax.camera import Camera
+from gavo_jax.image.levels import image_plane
+from gavo_jax.image.shutter import Slopes
+from gavo_jax.objective.derivatives import normal_equations, pixel_jacobian
+from gavo_jax.se3 import exp, log, rigid_inverse
+
+STRIDE = 2
+"""Every so many pixels along either side are asked;"""
+CELL = 4
+"""so many of these along either side are a block."""
+LEAST_GREY, LEAST_DEPTH = 1.0, 8e-4
+"""Smallest deviations of a pixel's residuals: grey levels, 1/m."""
+BOUND = 6.0
+"""Deviations at which a single pixel's residual counts by half as much: what is hidden, and edges."""
+FARTHER = 2.0
+"""A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
+ROUNDS = 4
+DISSENT = 6.0
+"""Times the usual: from there on a block does not move as the others do."""
+
+
+class Blocks(NamedTuple):
+    """The normal equations of B blocks at one motion, by a step δ on the target's side; and how much each counts."""
+
+    hessian: Float[Array, "b 6 6"]
+    gradient: Float[Array, "b 6"]
+    inverse: Float[Array, "b 6 6"]
+    credit: Float[Array, " b"]
+
+
+class Opinion(NamedTuple):
+    """What the area says of a motion."""
+
+    blocks: Blocks
+    dissent: Float[Array, ""]
+    """With the motion that was asked about: what the middle one of the blocks would gain by a motion of its own."""
+    least: Float[Array, ""]
+    """The same with the motion below."""
+    target_T_reference: Float[Array, "4 4"]
+    """The motion that the area asks for."""
+    dissenting: Bool[Array, "h w"]
+    """Pixels of blocks that do not move by it."""
+
+
+@jax.jit
+def ask_area(
+    here: View, there: View, target_T_here: Float[Array, "4 4"], credit: Float[Array, "h w"], camera: Camera
+) -> Opinion:
+    """What the area of a view says of a motion, and which one it asks for: the least median of what blocks would gain.
+
+    Args:
+        here: The view.
+        there: The one that the motion leads to.
+        target_T_here: The motion.
+        credit: How far each pixel counts.
+        camera: Of the views' level.
+    """
+    blocks = _equations(here, there, target_T_here, credit, camera)
+    nothing = jnp.zeros(6)
+
+    def settle(_: int, delta: jax.Array) -> jax.Array:
+        gains = gain_of_its_own(blocks, delta)
+        weight = blocks.credit / (1.0 + gains / (2.0 * _middle(gains, blocks.credit))) ** 2
+        hessian = jnp.einsum("b,bij->ij", weight, blocks.hessian)
+        return -jnp.linalg.solve(hessian + jnp.eye(6), weight @ blocks.gradient)
+
+    delta = jax.lax.fori_loop(0, ROUNDS, settle, nothing)
+    gains = gain_of_its_own(blocks, delta)
+    least = _middle(gains, blocks.credit)
+    rows, columns = _grid(camera)
+    dissenting = jnp.repeat(
+        jnp.repeat((gains > DISSENT * least).reshape(rows, columns), CELL * STRIDE, 0), CELL * STRIDE, 1
+    )
+    rest = ((0, camera.height - dissenting.shape[0]), (0, camera.width - dissenting.shape[1]))
+    return Opinion(
+        blocks,
+        _middle(gain_of_its_own(blocks, nothing), blocks.credit),
+        least,
+        exp(delta) @ target_T_here,
+        jnp.pad(dissenting, rest),
+    )
+
+
+@jax.jit
+def dissent_of(opinion: Opinion, asked: Float[Array, "4 4"], motion: Float[Array, "4 4"]) -> Float[Array, ""]:
+    """As `Opinion.dissent`, of another motion than the one that was asked about."""
+    blocks = opinion.blocks
+    return _middle(gain_of_its_own(blocks, log(motion @ rigid_inverse(asked))), blocks.credit)
+
+
+def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
+    """By how much each block's squared residuals, in variances, fall if it moves as it likes instead of by δ."""
+    pull = blocks.hessian @ delta + blocks.gradient
+    return jnp.einsum("bi,bij,bj->b", pull, blocks.inverse, pull)
+
+
+def _grid(camera: Camera) -> tuple[int, int]:
+    """Rows and columns of blocks."""
+    return tuple(-(-size // STRIDE) // CELL for size in (camera.height, camera.width))
+
+
+def _equations(
+    here: View, there: View, target_T_here: Float[Array, "4 4"], credit: Float[Array, "h w"], camera: Camera
+) -> Blocks:
+    plane = image_plane(camera)
+    compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_here[None], camera, STRIDE)
+    r = jax.tree.map(lambda leaf: leaf[0], compared.residuals)
+    depth = jnp.where(compared.inverse_depth > 0, 1.0 / jnp.maximum(compared.inverse_depth, 1e-3), jnp.nan)
+    area = jnp.nan_to_num(jnp.minimum(depth / jnp.nanmedian(depth), FARTHER) ** 2)
+    counted = credit[::STRIDE, ::STRIDE].reshape(-1) * area * r.inside
+    nothing = jnp.zeros_like(r.grey)
+    along_grey = Slopes(r.grey_sample.along_u, r.grey_sample.along_v, nothing)
+    along_depth = Slopes(-r.depth_sample.along_u, -r.depth_sample.along_v, nothing + 1.0)
+    terms = []
+    for residual, mask, least, slopes in (
+        (r.grey, r.inside, LEAST_GREY, along_grey),
+        (r.depth, r.depth_valid, LEAST_DEPTH, along_depth),
+    ):
+        usual = jnp.nanmedian(jnp.where(mask * counted > 0, jnp.abs(residual), jnp.nan))
+        scale = jnp.maximum(1.48 * jnp.nan_to_num(usual, nan=1.0), least)
+        weight = jnp.where(mask > 0, (1.0 + (residual / (BOUND * scale)) ** 2) ** -2 / scale**2, 0.0)
+        jacobian = jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0)
+        terms.append([_blocked(a, camera) for a in (jacobian, residual, weight)])
+    gradient, hessian = jax.vmap(lambda *own: normal_equations(list(own)), (((1, 0, 0)),) * 2)(*map(tuple, terms))
+    size = jnp.trace(hessian, axis1=1, axis2=2)[:, None, None]
+    inverse = jnp.linalg.inv(hessian + (1e-3 * size + 1.0) * jnp.eye(6))
+    return Blocks(hessian, gradient, inverse, jnp.mean(_blocked(counted, camera), axis=-1))
+
+
+def _blocked(values: Float[Array, "*c n"], camera: Camera) -> Float[Array, "*c b m"]:
+    """Values of all pixels asked as those of blocks; what is left over at the right and below is left out."""
+    height, width = (-(-size // STRIDE) for size in (camera.height, camera.width))
+    rows, columns = _grid(camera)
+    front = values.shape[:-1]
+    image = values.reshape(*front, height, width)[..., : rows * CELL, : columns * CELL]
+    cells = jnp.moveaxis(image.reshape(*front, rows, CELL, columns, CELL), -3, -2)
+    return cells.reshape(*front, rows * columns, CELL * CELL)
+
+
+def _middle(values: Float[Array, " b"], weights: Float[Array, " b"]) -> Float[Array, ""]:
+    """Median of weighted values."""
+    order = jnp.argsort(values)
+    total = jnp.cumsum(weights[order])
+    return values[order][jnp.searchsorted(total, 0.5 * total[-1])]

@@ -1,0 +1,69 @@
+"""A scene of little contrast outvotes a body of much."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gavo_jax.alignment.visits import prepare_target
+from gavo_jax.bodies.consensus import ask_area, dissent_of
+from gavo_jax.bodies.evidence import View, view_of
+from gavo_jax.bodies.scene import Retina
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.odometry.driver import track
+from gavo_jax.se3 import exp
+from gavo_jax.settings import OdometryOptions, Settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.trajectory import inverse
+
+CAMERA = DEFAULT_CAMERA.level(1)
+MASKED = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(recover=False, bodies="mask"))
+BETWEEN = np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.5), 0.0])
+
+
+@pytest.fixture(scope="module")
+def room() -> SyntheticSequence:
+    """A camera that moves, a box and a walker before it."""
+    return SyntheticSequence(frames=6, camera=CAMERA, bodies=2)
+
+
+def views(room: SyntheticSequence, retina: Retina) -> tuple[list[View], np.ndarray]:
+    """Of the first two frames, and the true motion between them."""
+    pyramids = [build_pyramid(frame.grey, frame.depth, CAMERA.depth_scale, 5) for frame in room[:2]]
+    still = jnp.zeros(6)
+    seen = [view_of(prepare_target(pyramid, retina.levels), retina.levels, still) for pyramid in pyramids]
+    poses = room.ground_truth.interpolate(room.timestamps)[0]
+    return seen, (inverse(poses[1]) @ poses[0]).astype(np.float32)
+
+
+def test_the_area_asks_for_the_scene_and_names_what_dissents(room: SyntheticSequence) -> None:
+    retina = Retina(CAMERA, MASKED)
+    (last, new), true = views(room, retina)
+    turn = np.array(exp(jnp.asarray(BETWEEN, jnp.float32)))
+    turn[0, 3] = -2.5 * np.sin(BETWEEN[4])  # what is 2.5 m away stays where it is in the image
+    wrong = (turn @ true).astype(np.float32)
+    everywhere = jnp.ones(retina.size)
+    right, misled = (ask_area(last, new, jnp.asarray(motion), everywhere, retina.camera) for motion in (true, wrong))
+    assert float(right.dissent) < 1.3 * float(right.least)
+    assert float(misled.dissent) > 2.0 * float(misled.least)
+    asked = np.asarray(misled.target_T_reference)
+    assert np.linalg.norm((asked - true)[:3, 3]) < 0.4 * np.linalg.norm((wrong - true)[:3, 3])
+    assert float(dissent_of(misled, jnp.asarray(wrong), jnp.asarray(true))) < 0.5 * float(misled.dissent)
+    factor = CAMERA.height // retina.size[0]
+    body = room.body_labels(0)[::factor, ::factor] > 0
+    dissenting = np.asarray(right.dissenting)
+    assert dissenting[body].mean() > 3 * dissenting[~body].mean()
+
+
+def test_the_camera_is_not_taken_along(room: SyntheticSequence) -> None:
+    poses = room.ground_truth.interpolate(room.timestamps)[0]
+    true = inverse(poses[0]) @ poses[-1]
+
+    def error(bodies: str) -> float:
+        settings = replace(MASKED, odometry=replace(MASKED.odometry, bodies=bodies))  # pyright: ignore
+        *_, step = track(room, settings)
+        return float(np.linalg.norm((inverse(true) @ step.world_T_camera)[:3, 3]))
+
+    assert error("mask") < min(0.01, 0.3 * error("off"))
