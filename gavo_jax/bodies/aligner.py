@@ -92,6 +92,11 @@ class BodyAware:
         """Compile what every frame needs: the search, and the look at what it explains."""
         seconds, start = self.first.warm_up(), time.perf_counter()
         state = self.blank_state()
+        opinion = self.retina.ask_area(state.scene, state.tracker, np.eye(4))
+        jax.block_until_ready((dissent_of(opinion, np.eye(4, dtype=np.float32)), opinion))
+        jax.block_until_ready(
+            self._without(state.tracker, opinion, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0)))
+        )
         jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
         return seconds + time.perf_counter() - start
 
@@ -137,13 +142,12 @@ class BodyAware:
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion."""
         for _ in range(ROUNDS):
-            asked = np.asarray(attempt.result.target_T_reference, np.float32)
-            opinion = self.retina.ask_area(state.scene, attempt.state, asked)
+            opinion = self.retina.ask_area(state.scene, attempt.state, attempt.result.target_T_reference)
             if not float(opinion.dissent) > RELUCTANT * float(opinion.least):
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
-            motion = np.asarray(again.result.target_T_reference, np.float32)
-            if not again.usable or not float(dissent_of(opinion, asked, motion)) * RELUCTANT < float(opinion.dissent):
+            dissent = dissent_of(opinion, np.asarray(again.result.target_T_reference, np.float32))
+            if not (again.usable and RELUCTANT * float(dissent) < float(opinion.dissent)):
                 break
             attempt = again
         return attempt

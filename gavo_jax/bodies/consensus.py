@@ -29,6 +29,7 @@ BOUND = 6.0
 FARTHER = 2.0
 """A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
 ROUNDS = 4
+HALVINGS = 16
 DISSENT = 6.0
 """Times the usual: from there on a block does not move as the others do."""
 
@@ -45,9 +46,12 @@ class Blocks(NamedTuple):
 class Opinion(NamedTuple):
     """What the area says of a motion."""
 
+    asked: Float[Array, "4 4"]
+    """That motion,"""
     blocks: Blocks
+    """the blocks at it,"""
     dissent: Float[Array, ""]
-    """With the motion that was asked about: what the middle one of the blocks would gain by a motion of its own."""
+    """and what the middle one of the blocks would gain by a motion of its own."""
     least: Float[Array, ""]
     """The same with the motion below."""
     target_T_reference: Float[Array, "4 4"]
@@ -56,7 +60,6 @@ class Opinion(NamedTuple):
     """Pixels of blocks that do not move by it."""
 
 
-@jax.jit
 def ask_area(
     here: View, there: View, target_T_here: Float[Array, "4 4"], credit: Float[Array, "h w"], camera: Camera
 ) -> Opinion:
@@ -87,6 +90,7 @@ def ask_area(
     )
     rest = ((0, camera.height - dissenting.shape[0]), (0, camera.width - dissenting.shape[1]))
     return Opinion(
+        target_T_here,
         blocks,
         _middle(gain_of_its_own(blocks, nothing), blocks.credit),
         least,
@@ -96,10 +100,10 @@ def ask_area(
 
 
 @jax.jit
-def dissent_of(opinion: Opinion, asked: Float[Array, "4 4"], motion: Float[Array, "4 4"]) -> Float[Array, ""]:
+def dissent_of(opinion: Opinion, motion: Float[Array, "4 4"]) -> Float[Array, ""]:
     """As `Opinion.dissent`, of another motion than the one that was asked about."""
     blocks = opinion.blocks
-    return _middle(gain_of_its_own(blocks, log(motion @ rigid_inverse(asked))), blocks.credit)
+    return _middle(gain_of_its_own(blocks, log(motion @ rigid_inverse(opinion.asked))), blocks.credit)
 
 
 def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
@@ -120,7 +124,8 @@ def _equations(
     compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_here[None], camera, STRIDE)
     r = jax.tree.map(lambda leaf: leaf[0], compared.residuals)
     depth = jnp.where(compared.inverse_depth > 0, 1.0 / jnp.maximum(compared.inverse_depth, 1e-3), jnp.nan)
-    area = jnp.nan_to_num(jnp.minimum(depth / jnp.nanmedian(depth), FARTHER) ** 2)
+    usual = _middle_of_many(jnp.nan_to_num(depth), compared.inverse_depth > 0)
+    area = jnp.nan_to_num(jnp.minimum(depth / jnp.maximum(usual, 1e-3), FARTHER) ** 2)
     counted = credit[::STRIDE, ::STRIDE].reshape(-1) * area * r.inside
     nothing = jnp.zeros_like(r.grey)
     along_grey = Slopes(r.grey_sample.along_u, r.grey_sample.along_v, nothing)
@@ -130,14 +135,13 @@ def _equations(
         (r.grey, r.inside, LEAST_GREY, along_grey),
         (r.depth, r.depth_valid, LEAST_DEPTH, along_depth),
     ):
-        usual = jnp.nanmedian(jnp.where(mask * counted > 0, jnp.abs(residual), jnp.nan))
-        scale = jnp.maximum(1.48 * jnp.nan_to_num(usual, nan=1.0), least)
+        scale = jnp.maximum(1.48 * _middle_of_many(jnp.abs(residual), mask * counted > 0), least)
         weight = jnp.where(mask > 0, (1.0 + (residual / (BOUND * scale)) ** 2) ** -2 / scale**2, 0.0)
         jacobian = jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0)
         terms.append([_blocked(a, camera) for a in (jacobian, residual, weight)])
     gradient, hessian = jax.vmap(lambda *own: normal_equations(list(own)), (((1, 0, 0)),) * 2)(*map(tuple, terms))
     size = jnp.trace(hessian, axis1=1, axis2=2)[:, None, None]
-    inverse = jnp.linalg.inv(hessian + (1e-3 * size + 1.0) * jnp.eye(6))
+    inverse = _inverses(hessian + (1e-3 * size + 1.0) * jnp.eye(6))
     return Blocks(hessian, gradient, inverse, jnp.mean(_blocked(counted, camera), axis=-1))
 
 
@@ -149,6 +153,31 @@ def _blocked(values: Float[Array, "*c n"], camera: Camera) -> Float[Array, "*c b
     image = values.reshape(*front, height, width)[..., : rows * CELL, : columns * CELL]
     cells = jnp.moveaxis(image.reshape(*front, rows, CELL, columns, CELL), -3, -2)
     return cells.reshape(*front, rows * columns, CELL * CELL)
+
+
+def _inverses(matrices: Float[Array, "b 6 6"]) -> Float[Array, "b 6 6"]:
+    """Of positive definite matrices, by Gauss-Jordan elimination: LAPACK's call takes ten times as long."""
+    identity = jnp.broadcast_to(jnp.eye(6), matrices.shape)
+    rows = jnp.moveaxis(jnp.concatenate([matrices, identity], axis=-1), 0, -1)
+    for k in range(6):
+        pivot = rows[k] / rows[k, k]
+        rows = (rows - rows[:, k, None] * pivot).at[k].set(pivot)
+    return jnp.moveaxis(rows[:, 6:], -1, 0)
+
+
+def _middle_of_many(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Median of some of many values from 0 on, to a small part of their largest, by bisection: sorting takes longer
+    than all else here.
+    """
+    half = 0.5 * jnp.sum(counted)
+
+    def halve(_: int, limits: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = limits
+        middle = 0.5 * (low + high)
+        is_above = jnp.sum(counted & (values < middle)) < half
+        return jnp.where(is_above, middle, low), jnp.where(is_above, high, middle)
+
+    return jax.lax.fori_loop(0, HALVINGS, halve, (jnp.float32(0.0), jnp.max(jnp.where(counted, values, 0.0))))[1]
 
 
 def _middle(values: Float[Array, " b"], weights: Float[Array, " b"]) -> Float[Array, ""]:

@@ -134,10 +134,13 @@ class Retina:
 
     def ask_area(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Opinion:
         """What the area of the last frame says of a motion."""
-        last = jax.tree.map(lambda leaf: leaf[0], scene.views)
-        credit = jnp.clip(0.5 - scene.known, 0.0, 1.0)
-        motion = jnp.asarray(target_T_reference, jnp.float32)
-        return ask_area(last, self.view(tracker), motion, credit, self.camera)
+        return _ask(
+            (scene.known, scene.views),
+            (tracker.previous_image, tracker.motion, tracker.seconds),
+            np.asarray(target_T_reference, np.float32),
+            self.full,
+            self.levels,
+        )
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
@@ -152,6 +155,23 @@ class Retina:
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
         return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
+
+
+@partial(jax.jit, static_argnames="levels")
+def _ask(
+    known: tuple[Float[Array, "h w"], View],
+    new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
+    target_T_reference: Float[Array, "4 4"],
+    camera: Camera,
+    levels: Levels,
+) -> Opinion:
+    """Asked about every frame, as `_look` is."""
+    before, views = known
+    image, motion, seconds = new
+    there = view_of(image, levels, motion * (camera.readout / seconds))
+    seen = camera.level(levels.numbers[seen_level(levels)])
+    credit = jnp.clip(0.5 - before, 0.0, 1.0)
+    return ask_area(jax.tree.map(lambda leaf: leaf[0], views), there, target_T_reference, credit, seen)
 
 
 @partial(jax.jit, static_argnames="levels")
