@@ -118,11 +118,12 @@ class BodyAware:
         """Align, and look what moves."""
         scene, retina = state.scene, self.retina
         before = np.asarray(scene.roll.labels) > 0
-        attempt = self._agreed(state, frame, clock, self.first.align(state.tracker, frame, clock))
+        first = self.first.align(state.tracker, frame, clock)
+        attempt = self._agreed(state, frame, clock, first)
         look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
-        if arisen > SUSPICIOUS or (not attempt.usable and (np.any(before) or np.any(found))):
+        if (arisen > SUSPICIOUS and attempt is first) or (not attempt.usable and (np.any(before) or np.any(found))):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
                 attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
