@@ -10,7 +10,7 @@ from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.motions import size
 from gavo_jax.trajectory import inverse
 
-MOST = 4
+MOST = 2
 """Candidates of one keyframe, which bounds the work."""
 MIN_SECONDS = 1.0
 """Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
@@ -37,14 +37,13 @@ class Candidate(NamedTuple):
     """and the correlation."""
 
 
-def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera, most: int = MOST) -> list[Candidate]:
-    """The candidates of a keyframe among earlier ones that have their images, the likest first.
+def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Candidate]:
+    """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
 
     Args:
         new: The later one.
         others: The earlier ones.
         camera: Of their images.
-        most: Of candidates.
     """
     possible = []
     for other in others:
@@ -63,7 +62,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera, most:
     for candidate in possible:
         if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
             found.append(candidate)
-    return found[:most]
+    return found[:MOST]
 
 
 def _was_tried(new: Keyframe, other: Keyframe, later_T_earlier: np.ndarray) -> bool:

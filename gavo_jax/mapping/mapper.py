@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.mapping.candidates import MOST, find_candidates
+from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
@@ -28,8 +28,6 @@ FIRST = 20
 """Keyframes of the first one."""
 SOUGHT_OF_SEGMENT = 5
 """Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
-MOST_IN_THE_END = 2
-"""Candidates of each keyframe when loops are looked for once more in the end."""
 REMEMBERED = 64
 """Frames since a keyframe whose covariance is kept, for those that refer to them."""
 
@@ -133,7 +131,7 @@ class Mapper:
         self._optimise(reweighted=1)
         self._join()
         for keyframe in self.keyframes.searchable():
-            self._close(keyframe, MOST_IN_THE_END)
+            self._close(keyframe)
         return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
     def _join(self) -> None:
@@ -186,10 +184,10 @@ class Mapper:
             keyframe.linked.add(edge.earlier)
             self.edges.append(edge)
 
-    def _close(self, keyframe: Keyframe, most: int = MOST) -> None:
+    def _close(self, keyframe: Keyframe) -> None:
         """Look for loops that a keyframe closes."""
         earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
-        candidates = find_candidates(keyframe, earlier, self.keyframes.camera, most)
+        candidates = find_candidates(keyframe, earlier, self.keyframes.camera)
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
             keyframe.tried[candidate.earlier.number] = candidate.later_T_earlier
             if edge is not None:
