@@ -4,10 +4,11 @@ A pair counts as found when its motion is within 5 cm and 3 degrees of the groun
 stamps. A gap is in frames of the clip: one that keeps every 4th frame of a sequence has four times the motion.
 
 Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
-seeds. A last row has the number of pairs and their median motion. A second table has the median errors of the pairs
-that were found. A third says how often a method's status was right about failure: precision (share of the flagged pairs
-that had failed), recall (share of the failed pairs that were flagged), and milliseconds per pair. A peer's status is
-the flag that it returns.
+seeds. The last rows have the number of pairs and their median motion, and how many of them see at least a tenth of each
+other's points. A second table has the median errors of the pairs that were found, a third those of the pairs that every
+method found. The last one says how often a method's status was right about failure: precision (share of the flagged
+pairs that had failed), recall (share of the failed pairs that were flagged), and milliseconds per pair. A peer's status
+is the flag that it returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
@@ -43,6 +44,8 @@ METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.install
 TITLE = "success rate on "
 MAX_TRANSLATION, MAX_ROTATION = 0.05, 3.0
 """Metres and degrees: errors of a found motion stay below."""
+LEAST_OVERLAP = 0.1
+"""Share of either frame's points that the other one sees in a pair that overlaps."""
 
 
 class Pair(NamedTuple):
@@ -111,6 +114,17 @@ def motion_size(a_T_b: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(a_T_b[:3, 3])), float(np.degrees(rotation_angle(a_T_b[None, :3, :3])[0]))
 
 
+def overlap(reference: Frame, target_T_reference: np.ndarray, camera: Camera) -> float:
+    """Share of a frame's points that are in view of another camera."""
+    row, column = np.mgrid[4 : camera.height : 8, 4 : camera.width : 8]
+    z = reference.depth[row, column] / float(camera.depth_scale)
+    points = np.asarray(camera.back_project(np.stack([column, row], axis=-1)[z > 0], z[z > 0]))
+    seen = points @ target_T_reference[:3, :3].T + target_T_reference[:3, 3]
+    pixels = np.asarray(camera.project(seen[seen[:, 2] > 0]))
+    size = np.array([camera.width, camera.height])
+    return float(np.sum(np.all((pixels > -0.5) & (pixels < size - 0.5), axis=1)) / max(len(points), 1))
+
+
 def attempt_pairs(
     sequence: Sequence, pairs: list[Pair], aligners: dict[str, Aligner], seeds: int
 ) -> list[dict[str, Any]]:
@@ -119,6 +133,8 @@ def attempt_pairs(
     for pair in pairs:
         reference, target = sequence[pair.reference], sequence[pair.target]
         length, angle = motion_size(pair.target_T_reference)
+        views = ((reference, pair.target_T_reference), (target, inverse(pair.target_T_reference)))
+        seen = min(overlap(frame, motion, sequence.camera) for frame, motion in views)
         for name, aligner in aligners.items():
             for seed in range(1 if name in PEERS else seeds):
                 start = time.perf_counter()
@@ -133,6 +149,7 @@ def attempt_pairs(
                         "seed": seed,
                         "motion_m": length,
                         "motion_deg": angle,
+                        "overlap": seen,
                         "error_m": error[0],
                         "error_deg": error[1],
                         "found": error[0] < MAX_TRANSLATION and error[1] < MAX_ROTATION,
@@ -157,16 +174,22 @@ def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 if r["method"] == name:
                     by_seed.setdefault(r["seed"], []).append(r["found"])
             rates[name] = float(np.median([np.mean(found) for found in by_seed.values()]))
-        rows.append({"gap": gap, "pairs": len(motions), "motion_m": length, "motion_deg": angle, "success": rates})
+        row: dict[str, Any] = {"gap": gap, "pairs": len(motions), "motion_m": length, "motion_deg": angle}
+        overlapping = {r["reference"] for r in of_gap if r["overlap"] >= LEAST_OVERLAP}
+        rows.append(row | {"overlapping": len(overlapping), "success": rates})
     return rows
 
 
-def median_errors(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a gap and method: median errors of the pairs that were found, metres and degrees; None where none was."""
+def median_errors(records: list[dict[str, Any]], of_all: bool = False) -> list[dict[str, Any]]:
+    """A row a gap and method: median errors of the pairs that were found, metres and degrees; None where none was.
+    `of_all` takes the pairs that every method found, so that methods can be compared.
+    """
     rows = []
     for gap in dict.fromkeys(r["gap"] for r in records):
+        missed = {r["reference"] for r in records if r["gap"] == gap and of_all and not r["found"]}
         for name in dict.fromkeys(r["method"] for r in records):
-            found = [r for r in records if r["gap"] == gap and r["method"] == name and r["found"]]
+            own = [r for r in records if r["gap"] == gap and r["method"] == name and r["found"]]
+            found = [r for r in own if r["reference"] not in missed]
             metres, degrees = (
                 float(np.median([r[key] for r in found])) if found else None for key in ("error_m", "error_deg")
             )
@@ -240,14 +263,16 @@ def main(
     gap_names = [f"{row['gap']} frame{'s' * (row['gap'] > 1)}, {row['motion_deg']:.0f}°" for row in rates]
     rows: list[list[Any]] = [[name, *(number(row["success"][name], 2) for row in rates)] for name in aligners]
     motions = [f"{row['pairs']}, {row['motion_m']:.3f} m" for row in rates]
-    common.print_table(f"{TITLE}{clip}", ("method", *gap_names), [*rows, ["(pairs, motion)", *motions]])
-    errors = median_errors(records)
-    rows = [
-        [name]
-        + [f"{number(row['error_m'], 4)} {number(row['error_deg'], 2)}" for row in errors if row["method"] == name]
-        for name in aligners
-    ]
-    common.print_table("median error of the found, m and degrees", ("method", *gap_names), rows)
+    overlapping = ["(that overlap)", *(str(row["overlapping"]) for row in rates)]
+    common.print_table(f"{TITLE}{clip}", ("method", *gap_names), [*rows, ["(pairs, motion)", *motions], overlapping])
+    errors, of_all = median_errors(records), median_errors(records, of_all=True)
+    for title, of in (("", errors), (" by all", of_all)):
+        rows = [
+            [name]
+            + [f"{number(row['error_m'], 4)} {number(row['error_deg'], 2)}" for row in of if row["method"] == name]
+            for name in aligners
+        ]
+        common.print_table(f"median error of the found{title}, m and degrees", ("method", *gap_names), rows)
     rows = [
         [row["method"], row["attempts"], row["failed"], row["flagged"]]
         + [number(row["precision"], 2), number(row["recall"], 2), number(row["milliseconds"], 0)]
@@ -256,7 +281,14 @@ def main(
     common.print_table(
         "status against failure", ("method", "tries", "failed", "flagged", "precision", "recall", "ms/pair"), rows
     )
-    results = {"clip": clip, "success": rates, "errors": errors, "status": agreement, "attempts": records}
+    results = {
+        "clip": clip,
+        "success": rates,
+        "errors": errors,
+        "errors_of_all": of_all,
+        "status": agreement,
+        "attempts": records,
+    }
     common.record(json, "basin", results)
     if figure is not None:
         _draw(records, clip, figure)

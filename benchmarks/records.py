@@ -122,6 +122,8 @@ SUMMARY = (
     ("gavo `gauss-newton`", "gauss-newton"),
     ("gavo `adam`", "adam"),
     ("the paper's GA, as printed", "printed"),
+    ("OpenCV SIFT, PnP", "sift-pnp"),
+    ("OpenCV ORB, PnP", "orb-pnp"),
     ("OpenCV RGB", "opencv-rgb"),
     ("OpenCV RGB-D", "opencv-rgbd"),
     ("Open3D colour", "open3d-color"),

@@ -18,7 +18,7 @@ from contextlib import suppress
 from functools import cache, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, get_args, get_type_hints
 
 import jax
 import numpy as np
@@ -76,7 +76,7 @@ class CachedProgram(Generic[P, R]):
     Args:
         function: Of trees of arrays and numbers by position, and of `static` arguments by keyword.
         static: Names of keyword arguments that are part of the program.
-        returns: The NamedTuples in what it returns.
+        returns: The NamedTuples in what it returns; those in their fields are found by their types.
     """
 
     def __init__(self, function: Callable[P, R], static: tuple[str, ...] = (), returns: tuple[type, ...] = ()):
@@ -131,11 +131,15 @@ class CachedProgram(Generic[P, R]):
 
 
 def _register(node: type) -> None:
-    """Tell JAX how to write down a NamedTuple."""
+    """Tell JAX how to write down a NamedTuple, and those in it: of one that it doesn't know no program can be kept."""
     try:
         export.register_namedtuple_serialization(node, serialized_name=f"{node.__module__}.{node.__qualname__}")
     except ValueError:  # another program returns it too
-        pass
+        return
+    for hint in get_type_hints(node).values():
+        for part in (hint, *get_args(hint)):
+            if isinstance(part, type) and issubclass(part, tuple) and hasattr(part, "_fields"):
+                _register(part)
 
 
 class Foreign(Exception):

@@ -10,10 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
-from gavo_jax import AlignmentOptions, presets, program_cache
+from gavo_jax import AlignmentOptions, AlignmentStatus, Camera, presets, program_cache
+from gavo_jax.alignment.result import no_alignment
 from gavo_jax.image.warp import Points
 from gavo_jax.objective.losses import geman_mcclure, huber
+from gavo_jax.odometry.aligners import Search
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.program_cache import CachedProgram, Foreign, identify, keep_programs_in
 
@@ -39,7 +42,7 @@ def double(numbers: jax.Array, options: AlignmentOptions, *, points: bool = Fals
     return Twice(row, Points(row, row, row) if points else None)
 
 
-program: Any = CachedProgram(double, static=("points",), returns=(Twice, Points))
+program: Any = CachedProgram(double, static=("points",), returns=(Twice,))
 
 
 @pytest.fixture
@@ -72,6 +75,15 @@ def test_a_program_is_traced_once_and_found_by_the_next_process(folder: Path) ->
         np.testing.assert_array_equal(again.doubled, first.doubled)
     np.testing.assert_allclose(first.doubled, 2.0 * NUMBERS * OPTIONS.min_overlap)
     assert len(list(folder.iterdir())) == 1
+
+
+def test_what_the_programs_of_frames_and_pairs_return_can_be_kept() -> None:
+    settings = presets.preset("ga", "fast")
+    state = Search(Camera.preset("icl"), settings, jax.random.key(0)).blank_state()
+    for result in (state, no_alignment(AlignmentStatus.GAP)._replace(status=0)):
+        leaves, structure = jax.tree.flatten(result)
+        kept = export.export(jax.jit(lambda *leaves, of=structure: jax.tree.unflatten(of, leaves)))
+        assert kept(*map(jnp.asarray, leaves)).serialize()
 
 
 def test_its_own_results_are_no_new_program(folder: Path) -> None:

@@ -12,7 +12,7 @@ from gavo_jax.alignment.evidence import Evidence
 from gavo_jax.alignment.modes import rival_error
 from gavo_jax.objective.estimates import Brightness
 
-STRONG_TOTAL, STRONG_SEEN = 1.5, 2.8
+STRONG_TOTAL, STRONG_SEEN = 0.9, 2.8
 """Evidence beyond which a motion that was known before needs no search."""
 LEAST_EVIDENCE = 0.02
 """Evidence counts as this much at least where two are compared."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
@@ -19,6 +20,7 @@ from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
+from gavo_jax.status import AlignmentStatus
 
 
 class Images(NamedTuple):
@@ -99,6 +101,36 @@ def with_features(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
+MOST_DELAY = 0.1
+"""Seconds: depth that is further from its colour image has a stamp that tells nothing."""
+
+
+def depth_delays(side: Any, count: int) -> list[float]:
+    """Seconds from each frame's colour image to its depth image; 0 where that is not known."""
+    frames = side if isinstance(side, list) else [None] * count
+    stamps = [(f.depth_timestamp, f.timestamp) if isinstance(f, Frame) else (None, 0.0) for f in frames]
+    delays = [0.0 if depth is None else depth - grey for depth, grey in stamps]
+    return [delay if abs(delay) <= MOST_DELAY else 0.0 for delay in delays]
+
+
+def moving_rows(
+    result: Alignment, sides: Any, camera: Camera, settings: Settings, delays: list[tuple[float, float]]
+) -> Alignment:
+    """A batch's results on the host, with what each frame's own motion did to it taken into account."""
+    options = settings.alignment
+    if not options.refine or options.features == "off":
+        return result
+    rows = [jax.tree.map(lambda leaf, k=k: leaf[k], result) for k in range(len(result.status))]
+    for k, row in enumerate(rows):
+        if not (camera.readout or any(delays[k])) or not np.isfinite(row.covariance).all():
+            continue
+        before, after = (Images(np.asarray(side.grey[k]), np.asarray(side.depth[k])) for side in sides)
+        found = refine_moving(before, after, camera.rectified(), row.target_T_reference, delays[k])
+        if found is not None:
+            rows[k] = with_own_motion(row, found)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
     """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
     first `count` rows alone, where that is given.
@@ -132,9 +164,10 @@ def align(
 ) -> Alignment:
     """Estimate the motion of the camera between two RGB-D frames.
 
-    Each image counts as taken at one moment, its depth with it, also where stamps and the camera's `readout` are known:
-    the velocity that a rolling shutter or a delay of depth asks for is not the motion between frames far apart, and
-    over a gap the candidate's own motion would be a wrong one. The driver, which knows it, takes both into account.
+    The search takes each image as of one moment, its depth with it. Where a rolling shutter (`Camera.readout`) or a
+    delay of depth (a `Frame`'s stamps) says that it is not, the camera's velocity is needed, which the motion between
+    frames far apart does not tell. The preset `wide` finds both at the end (`alignment.own_motion`), `error`, `overlap`
+    and `explained` being those of the motion before. The driver knows the velocity from the frames before.
 
     Args:
         reference: Frame t: a `Frame`, or a pair of arrays (grey, depth) of [H, W]; depth in units of
@@ -157,8 +190,10 @@ def align(
     sides = [stacked_images([frame], camera) for frame in (reference, target)]
     keys = (jax.random.key(0) if key is None else key)[None]
     guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
-    result = align_rows(sides, camera, settings, keys, with_features(guesses, sides, camera, settings))
-    return on_host(jax.tree.map(lambda leaf: leaf[0], result))
+    result = on_host(align_rows(sides, camera, settings, keys, with_features(guesses, sides, camera, settings)))
+    delays = list(zip(depth_delays([reference], 1), depth_delays([target], 1), strict=True))
+    row = jax.tree.map(lambda leaf: leaf[0], moving_rows(result, sides, camera, settings, delays))
+    return row._replace(status=AlignmentStatus(int(row.status)))
 
 
 def align_batch(
@@ -199,7 +234,9 @@ def align_batch(
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
     guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
     guesses = with_features(guesses, sides, camera, settings)
-    return on_host(align_rows(sides, camera, settings, keys, guesses))
+    result = on_host(align_rows(sides, camera, settings, keys, guesses))
+    delays = list(zip(depth_delays(references, count), depth_delays(targets, count), strict=True))
+    return moving_rows(result, sides, camera, settings, delays)
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:

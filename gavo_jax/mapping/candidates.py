@@ -5,13 +5,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.camera import Camera
-from gavo_jax.mapping.keyframes import Keyframe
+from gavo_jax.camera import Camera, to_pixels
+from gavo_jax.mapping.keyframes import NEAREST, Keyframe
 from gavo_jax.mapping.motions import size
 from gavo_jax.trajectory import inverse
 
-MOST = 4
+MOST = 2
 """Candidates of one keyframe, which bounds the work."""
+LOOKED_AT = 48
+"""Earlier keyframes, those that see most of what the new one sees, that are compared with it: this bounds the work."""
+FEW_POINTS = 60
+"""Points that tell which these are."""
 MIN_SECONDS = 1.0
 """Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
@@ -37,20 +41,17 @@ class Candidate(NamedTuple):
     """and the correlation."""
 
 
-def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera, most: int = MOST) -> list[Candidate]:
-    """The candidates of a keyframe among earlier ones that have their images, the likest first.
+def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Candidate]:
+    """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
 
     Args:
         new: The later one.
         others: The earlier ones.
         camera: Of their images.
-        most: Of candidates.
     """
     possible = []
-    for other in others:
+    for other in _most_overlapping(new, others, camera):
         later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
-        if new.timestamp - other.timestamp < MIN_SECONDS or _was_tried(new, other, later_T_earlier):
-            continue
         back = new.look.agreement(other.look, inverse(later_T_earlier), camera)
         if back[0] < MIN_OVERLAP or back[1] < MIN_LIKENESS:
             continue
@@ -63,15 +64,30 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera, most:
     for candidate in possible:
         if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
             found.append(candidate)
-    return found[:most]
+    return found[:MOST]
 
 
-def _was_tried(new: Keyframe, other: Keyframe, later_T_earlier: np.ndarray) -> bool:
+def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
+    """Those of some earlier keyframes that were not tried yet and see most of what a new one sees."""
+    old = [o for o in others if new.timestamp - o.timestamp >= MIN_SECONDS and not _was_tried(new, o)]
+    points = new.look.points[:, :: max(1, new.look.points.shape[1] // FEW_POINTS)]
+    if not old or not points.size:
+        return []
+    old_T_new = inverse(np.stack([other.world_T_camera for other in old])) @ new.world_T_camera
+    x, y, z = np.moveaxis(old_T_new[:, :3, :3] @ points + old_T_new[:, :3, 3:], 1, 0)
+    ahead = z > NEAREST
+    u, v = to_pixels(camera, x, y, 1.0 / np.where(ahead, z, 1.0))
+    seen = np.mean(ahead & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1), axis=1)
+    return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= 0.8 * MIN_OVERLAP]
+
+
+def _was_tried(new: Keyframe, other: Keyframe) -> bool:
     """Whether they are linked, or were aligned in vain from about the same guess."""
     if other.number in new.linked:
         return True
     guess = new.tried.get(other.number)
     if guess is None:
         return False
+    later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
     changes = size(inverse(guess) @ later_T_earlier)
     return all(change < least for change, least in zip(changes, ANOTHER_GUESS, strict=True))

@@ -9,8 +9,8 @@ from jaxtyping import Float32, Float64
 
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
+from gavo_jax.image.settling import Still, still
 from gavo_jax.mapping.motions import size
-from gavo_jax.mapping.settling import Still, still
 from gavo_jax.trajectory import inverse
 
 MAX_IMAGES = 300

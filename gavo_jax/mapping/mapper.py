@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.mapping.candidates import MOST, find_candidates
+from gavo_jax.mapping.candidates import Candidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
@@ -28,8 +28,8 @@ FIRST = 20
 """Keyframes of the first one."""
 SOUGHT_OF_SEGMENT = 5
 """Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
-MOST_IN_THE_END = 2
-"""Candidates of each keyframe when loops are looked for once more in the end."""
+MOST_IN_THE_END = 100
+"""Candidates, the likest ones, that are aligned when loops are looked for once more in the end."""
 REMEMBERED = 64
 """Frames since a keyframe whose covariance is kept, for those that refer to them."""
 
@@ -132,8 +132,9 @@ class Mapper:
             return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
         self._optimise(reweighted=1)
         self._join()
-        for keyframe in self.keyframes.searchable():
-            self._close(keyframe, MOST_IN_THE_END)
+        candidates = [candidate for keyframe in self.keyframes.searchable() for candidate in self._candidates(keyframe)]
+        candidates.sort(key=lambda candidate: -candidate.likeness)
+        self._close(candidates[:MOST_IN_THE_END])
         return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
     def _join(self) -> None:
@@ -167,7 +168,7 @@ class Mapper:
         self.keyframes.add(keyframe)
         self._known.clear()
         self._known[_key(keyframe.timestamp)] = np.zeros((6, 6))
-        self._close(keyframe)
+        self._close(self._candidates(keyframe))
         if len(self.keyframes.all) >= self._next:
             self._next = int(GROWTH * len(self.keyframes.all)) + 1
             self._optimise()
@@ -186,14 +187,17 @@ class Mapper:
             keyframe.linked.add(edge.earlier)
             self.edges.append(edge)
 
-    def _close(self, keyframe: Keyframe, most: int = MOST) -> None:
-        """Look for loops that a keyframe closes."""
+    def _candidates(self, keyframe: Keyframe) -> list[Candidate]:
+        """The loops that a keyframe may close."""
         earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
-        candidates = find_candidates(keyframe, earlier, self.keyframes.camera, most)
+        return find_candidates(keyframe, earlier, self.keyframes.camera)
+
+    def _close(self, candidates: list[Candidate]) -> None:
+        """Keep those loops that stand."""
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
-            keyframe.tried[candidate.earlier.number] = candidate.later_T_earlier
+            candidate.later.tried[candidate.earlier.number] = candidate.later_T_earlier
             if edge is not None:
-                self._link(keyframe, edge)
+                self._link(candidate.later, edge)
 
     def _optimise(self, reweighted: int = 0) -> Solution:
         """Move all keyframes to where odometry and loops want them."""

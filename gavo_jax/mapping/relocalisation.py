@@ -12,9 +12,9 @@ from jaxtyping import Float32
 
 from gavo_jax.camera import Camera
 from gavo_jax.features import Features, detect, solve_motion
+from gavo_jax.image.settling import Still
 from gavo_jax.mapping.candidates import Candidate
 from gavo_jax.mapping.keyframes import Keyframe, Look
-from gavo_jax.mapping.settling import Still
 from gavo_jax.mapping.verification import Edge, Verifier
 
 LOOKED_AT = 8

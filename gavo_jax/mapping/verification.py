@@ -11,9 +11,9 @@ from jaxtyping import Float64
 from gavo_jax.alignment.pairs import Images, align_rows
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
+from gavo_jax.image.settling import Still
 from gavo_jax.mapping.candidates import MOST, Candidate
 from gavo_jax.mapping.motions import between, carried, size
-from gavo_jax.mapping.settling import Still
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus

@@ -10,12 +10,12 @@ from small import CAMERA
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.image.settling import still
 from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.mapping.motions import exp, log, size
-from gavo_jax.mapping.settling import still
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
 from gavo_jax.odometry.run import guessed, trajectory_of

@@ -52,7 +52,7 @@ def still(
     if not np.any(twist):
         return Still(grey, depth)
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
-    flow = _flow(camera, u, v, _filled_inverse_depth(depth, camera), twist)
+    flow = pixel_flow(camera, u, v, filled_inverse_depth(depth, camera), twist)
     seconds = np.float32(camera.readout) * row_time(v, camera)
     seconds = seconds + np.float32(camera.readout / camera.height) * flow[1] * seconds
     if camera.readout:
@@ -67,7 +67,7 @@ def still(
     return Still(grey, depth)
 
 
-def _flow(
+def pixel_flow(
     camera: Camera, u: np.ndarray, v: np.ndarray, q: np.ndarray, twist: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Motion of each pixel along u and v, pixels a second, and the rotation's part in its depth's relative rate."""
@@ -80,7 +80,7 @@ def _flow(
     return along_u.astype(np.float32), along_v.astype(np.float32), forward.astype(np.float32)
 
 
-def _filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
+def filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """1/z [1/m], gaps filled from their surroundings."""
     known = depth > 0
     q = np.where(known, camera.depth_scale / np.maximum(depth, 1), 0.0).astype(np.float32)

@@ -1,0 +1,99 @@
+"""Corners of one frame found again in another one, from a motion that is nearly right.
+
+The target is first seen from where the reference was taken: what differs then is what the motion does not explain, a
+few pixels, and Lucas and Kanade's tracking finds it to a part of one.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float64, UInt8, UInt16
+
+from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.settling import filled_inverse_depth
+
+MOST = 500
+"""Corners, the strongest ones,"""
+QUALITY = 0.005
+"""down to this share of the strongest one's response,"""
+LEAST_SLOPE = 2.0
+"""Grey levels a pixel that a corner must have in every direction; noise has about one."""
+RESPONSE = 64.0 * 9.0 / (12.0 * 255.0) ** 2
+"""OpenCV's response to one grey level a pixel in every direction: sums of its Sobel filter over 3 x 3 pixels."""
+SPACING = 1 / 80
+"""no two nearer than this share of the image's width."""
+WINDOW = 1 / 30
+"""What is compared about a corner, as a share of the width."""
+RETURN = 0.5
+"""Pixels within which tracking back must end where it began."""
+NEAREST = 0.05
+"""Metres in front of a camera from which on a point is seen."""
+
+
+class Matches(NamedTuple):
+    """The same corners in two frames."""
+
+    reference: Float64[np.ndarray, "n 2"]
+    """Column and row,"""
+    target: Float64[np.ndarray, "n 2"]
+    """and where they are in the other frame."""
+
+
+def track_corners(
+    reference: tuple[UInt8[np.ndarray, "h w"], UInt16[np.ndarray, "h w"]],
+    target: UInt8[np.ndarray, "h w"],
+    target_T_reference: Float[np.ndarray, "4 4"],
+    camera: Camera,
+) -> Matches:
+    """Find corners of a frame in another one.
+
+    Args:
+        reference: Grey and depth, 0 = no reading.
+        target: Grey.
+        target_T_reference: The motion as far as it is known.
+        camera: Of both, without distortion.
+    """
+    grey, depth = reference
+    column, row, seen = _view(depth, target_T_reference, camera)
+    size = 2 * int(0.5 * WINDOW * camera.width) + 1
+    seen = cv2.erode(seen, np.ones((size, size), np.uint8)) * (depth > 0)
+    points = None
+    is_corner = seen * (cv2.cornerMinEigenVal(grey, 3) > RESPONSE * LEAST_SLOPE**2).astype(np.uint8)
+    if is_corner.any():
+        points = cv2.goodFeaturesToTrack(grey, MOST, QUALITY, max(1.0, SPACING * camera.width), mask=255 * is_corner)
+    if points is None:
+        return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
+    there = cv2.remap(target, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    there = _as_bright(there, grey, seen > 0)
+    options = {"winSize": (size, size), "criteria": (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01)}
+    found, is_found, _ = cv2.calcOpticalFlowPyrLK(grey, there, points, np.empty(0), **options)
+    back, is_back, _ = cv2.calcOpticalFlowPyrLK(there, grey, found, np.empty(0), **options)
+    kept = (is_found[:, 0] > 0) & (is_back[:, 0] > 0) & (np.linalg.norm(points - back, axis=2)[:, 0] < RETURN)
+    before, after = points[kept, 0], found[kept, 0]
+    if not kept.any():
+        return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
+    landed = [cv2.remap(axis, after[:, :1], after[:, 1:], cv2.INTER_LINEAR)[:, 0] for axis in (column, row)]
+    return Matches(before.astype(np.float64), np.stack(landed, axis=-1).astype(np.float64))
+
+
+def _view(depth: np.ndarray, motion: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column and row in the target of each of the reference's pixels, and whether they are in view there."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
+    x, y = to_ray(camera, u, v)
+    q = filled_inverse_depth(depth, camera)
+    rotation, shift = motion[:3, :3].astype(np.float32), motion[:3, 3].astype(np.float32)
+    a, b, c = (rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] + shift[i] * q for i in range(3))
+    ahead = c > NEAREST * q
+    c = np.where(ahead, c, 1.0)
+    column = (camera.fx * a / c + camera.cx).astype(np.float32)
+    row = (camera.fy * b / c + camera.cy).astype(np.float32)
+    inside = (column > 0) & (column < camera.width - 1) & (row > 0) & (row < camera.height - 1)
+    return column, row, (ahead & inside).astype(np.uint8)
+
+
+def _as_bright(grey: np.ndarray, other: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """An image with the mean and the contrast of another one, by what both see."""
+    own, wanted = grey[seen].astype(np.float32), other[seen].astype(np.float32)
+    gain = wanted.std() / max(float(own.std()), 1.0)
+    return np.clip((grey - own.mean()) * gain + wanted.mean(), 0.0, 255.0).astype(np.uint8)
