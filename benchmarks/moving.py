@@ -19,9 +19,7 @@ Dashes stand where a method knows no bodies.
 On 2 cores the defaults take about half an hour.
 """
 
-import csv
 import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,6 +30,7 @@ import cv2
 import numpy as np
 from moving_clips import LOOKS, CardClip
 
+from gavo_jax.bodies.records import Body
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.bodies_truth import WithBodies
 from gavo_jax.datasets.moving import body_of_part
@@ -40,7 +39,6 @@ from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
-from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
@@ -51,10 +49,8 @@ WRONG = (0.02, 1.5)
 """Metres and degrees: a pair whose motion is further from the truth is wrong."""
 LEAST_SHARE = 0.01
 """Of the image: less of a body than this need not be found."""
-BODIES = "bodies.csv"
 ROOM = "room"
 """Name of the rendered sequences; each seed has its own."""
-AXES = (("x", "y", "z"), ("dx", "dy", "dz"), ("rx", "ry", "rz"))
 PEER_NAMES = ("opencv-rgbd", "opencv-depth", "open3d-color", "open3d-hybrid")
 DEFAULT_METHODS = ",".join(["ga", "gauss-newton", *(name for name in PEER_NAMES if PEERS[name].installed)])
 
@@ -67,17 +63,6 @@ class Case(NamedTuple):
     seed: int
     sequence: Any
     clean: FrameSequence
-
-
-class Found(NamedTuple):
-    """A row of bodies.csv: the motion of one body since the frame before, in the run's world (the first camera)."""
-
-    centroid: np.ndarray
-    """[3] m."""
-    displacement: np.ndarray
-    """[3] of the centroid, m."""
-    rotation: np.ndarray
-    """[3] rotation vector, rad."""
 
 
 @dataclass
@@ -119,24 +104,6 @@ def with_bodies(settings: Settings, mode: str | None) -> Settings:
     raise GavoError("--bodies: the settings know no bodies")
 
 
-def masks_of(step: Step) -> dict[str, np.ndarray]:
-    """The bodies' masks of a step by their numbers, bool [H, W]; none where it knows of none."""
-    return {str(body.number): np.asarray(body.mask, bool) for body in getattr(step, "bodies", None) or ()}
-
-
-def read_bodies(folder: Path) -> dict[tuple[str, str], Found]:
-    """Rows of bodies.csv by stamp (6 decimals) and body; those without a motion are left out, none where no file is."""
-    path, found = folder / BODIES, {}
-    if not path.exists():
-        return found
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            vectors = [[float(row[axis] or "nan") for axis in axes] for axes in AXES]
-            if np.isfinite(vectors).all():
-                found[f"{float(row['timestamp']):.6f}", row["body"]] = Found(*map(np.array, vectors))
-    return found
-
-
 def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]:
     """The true masks of the bodies of which a frame shows enough, by label; from the labels of its parts."""
     bodies = body_of_part(sequence.bodies_truth)[labels]
@@ -147,9 +114,9 @@ def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]
     }
 
 
-def best_match(true: np.ndarray, masks: dict[str, np.ndarray]) -> tuple[str | None, float]:
+def best_match(true: np.ndarray, masks: dict[int, np.ndarray]) -> tuple[int | None, float]:
     """The found mask of largest intersection over union with a true one, and that."""
-    best: tuple[str | None, float] = (None, 0.0)
+    best: tuple[int | None, float] = (None, 0.0)
     for name, mask in masks.items():
         overlap = float((mask & true).sum() / (mask | true).sum())
         if overlap > best[1]:
@@ -158,7 +125,7 @@ def best_match(true: np.ndarray, masks: dict[str, np.ndarray]) -> tuple[str | No
 
 
 def motion_errors(
-    sequence: WithBodies, index: int, label: int, labels: np.ndarray, found: Found, world_T_first: np.ndarray
+    sequence: WithBodies, index: int, label: int, labels: np.ndarray, found: Body, world_T_first: np.ndarray
 ) -> tuple[float, float | None]:
     """How far the motion of a body between frames index - 1 and index is from the truth.
 
@@ -199,31 +166,24 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
     first = float(sequence.timestamps[0])
     world_T_first = truth.interpolate(sequence.timestamps[:1], max_gap=np.inf)[0][0]
     poses: dict[float, np.ndarray] = {first: np.eye(4)}
-    matches: list[tuple[int, str, int, str | None, np.ndarray]] = []
 
     def on_step(step: Step) -> None:
-        folder.add(step, odometry.progress)
         poses[step.timestamp] = step.world_T_camera
         if score is None:
             return
         count(score, is_wrong(step, poses, truth), step.alignment.status != 0)
-        masks = masks_of(step)
-        if hasattr(step, "bodies"):
-            labels = sequence.part_labels(step.index)
-            for body, mask in bodies_in(sequence, labels).items():
-                name, overlap = best_match(mask, masks)
-                score.overlaps.append(overlap)
-                matches.append((step.index, f"{step.timestamp:.6f}", body, name, labels))
+        labels = sequence.part_labels(step.index)
+        masks = {body.number: body.mask for body in step.bodies}
+        bodies = {body.number: body for body in step.bodies}
+        for label, mask in bodies_in(sequence, labels).items():
+            number, overlap = best_match(mask, masks)
+            score.overlaps.append(overlap)
+            if number is not None and np.isfinite(bodies[number].displacement).all():
+                apart, turned = motion_errors(sequence, step.index, label, labels, bodies[number], world_T_first)
+                score.displacements_mm.append(apart)
+                score.rotations_deg += [] if turned is None else [turned]
 
-    with tempfile.TemporaryDirectory() as scratch, RunFolder(Path(scratch) / "run") as folder:
-        folder.start({}, first)
-        steps = track_visibly(label, sequence, odometry, on_step).steps
-        rows = read_bodies(folder.path) if score is not None else {}
-    for index, stamp, body, name, labels in matches:
-        if score is not None and name is not None and (found := rows.get((stamp, name))):
-            apart, turned = motion_errors(sequence, index, body, labels, found, world_T_first)
-            score.displacements_mm.append(apart)
-            score.rotations_deg += [] if turned is None else [turned]
+    steps = track_visibly(label, sequence, odometry, on_step).steps
     return trajectory_of(first, steps)
 
 

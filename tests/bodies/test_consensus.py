@@ -31,7 +31,8 @@ def room() -> SyntheticSequence:
 
 def views(room: SyntheticSequence, retina: Retina) -> tuple[list[View], np.ndarray]:
     """Of the first two frames, and the true motion between them."""
-    pyramids = [build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale, 5) for frame in room[:2]]
+    images = [(jnp.asarray(frame.grey), jnp.asarray(frame.depth)) for frame in room[:2]]
+    pyramids = [build_pyramid(grey, depth, CAMERA.depth_scale, 5) for grey, depth in images]
     still = jnp.zeros(6)
     seen = [view_of(prepare_target(pyramid, retina.levels), retina.levels, still) for pyramid in pyramids]
     poses = room.ground_truth.interpolate(room.timestamps)[0]
