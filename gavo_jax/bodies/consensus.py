@@ -114,7 +114,8 @@ def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, "
 
 def _grid(camera: Camera) -> tuple[int, int]:
     """Rows and columns of blocks."""
-    return tuple(-(-size // STRIDE) // CELL for size in (camera.height, camera.width))
+    rows, columns = (-(-size // STRIDE) // CELL for size in (camera.height, camera.width))
+    return rows, columns
 
 
 def _equations(
