@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 from command import runner
+from small import CAMERA
 
-from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 
 EVIL = "cl\x1b]0;gotcha\x07\x1b[31m\x9bip [b] {task} %s $\\frac$\n"
@@ -18,7 +18,7 @@ EVIL = "cl\x1b]0;gotcha\x07\x1b[31m\x9bip [b] {task} %s $\\frac$\n"
 @pytest.fixture
 def gavo(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    write_tum(SyntheticSequence(frames=40, camera=Camera(65.5, 65.5, 39.5, 29.5, 80, 60)), tmp_path / EVIL)
+    write_tum(SyntheticSequence(frames=40, camera=CAMERA), tmp_path / EVIL)
     (Path(EVIL) / "camera.toml").rename("camera.toml")
     return runner(capsys)
 
