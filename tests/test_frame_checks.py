@@ -91,6 +91,16 @@ def test_depth_in_other_units_throughout_is_told_but_used(frames):
     assert findings == [Finding(Status.DEPTH_UNITS, Use.ALL)] * len(frames)
 
 
+def test_a_near_body_does_not_change_the_units(frames, seen):
+    def behind_a_body(frame: Frame) -> Frame:
+        depth = frame.depth.copy()
+        depth[:, : depth.shape[1] * 7 // 10] = int(0.3 * CAMERA.depth_scale)
+        return replace(frame, depth=depth)
+
+    findings, _ = look(seen, *map(behind_a_body, frames[5:7]), frames[7])
+    assert findings == [Finding(Status.OK, Use.ALL)] * 3
+
+
 def test_a_frozen_image(frames, seen):
     frozen = replace(frames[4], timestamp=frames[5].timestamp, depth=frames[5].depth)
     findings, _ = look(seen, frozen, frames[6])
