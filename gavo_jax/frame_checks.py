@@ -58,7 +58,7 @@ class History(NamedTuple):
     """Depth of the last good frame at the `RANGE_QUANTILES`, metres, and that frame's stamp."""
     range_timestamp: float = 0.0
     units_known: bool = False
-    """Whether a frame's median was likely, and the farthest readings went on from there."""
+    """Whether a frame's depth was that of a camera; since then it has changed only as a scene can."""
     doubts: int = 0
     """Frames in a row that were refused only for being unlike those before."""
 
@@ -91,10 +91,10 @@ RANGE_AGE = 0.1
 MAX_DUPLICATE_DIFFERENCE = 2
 """Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
 DEPTH_RANGE = (0.4, 15.0)
-"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless a near body
-hides a scene that was seen before. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
+"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
+without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
 MIN_FAR = 0.8
-"""Metres: the scene's farthest readings behind such a body; in millimetres read as fifths they would be 4 m away."""
+"""Metres: the highest of the quantiles, for units to be known; read as fifths, millimetres are that from 4 m on."""
 MAX_INTERVAL_RATIO = 2.5
 """An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
 MIN_INTERVALS = 3
@@ -214,18 +214,17 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     usual = median(history.coverages) if history.coverages else coverage
     history = history._replace(coverages=_remember(history.coverages, coverage))
     ranges = np.percentile(readings[::ROW_STEP], RANGE_QUANTILES) / depth_scale
-    behind = False
     if history.ranges:
         age = (history.timestamp or 0.0) - history.range_timestamp
         changes = np.log(ranges / np.array(history.ranges))
         limit = math.log(MAX_RANGE_RATIO) * max(age / RANGE_AGE, 1.0)
         if np.all(changes > limit) or np.all(changes < -limit):
             return _refused(AlignmentStatus.DEPTH_UNITS), history
-        behind = history.units_known and ranges[-1] > MIN_FAR and abs(changes[-1]) < math.log(MAX_RANGE_RATIO)
-    known = bool(behind or DEPTH_RANGE[0] < ranges[1] < DEPTH_RANGE[1])
+    likely = bool(DEPTH_RANGE[0] < ranges[1] < DEPTH_RANGE[1])
+    known = history.units_known or (likely and bool(ranges[-1] > MIN_FAR))
     stamp = history.timestamp or 0.0
     history = history._replace(ranges=tuple(ranges.tolist()), range_timestamp=stamp, units_known=known)
-    if not known:
+    if not (likely or known):
         return Finding(AlignmentStatus.DEPTH_UNITS, Use.ALL), history
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
