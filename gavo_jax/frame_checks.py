@@ -54,11 +54,11 @@ class History(NamedTuple):
     """Shares of black or white pixels of the last good frames."""
     coverages: tuple[float, ...] = ()
     """Shares of pixels with depth of the last frames that had any."""
-    range: float | None = None
-    """Median depth of the last good frame, metres, and that frame's stamp."""
+    ranges: tuple[float, ...] = ()
+    """Depth of the last good frame at the `RANGE_QUANTILES`, metres, and that frame's stamp."""
     range_timestamp: float = 0.0
     units_known: bool = False
-    """Whether depths were plausible, and have not jumped since."""
+    """Whether a frame's depth was that of a camera; since then it has changed only as a scene can."""
     doubts: int = 0
     """Frames in a row that were refused only for being unlike those before."""
 
@@ -80,16 +80,21 @@ MIN_CORRELATION = 0.7
 up to a half where undistortion interpolated it."""
 MIN_COVERAGE_RATIO = 0.7
 """Depth readings, against their usual number, below which depth is partial; the TUM clips stay above 0.92."""
+RANGE_QUANTILES = (25.0, 50.0, 75.0)
+"""Per cent of the readings. Other units change all of them by one factor; a near body changes the lower ones alone.
+Higher ones would often be at the end of what the image's numbers can hold."""
 MAX_RANGE_RATIO = 2.5
-"""A median depth that grows or shrinks by more than this from a frame to the next is in other units; handheld motion
-stays within 1.4 a frame. The limit's logarithm grows with the time between,"""
+"""Depth that grows or shrinks by more than this from a frame to the next, at all those quantiles, is in other units;
+handheld motion stays within 1.4 a frame. The limit's logarithm grows with the time between,"""
 RANGE_AGE = 0.1
 """in seconds, beyond this."""
 MAX_DUPLICATE_DIFFERENCE = 2
 """Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
 DEPTH_RANGE = (0.4, 15.0)
-"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer). Millimetres that are
-read as fifths of one put a scene nearer than 2 m there."""
+"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
+without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
+MIN_FAR = 0.8
+"""Metres: the highest of the quantiles, for units to be known; read as fifths, millimetres are that from 4 m on."""
 MAX_INTERVAL_RATIO = 2.5
 """An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
 MIN_INTERVALS = 3
@@ -208,17 +213,18 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
         return Finding(AlignmentStatus.NO_DEPTH, Use.TARGET), history
     usual = median(history.coverages) if history.coverages else coverage
     history = history._replace(coverages=_remember(history.coverages, coverage))
-    range_m = float(np.median(readings[::ROW_STEP])) / depth_scale
-    known = history.units_known
-    if history.range is not None:
+    ranges = np.percentile(readings[::ROW_STEP], RANGE_QUANTILES) / depth_scale
+    if history.ranges:
         age = (history.timestamp or 0.0) - history.range_timestamp
-        jump = abs(math.log(range_m / history.range)) / math.log(MAX_RANGE_RATIO)
-        if jump > max(age / RANGE_AGE, 1.0):
+        changes = np.log(ranges / np.array(history.ranges))
+        limit = math.log(MAX_RANGE_RATIO) * max(age / RANGE_AGE, 1.0)
+        if np.all(changes > limit) or np.all(changes < -limit):
             return _refused(AlignmentStatus.DEPTH_UNITS), history
-        known = known and jump < 1.0
-    plausible = DEPTH_RANGE[0] < range_m < DEPTH_RANGE[1]
-    history = history._replace(range=range_m, range_timestamp=history.timestamp or 0.0, units_known=known or plausible)
-    if not plausible and not known:  # something near may have come before the camera
+    likely = bool(DEPTH_RANGE[0] < ranges[1] < DEPTH_RANGE[1])
+    known = history.units_known or (likely and bool(ranges[-1] > MIN_FAR))
+    stamp = history.timestamp or 0.0
+    history = history._replace(ranges=tuple(ranges.tolist()), range_timestamp=stamp, units_known=known)
+    if not (likely or known):
         return Finding(AlignmentStatus.DEPTH_UNITS, Use.ALL), history
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
