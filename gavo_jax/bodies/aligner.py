@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.consensus import Opinion, dissent_of
+from gavo_jax.bodies.consensus import Opinion, dissent_of, has_blocks
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Retina
@@ -92,11 +92,11 @@ class BodyAware:
         """Compile what every frame needs: the search, and the look at what it explains."""
         seconds, start = self.first.warm_up(), time.perf_counter()
         state = self.blank_state()
-        opinion = self.retina.ask_area(state.scene, state.tracker, np.eye(4))
-        jax.block_until_ready((dissent_of(opinion, np.eye(4, dtype=np.float32)), opinion))
-        jax.block_until_ready(
-            self._without(state.tracker, opinion, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0)))
-        )
+        if has_blocks(self.retina.camera):
+            opinion = self.retina.ask_area(state.scene, state.tracker, np.eye(4))
+            clock = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
+            jax.block_until_ready(self._without(state.tracker, opinion, clock))
+            jax.block_until_ready(dissent_of(opinion, np.eye(4, dtype=np.float32)))
         jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
         return seconds + time.perf_counter() - start
 
@@ -142,7 +142,7 @@ class BodyAware:
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion."""
-        for _ in range(ROUNDS):
+        for _ in range(ROUNDS if has_blocks(self.retina.camera) else 0):
             opinion = self.retina.ask_area(state.scene, attempt.state, attempt.result.target_T_reference)
             if not float(opinion.dissent) > RELUCTANT * float(opinion.least):
                 break

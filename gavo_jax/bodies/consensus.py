@@ -29,6 +29,7 @@ BOUND = 6.0
 FARTHER = 2.0
 """A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
 ROUNDS = 4
+"""Of re-weighting the blocks, about their median."""
 HALVINGS = 16
 DISSENT = 6.0
 """Times the usual: from there on a block does not move as the others do."""
@@ -40,6 +41,7 @@ class Blocks(NamedTuple):
     hessian: Float[Array, "b 6 6"]
     gradient: Float[Array, "b 6"]
     inverse: Float[Array, "b 6 6"]
+    """Of the Hessians, damped."""
     credit: Float[Array, " b"]
 
 
@@ -58,6 +60,11 @@ class Opinion(NamedTuple):
     """The motion that the area asks for."""
     dissenting: Bool[Array, "h w"]
     """Pixels of blocks that do not move by it."""
+
+
+def has_blocks(camera: Camera) -> bool:
+    """Whether an image is large enough for a block."""
+    return min(_grid(camera)) > 0
 
 
 def ask_area(

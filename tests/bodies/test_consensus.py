@@ -68,3 +68,10 @@ def test_the_camera_is_not_taken_along(room: SyntheticSequence) -> None:
         return float(np.linalg.norm((inverse(true) @ step.world_T_camera)[:3, 3]))
 
     assert error("mask") < min(0.01, 0.3 * error("off"))
+
+
+def test_an_image_without_room_for_a_block_is_not_asked() -> None:
+    tiny = DEFAULT_CAMERA.level(4)
+    sequence = SyntheticSequence(3, camera=tiny)
+    coarse = replace(MASKED, solver=GaussNewton(iterations=(0, 0, 0, 5, 5)))
+    assert [step.index for step in track(sequence, coarse)] == [1, 2]
