@@ -95,6 +95,7 @@ def ask_area(
     dissenting = jnp.repeat(
         jnp.repeat((gains > DISSENT * least).reshape(rows, columns), CELL * STRIDE, 0), CELL * STRIDE, 1
     )
+    dissenting = dissenting[: camera.height, : camera.width]  # of an odd side, a block's last pixel may lie outside
     rest = ((0, camera.height - dissenting.shape[0]), (0, camera.width - dissenting.shape[1]))
     return Opinion(
         target_T_here,

@@ -1,7 +1,9 @@
 """A scene of little contrast outvotes a body of much."""
 
 from dataclasses import replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.image.pyramid import build_pyramid
+from gavo_jax.image.sampling import Target
 from gavo_jax.odometry.driver import track
 from gavo_jax.se3 import exp
 from gavo_jax.settings import OdometryOptions, Settings
@@ -75,3 +78,13 @@ def test_an_image_without_room_for_a_block_is_not_asked() -> None:
     sequence = SyntheticSequence(3, camera=tiny)
     coarse = replace(MASKED, solver=GaussNewton(iterations=(0, 0, 0, 5, 5)))
     assert [step.index for step in track(sequence, coarse)] == [1, 2]
+
+
+@pytest.mark.parametrize("size", [(15, 20), (23, 31), (24, 39), (9, 7)])
+def test_images_of_any_size_are_asked(size: tuple[int, int]) -> None:
+    height, width = size
+    camera = replace(DEFAULT_CAMERA.level(4), height=height, width=width)
+    packed = jnp.zeros(size, jnp.uint32)
+    view = View(Target(*(packed for _ in Target._fields)), jnp.zeros(6))
+    opinion = jax.eval_shape(partial(ask_area, camera=camera), view, view, jnp.eye(4), jnp.ones(size))
+    assert opinion.dissenting.shape == size
