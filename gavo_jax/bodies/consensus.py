@@ -91,19 +91,13 @@ def ask_area(
     delta = jax.lax.fori_loop(0, ROUNDS, settle, nothing)
     gains = gain_of_its_own(blocks, delta)
     least = _middle(gains, blocks.credit)
-    rows, columns = _grid(camera)
-    dissenting = jnp.repeat(
-        jnp.repeat((gains > DISSENT * least).reshape(rows, columns), CELL * STRIDE, 0), CELL * STRIDE, 1
-    )
-    dissenting = dissenting[: camera.height, : camera.width]  # of an odd side, a block's last pixel may lie outside
-    rest = ((0, camera.height - dissenting.shape[0]), (0, camera.width - dissenting.shape[1]))
     return Opinion(
         target_T_here,
         blocks,
         _middle(gain_of_its_own(blocks, nothing), blocks.credit),
         least,
         exp(delta) @ target_T_here,
-        jnp.pad(dissenting, rest),
+        _pixels_of(gains > DISSENT * least, camera),
     )
 
 
@@ -124,6 +118,14 @@ def _grid(camera: Camera) -> tuple[int, int]:
     """Rows and columns of blocks."""
     rows, columns = (-(-size // STRIDE) // CELL for size in (camera.height, camera.width))
     return rows, columns
+
+
+def _pixels_of(blocks: Bool[Array, " b"], camera: Camera) -> Bool[Array, "h w"]:
+    """The pixels of some blocks; none of what is left over beside them."""
+    rows, columns = _grid(camera)
+    pixels = jnp.repeat(jnp.repeat(blocks.reshape(rows, columns), CELL * STRIDE, 0), CELL * STRIDE, 1)
+    pixels = pixels[: camera.height, : camera.width]  # of an odd side, a block's last pixel may lie outside
+    return jnp.pad(pixels, ((0, camera.height - pixels.shape[0]), (0, camera.width - pixels.shape[1])))
 
 
 def _equations(

@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +15,15 @@ from gavo_jax.bodies.consensus import ask_area, dissent_of
 from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.sampling import Target
-from gavo_jax.odometry.driver import track
+from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.presets import preset
 from gavo_jax.se3 import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 CAMERA = DEFAULT_CAMERA.level(1)
@@ -88,3 +93,18 @@ def test_images_of_any_size_are_asked(size: tuple[int, int]) -> None:
     view = View(Target(*(packed for _ in Target._fields)), jnp.zeros(6))
     opinion = jax.eval_shape(partial(ask_area, camera=camera), view, view, jnp.eye(4), jnp.ones(size))
     assert opinion.dissenting.shape == size
+
+
+@pytest.mark.parametrize("shift", [0, 12])
+def test_half_an_image_that_moves_on_its_own_is_not_passed_over(data_dir: Path, shift: int) -> None:
+    clip = TumSequence(data_dir / "fr1_rpy")[:2]
+    card = 120.0 + cv2.GaussianBlur(np.random.default_rng(0).normal(0.0, 1200.0, (480, 640)), (0, 0), 12.0)
+    odometry, step = Odometry(clip.camera, preset("gauss-newton", "fast")), None
+    for index, frame in enumerate(clip):
+        grey, depth = frame.grey.copy(), frame.depth.copy()
+        if shift:
+            grey[70:410, 54:506] = np.clip(card[70:410, 100 - shift * index :][:, :452], 0, 255)
+            depth[70:410, 54:506] = round(0.7 * float(clip.camera.depth_scale))
+        step = odometry.register(replace(frame, grey=grey, depth=depth), frame.timestamp)
+    assert step is not None
+    assert step.alignment.status == (AlignmentStatus.MOVING_BODY if shift else AlignmentStatus.OK)
