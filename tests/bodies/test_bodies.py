@@ -1,6 +1,7 @@
 """Bodies: a card that moves in a rendered room is told from it, and nothing is where nothing moves."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,12 +14,13 @@ import pytest
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.belief import Belief, form_belief
-from gavo_jax.bodies.evidence import view_of
+from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step, track
@@ -89,14 +91,16 @@ def run(sequence: Any, settings: Settings) -> list[Step]:
     return list(track(sequence, odometry=Odometry(CAMERA, settings)))
 
 
+@partial(jax.jit, static_argnames="levels")
+def view(grey: jax.Array, depth: jax.Array, levels: Levels) -> View:
+    """Of one image."""
+    return view_of(prepare_target(build_pyramid(grey, depth, CAMERA.depth_scale), levels), levels, jnp.zeros(6))
+
+
 def beliefs(sequence: Carded) -> list[Belief]:
     """What the true motion, none, makes of each frame after the first."""
     retina = Retina(CAMERA, TRACKED)
-    views = []
-    for index in range(FRAMES):
-        frame = sequence[index]
-        pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
-        views.append(view_of(prepare_target(pyramid, retina.levels), retina.levels, jnp.zeros(6)))
+    views = [view(frame.grey, frame.depth, retina.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
     known, found = jnp.zeros(retina.size), []
     for before, here in pairwise(views):
         others = jax.tree.map(lambda leaf: leaf[None], before)
