@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import Rendered
 
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
@@ -72,22 +73,6 @@ class Altered:
 
     def check(self) -> None:
         self.checked += 1
-
-
-class Rendered(SyntheticSequence):
-    """A synthetic sequence that keeps its frames: several tests run over the same ones."""
-
-    def __init__(self, **options: Any):
-        super().__init__(**options)
-        self.kept: dict[float, Frame] = {}
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return super().__getitem__(index)
-        stamp = float(self.timestamps[index])
-        if stamp not in self.kept:
-            self.kept[stamp] = super().__getitem__(index)
-        return self.kept[stamp]
 
 
 @pytest.fixture(scope="module")
