@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.belief import Belief, form_belief
@@ -153,6 +154,17 @@ def test_what_stands_still_is_part_of_the_scene() -> None:
     aware, ignoring = run(sequence, TRACKED), run(sequence, IGNORED)
     assert not any(step.bodies for step in aware)
     np.testing.assert_array_equal([step.world_T_camera for step in aware], [step.world_T_camera for step in ignoring])
+
+
+def test_no_frame_after_the_warm_up_waits_for_a_program() -> None:
+    """Kept programs are compiled once for each kind of input, wherever that lies."""
+    sequence, odometry = Carded(), Odometry(CAMERA, TRACKED)
+    odometry.warm_up()
+    before = set(program_cache._loaded)
+    assert {"_ask", "_look", "track_frame"} <= {function.__name__ for function, *_ in before}
+    for index in range(3):
+        odometry.register(sequence[index], index / 30)
+    assert set(program_cache._loaded) == before
 
 
 def test_a_state_keeps_its_shape() -> None:
