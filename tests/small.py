@@ -25,8 +25,8 @@ GENETIC = Settings(
 class Rendered(SyntheticSequence):
     """A synthetic sequence that keeps its frames: several tests run over the same ones."""
 
-    def __init__(self, *frames: int, **options: Any):
-        super().__init__(*frames, **options)
+    def __init__(self, frames: int, **options: Any):
+        super().__init__(frames, **options)
         self.kept: dict[float, Frame] = {}
 
     def __getitem__(self, index: Any) -> Any:
