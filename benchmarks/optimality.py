@@ -81,12 +81,8 @@ def final_errors(
     ]
     found, descended = (result.target_T_reference for result in results)
     objective = objectives_of(before, after, camera, genetic.levels, options, found)[-1]
-    return FinalErrors(
-        objective.error(found)[0],
-        objective.error(descended)[0],
-        converged_error(objective, found),
-        converged_error(objective, descended),
-    )
+    minima = jax.lax.map(lambda start: converged_error(objective, start), jnp.stack([found, descended]))
+    return FinalErrors(objective.error(found)[0], objective.error(descended)[0], *minima)
 
 
 def pair_errors(sequence: Sequence, preset_name: str, seed: int) -> list[FinalErrors]:

@@ -70,3 +70,15 @@ def data_dir() -> Path:
     if os.environ.get("GAVO_REQUIRE_DATA"):
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def forty_frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A TUM folder of 160×120 pixels, which takes a second and a half to render: to be copied, no test changes it."""
+    from small import CAMERA
+
+    from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+
+    folder = tmp_path_factory.mktemp("forty") / "clip"
+    write_tum(SyntheticSequence(frames=40, camera=CAMERA), folder)
+    return folder

@@ -1,6 +1,10 @@
 """What tests use to which any camera and any search will do: all the same, so that they share compiled programs."""
 
+from typing import Any
+
 from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.objective.losses import l2
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -16,3 +20,19 @@ GENETIC = Settings(
     GeneticAlgorithm(population=(0, 0, 0, 8, 16), iterations=(0, 0, 0, 6, 8)), AlignmentOptions(last_step=False), ALONE
 )
 """So few candidates find little. A pair's result is the best of them, and nothing more."""
+
+
+class Rendered(SyntheticSequence):
+    """A synthetic sequence that keeps its frames: several tests run over the same ones."""
+
+    def __init__(self, frames: int, **options: Any):
+        super().__init__(frames, **options)
+        self.kept: dict[float, Frame] = {}
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return super().__getitem__(index)
+        stamp = float(self.timestamps[index])
+        if stamp not in self.kept:
+            self.kept[stamp] = super().__getitem__(index)
+        return self.kept[stamp]

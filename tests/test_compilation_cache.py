@@ -10,9 +10,11 @@ from pathlib import Path
 
 import jax
 import pytest
+from small import CAMERA
 
 from gavo_jax import program_cache
 from gavo_jax.compilation_cache import enable_compilation_cache, why_not_private
+from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoWarning
 from gavo_jax.program_cache import keep_programs_in
 
@@ -33,7 +35,9 @@ def own_settings(monkeypatch) -> Iterator[None]:
     keep_programs_in(None)
 
 
-SOON_COMPILED = ("solver.iterations=[0,0,0,0,20]", "odometry.recover=false", "odometry.bodies=off")
+SOON_COMPILED = ("solver.iterations=[0,0,0,0,20]", "alignment.loss=l2", "alignment.last_step=false") + tuple(
+    f"alignment.{part}=false" for part in ("robust_scale", "brightness", "depth")
+)
 CONFIGURED = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
@@ -114,9 +118,12 @@ def test_the_command_goes_on_with_one_line(tmp_path):
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(0o777)
+    write_tum(SyntheticSequence(2, camera=CAMERA), tmp_path / "clip")
     environment = {**os.environ, "GAVO_CACHE_DIR": str(cache)}
     environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # set by JAX in this process
-    command = [sys.executable, "-m", "gavo_jax", "run", "--frames", "2", "--method", "gauss-newton", "--output", "out"]
+    images = [str(path) for part in ("rgb", "depth") for path in sorted((tmp_path / "clip" / part).iterdir())]
+    command = [sys.executable, "-m", "gavo_jax", "align", *images[::2], *images[1::2], "--method", "gauss-newton"]
+    command += ["--camera", "clip/camera.toml"]
     command += [f"--set={setting}" for setting in SOON_COMPILED]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

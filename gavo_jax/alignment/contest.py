@@ -53,6 +53,7 @@ def hold_contest(
         The winner; its evidence over a rival's of another mode, of the points that each sees, +inf without one; and
         what was kept of the search, not-a-number if there was none.
     """
+    search, refine = jax.jit(search), jax.jit(refine)  # traced once, for the shapes of their results and for the rounds
     found, kept = jax.eval_shape(search)
     places = max(known.shape[0], found.shape[0], aliases.shape[0])
     like = partial(jax.tree.map, lambda leaf: jnp.zeros(leaf.shape, leaf.dtype))
@@ -62,7 +63,7 @@ def hold_contest(
     rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (WINNER + 1, places, *leaf.shape)), blank)
 
     def fill(motions: jax.Array) -> jax.Array:
-        return jnp.full((places, 4, 4), jnp.nan).at[: motions.shape[0]].set(motions)
+        return jnp.full((places, 4, 4), jnp.nan, jnp.float32).at[: motions.shape[0]].set(motions)
 
     def hold_round(carry: tuple[jax.Array, Entry, Any]) -> tuple[jax.Array, Entry, Any]:
         number, rows, kept = carry

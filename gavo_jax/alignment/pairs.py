@@ -65,6 +65,7 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     agree to the last bit; unrolled, a single pair would round differently.
     """
 
+    @jax.jit  # traced once, for the shapes of its results and for the loop
     def one(i):
         reference, target, key, own = jax.tree.map(lambda leaf: leaf[i], (references, targets, keys, guesses))
         return _align_images(reference, target, camera, solver, options, key, own)
@@ -72,10 +73,12 @@ def _align_pairs(count, references, targets, camera, solver, options, keys, gues
     if jax.default_backend() != "cpu":
         at_once = max(1, POINTS_SIDE_BY_SIDE // levels_of(camera, solver, options).most_points)
         return jax.lax.map(one, jnp.arange(keys.shape[0]), batch_size=at_once)
-    empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, 0))
-    return jax.lax.fori_loop(
-        0, count, lambda i, results: jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i)), empty
-    )
+    empty = jax.tree.map(lambda leaf: jnp.zeros((keys.shape[0], *leaf.shape), leaf.dtype), jax.eval_shape(one, count))
+
+    def add(i, results):
+        return jax.tree.map(lambda all, new: all.at[i].set(new), results, one(i))
+
+    return jax.lax.fori_loop(jnp.int32(0), count, add, empty)
 
 
 FEATURE_KINDS: dict[str, tuple[FeatureKind, ...]] = {

@@ -217,6 +217,7 @@ def _search_levels(
     """
     (target, options, exchanged), places = frames, start.islands.shape[0]
 
+    @jax.jit  # traced once, where its shapes are asked for first
     def search_level(
         search: Search, visit: tuple[Level, PRNGKeyArray]
     ) -> tuple[Search, tuple[jax.Array, Population | None]]:

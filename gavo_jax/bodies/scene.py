@@ -20,6 +20,7 @@ from gavo_jax.image.levels import ImagePlane, Levels
 from gavo_jax.image.sampling import Target
 from gavo_jax.objective.points import Reference
 from gavo_jax.odometry.tracking import TrackerState
+from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
@@ -122,7 +123,7 @@ class Retina:
             np.asarray(target_T_reference, np.float32),
             np.array(keep, np.int32),
             self.full,
-            self.levels,
+            levels=self.levels,
         )
 
     def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
@@ -139,7 +140,7 @@ class Retina:
             (tracker.previous_image, tracker.motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             self.full,
-            self.levels,
+            levels=self.levels,
         )
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
@@ -157,12 +158,13 @@ class Retina:
         return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
 
 
-@partial(jax.jit, static_argnames="levels")
+@partial(CachedProgram, static=("levels",), returns=(Opinion,))
 def _ask(
     known: tuple[Float[Array, "h w"], View],
     new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
     target_T_reference: Float[Array, "4 4"],
     camera: Camera,
+    *,
     levels: Levels,
 ) -> Opinion:
     """Asked about every frame, as `_look` is."""
@@ -174,13 +176,14 @@ def _ask(
     return ask_area(jax.tree.map(lambda leaf: leaf[0], views), there, target_T_reference, credit, seen)
 
 
-@partial(jax.jit, static_argnames="levels")
+@partial(CachedProgram, static=("levels",), returns=(Look,))
 def _look(
     known: tuple[Float[Array, "h w"], View, Float[Array, "3 4 4"]],
     new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
     target_T_reference: Float[Array, "4 4"],
     keep: Integer[Array, " 2"],
     camera: Camera,
+    *,
     levels: Levels,
 ) -> Look:
     """One program for all that is asked about every frame: a call costs more than what it computes."""

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import CAMERA, NEWTON
 
 from gavo_jax import presets
 from gavo_jax.alignment import pairs
@@ -17,7 +18,7 @@ from gavo_jax.alignment.information import Information
 from gavo_jax.alignment.judgement import Evidence, find_against
 from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.alignment.visits import prepare_pair, stack_levels, visited_levels
+from gavo_jax.alignment.visits import levels_of, prepare_pair, stack_levels, visited_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
@@ -27,7 +28,6 @@ from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.error import Scales
 from gavo_jax.objective.estimates import ExplainedShare
-from gavo_jax.objective.losses import l2
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, Settings
@@ -38,11 +38,6 @@ from gavo_jax.status import AlignmentStatus, as_findings, gravest
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
 Images = tuple[np.ndarray, np.ndarray]
 """Grey and depth."""
-QUICK = Settings(
-    GaussNewton(iterations=(0, 0, 0, 10, 20)),
-    AlignmentOptions(robust_scale=False, brightness=False, depth=False, loss=l2),
-)
-"""Two coarse levels and a plain error: soon compiled."""
 PAIRS = ((0, 1), (1, 0), (8, 9), (14, 15), (22, 23))
 
 
@@ -55,6 +50,13 @@ def sequence() -> SyntheticSequence:
 @pytest.fixture(scope="module")
 def frames(sequence: SyntheticSequence) -> dict[int, Frame]:
     return {i: sequence[i] for i in FRAMES}
+
+
+@pytest.fixture(scope="module")
+def small_frames() -> dict[int, Frame]:
+    """Of the same room, 160 x 120: for what any search shows."""
+    small = SyntheticSequence(frames=30, noise=NONE, camera=CAMERA)
+    return {i: small[i] for i in (0, 1, 8, 9)}
 
 
 def target_T_reference(sequence: SyntheticSequence, reference: int, target: int) -> np.ndarray:
@@ -87,15 +89,15 @@ def test_recovers_an_exact_motion(
 
 
 def test_the_symmetric_error_does_not_care_which_frame_is_the_reference(
-    sequence: SyntheticSequence, frames: dict[int, Frame]
+    sequence: SyntheticSequence, small_frames: dict[int, Frame]
 ) -> None:
-    start, far = frames[0], SyntheticSequence(frames=30)[9]
+    start, far = small_frames[0], SyntheticSequence(frames=30, camera=CAMERA)[9]
     truth = target_T_reference(sequence, 0, 9)
 
     def there_and_back(symmetric: bool) -> tuple[float, float]:
-        settings = replace(QUICK, alignment=replace(QUICK.alignment, symmetric=symmetric))
-        there = align(start, far, sequence.camera, settings, guess=truth)
-        back = align(far, start, sequence.camera, settings, guess=np.linalg.inv(truth))
+        settings = replace(NEWTON, alignment=replace(NEWTON.alignment, symmetric=symmetric))
+        there = align(start, far, CAMERA, settings, guess=truth)
+        back = align(far, start, CAMERA, settings, guess=np.linalg.inv(truth))
         return difference(back.target_T_reference, np.linalg.inv(np.asarray(there.target_T_reference, float)))
 
     one_way, both_ways = there_and_back(False), there_and_back(True)
@@ -255,14 +257,16 @@ def test_a_batch_of_arrays_is_a_batch_of_frames(
 
 
 def test_an_accelerator_aligns_a_batch_in_chunks(
-    sequence: SyntheticSequence, frames: dict[int, Frame], monkeypatch: pytest.MonkeyPatch
+    small_frames: dict[int, Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = ((0, 1), (8, 9), (1, 0))
-    expected = [align(frames[i], frames[j], sequence.camera, QUICK) for i, j in shown]
+    expected = [align(small_frames[i], small_frames[j], CAMERA, NEWTON) for i, j in shown]
     as_on_a_cpu = pairs._align_pairs._function
     monkeypatch.setattr(pairs, "_align_pairs", jax.jit(lambda *given: as_on_a_cpu(*given)))  # to be traced anew
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(pairs, "POINTS_SIDE_BY_SIDE", 2 * 4800 + 1)
+    monkeypatch.setattr(
+        pairs, "POINTS_SIDE_BY_SIDE", 2 * levels_of(CAMERA, NEWTON.solver, NEWTON.alignment).most_points + 1
+    )
     sizes, plain = [], jax.lax.map
 
     def noted(function: Callable[..., Any], rows: Any, batch_size: int) -> Any:
@@ -270,22 +274,22 @@ def test_an_accelerator_aligns_a_batch_in_chunks(
         return plain(function, rows, batch_size=batch_size)
 
     monkeypatch.setattr(jax.lax, "map", noted)
-    references, targets = ([frames[pair[side]] for pair in shown] for side in (0, 1))
-    found = align_batch(references, targets, sequence.camera, QUICK)
+    references, targets = ([small_frames[pair[side]] for pair in shown] for side in (0, 1))
+    found = align_batch(references, targets, CAMERA, NEWTON)
     assert sizes == [2]
     assert found.xi.shape == (3, 6)
     np.testing.assert_allclose(found.target_T_reference, [one.target_T_reference for one in expected], atol=1e-5)
     np.testing.assert_array_equal(found.status, [one.status for one in expected])
 
 
-def test_arrays_of_metres_are_frames_of_raw_depth(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
-    camera = sequence.camera
-    images = [(frames[i].grey, frames[i].depth.astype(np.float32) / np.float32(5000)) for i in (0, 1)]
-    metric = align(images[0], images[1], replace(camera, depth_scale=1.0), solver=GaussNewton())
-    raw = align(frames[0], frames[1], camera, solver=GaussNewton())
+def test_arrays_of_metres_are_frames_of_raw_depth(small_frames: dict[int, Frame]) -> None:
+    metres = replace(CAMERA, depth_scale=1.0)
+    images = [(small_frames[i].grey, small_frames[i].depth.astype(np.float32) / np.float32(5000)) for i in (0, 1)]
+    metric = align(images[0], images[1], metres, NEWTON)
+    raw = align(small_frames[0], small_frames[1], CAMERA, NEWTON)
     np.testing.assert_allclose(metric.target_T_reference, raw.target_T_reference, atol=1e-5)
     on_device = [(jnp.asarray(grey), jnp.asarray(depth)) for grey, depth in images]
-    again = align(on_device[0], on_device[1], replace(camera, depth_scale=1.0), solver=GaussNewton())
+    again = align(on_device[0], on_device[1], metres, NEWTON)
     np.testing.assert_array_equal(again.target_T_reference, metric.target_T_reference)
 
 

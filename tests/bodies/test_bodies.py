@@ -1,6 +1,7 @@
 """Bodies: a card that moves in a rendered room is told from it, and nothing is where nothing moves."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -10,15 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.belief import Belief, form_belief
-from gavo_jax.bodies.evidence import view_of
+from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step, track
@@ -89,14 +92,16 @@ def run(sequence: Any, settings: Settings) -> list[Step]:
     return list(track(sequence, odometry=Odometry(CAMERA, settings)))
 
 
+@partial(jax.jit, static_argnames="levels")
+def view(grey: jax.Array, depth: jax.Array, levels: Levels) -> View:
+    """Of one image."""
+    return view_of(prepare_target(build_pyramid(grey, depth, CAMERA.depth_scale), levels), levels, jnp.zeros(6))
+
+
 def beliefs(sequence: Carded) -> list[Belief]:
     """What the true motion, none, makes of each frame after the first."""
     retina = Retina(CAMERA, TRACKED)
-    views = []
-    for index in range(FRAMES):
-        frame = sequence[index]
-        pyramid = build_pyramid(jnp.asarray(frame.grey), jnp.asarray(frame.depth), CAMERA.depth_scale)
-        views.append(view_of(prepare_target(pyramid, retina.levels), retina.levels, jnp.zeros(6)))
+    views = [view(frame.grey, frame.depth, retina.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
     known, found = jnp.zeros(retina.size), []
     for before, here in pairwise(views):
         others = jax.tree.map(lambda leaf: leaf[None], before)
@@ -149,6 +154,17 @@ def test_what_stands_still_is_part_of_the_scene() -> None:
     aware, ignoring = run(sequence, TRACKED), run(sequence, IGNORED)
     assert not any(step.bodies for step in aware)
     np.testing.assert_array_equal([step.world_T_camera for step in aware], [step.world_T_camera for step in ignoring])
+
+
+def test_no_frame_after_the_warm_up_waits_for_a_program() -> None:
+    """Kept programs are compiled once for each kind of input, wherever that lies."""
+    sequence, odometry = Carded(), Odometry(CAMERA, TRACKED)
+    odometry.warm_up()
+    before = set(program_cache._loaded)
+    assert {"_ask", "_look", "track_frame"} <= {function.__name__ for function, *_ in before}
+    for index in range(3):
+        odometry.register(sequence[index], index / 30)
+    assert set(program_cache._loaded) == before
 
 
 def test_a_state_keeps_its_shape() -> None:

@@ -425,8 +425,15 @@ def test_names_of_options_are_those_of_the_presets():
     assert get_args(options.PresetName) == PRESETS
 
 
-@pytest.mark.parametrize("encoding", ["latin-1"])
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["evaluate", "\u2192.txt", "b.txt"]])
+@pytest.mark.parametrize(
+    ("encoding", "arguments"),
+    [
+        ("latin-1", ["--help"]),
+        ("latin-1", ["run", "--help"]),
+        ("latin-1", ["evaluate", "\u2192.txt", "b.txt"]),
+        ("utf-16", ["evaluate", "\u2192.txt", "b.txt"]),
+    ],
+)
 def test_any_encoding_of_the_screen_will_do(encoding, arguments):
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "1"}
     done = subprocess.run([sys.executable, "-m", "gavo_jax", *arguments], capture_output=True, env=environment)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -10,9 +11,7 @@ from typing import Any
 
 import pytest
 from command import runner
-from small import CAMERA
 
-from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.experiments import tuning
 from gavo_jax.locks import hold
 
@@ -25,7 +24,8 @@ camera = "clip/camera.toml"
 frames = {frames}
 [[methods]]
 name = "gauss-newton"
-solver.iterations = [0, 0, {iterations}, 0, 0]
+solver.iterations = [0, 0, 15, 0, 0]
+solver.damping = {damping}
 odometry.recover = false
 odometry.bodies = "off"
 [[methods]]
@@ -45,9 +45,9 @@ alignment.loss = {choices}
 
 
 @pytest.fixture
-def gavo(capsys, monkeypatch, tmp_path):
+def gavo(capsys, monkeypatch, tmp_path, forty_frames):
     monkeypatch.chdir(tmp_path)
-    write_tum(SyntheticSequence(frames=40, camera=CAMERA), tmp_path / "clip")
+    shutil.copytree(forty_frames, tmp_path / "clip")
     return runner(capsys)
 
 
@@ -66,7 +66,7 @@ COMPARE = ("compare", "clip", "--camera", "clip/camera.toml", "--methods", "open
 
 @pytest.mark.parametrize("command", ["run", "compare", "experiment", "report", "tune", "view"])
 def test_a_folder_in_use_is_refused_in_one_line_and_left_alone(gavo, tmp_path, monkeypatch, command):
-    toml = write("e.toml", EXPERIMENT, seeds=1, frames=34, iterations=3)
+    toml = write("e.toml", EXPERIMENT, seeds=1, frames=34, damping=0.001)
     monkeypatch.setattr(tuning, "measure", lambda *_: (0.1, 1.0))
     words: dict[str, tuple[Any, ...]] = {
         "run": RUN,
@@ -120,18 +120,18 @@ def rows_of(out: str) -> dict[str, list[str]]:
 def test_a_changed_experiment_is_told_apart_from_what_it_was(gavo, monkeypatch):
     """Frames and settings of one name are not one method, and are not paired by seed."""
     monkeypatch.setenv("COLUMNS", "200")
-    for frames, iterations in ((40, 8), (34, 8), (34, 9)):
-        toml = write("e.toml", EXPERIMENT, seeds=3, frames=frames, iterations=iterations)
+    for frames, damping in ((40, 0.002), (34, 0.002), (34, 0.003)):
+        toml = write("e.toml", EXPERIMENT, seeds=3, frames=frames, damping=damping)
         done = gavo("experiment", toml, "--output", "out")
         assert done.status == 0, done.err
     titles = [line for line in done.out.splitlines() if line.startswith("room")]
     assert titles[0] == "room" and "room (frames=40)" in titles
     before, _, earlier = done.out.partition("\nroom (frames=40)\n")
     now = rows_of(before[before.index("\nroom\n") :])
-    label = "gauss-newton, iterations=[0, 0, {}, 0, 0], recover=False, bodies=off"
-    assert now[label.format(9)][0] == "3" and now[label.format(8)][0] == "3" and now["opencv-rgb"][0] == "1"
-    assert rows_of(earlier)[label.format(8)][0] == "3"
-    assert f"{label.format(9)} / opencv-rgb" in done.out and "all sequences" not in done.out
+    label = "gauss-newton, iterations=[0, 0, 15, 0, 0], damping={}, recover=False, bodies=off"
+    assert now[label.format(0.003)][0] == "3" and now[label.format(0.002)][0] == "3" and now["opencv-rgb"][0] == "1"
+    assert rows_of(earlier)[label.format(0.002)][0] == "3"
+    assert f"{label.format(0.003)} / opencv-rgb" in done.out and "all sequences" not in done.out
     assert "4 of 11 runs are none of the experiment's as its file is now" not in done.out
     assert "7 of 11 runs are none of the experiment's as its file is now." in done.out
     again = gavo("experiment", "report", "out")

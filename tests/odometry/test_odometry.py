@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import Rendered
 
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
@@ -72,22 +73,6 @@ class Altered:
 
     def check(self) -> None:
         self.checked += 1
-
-
-class Rendered(SyntheticSequence):
-    """A synthetic sequence that keeps its frames: several tests run over the same ones."""
-
-    def __init__(self, **options: Any):
-        super().__init__(**options)
-        self.kept: dict[float, Frame] = {}
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return super().__getitem__(index)
-        stamp = float(self.timestamps[index])
-        if stamp not in self.kept:
-            self.kept[stamp] = super().__getitem__(index)
-        return self.kept[stamp]
 
 
 @pytest.fixture(scope="module")
@@ -417,13 +402,14 @@ def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> Non
 
 
 def test_a_rolling_shutter_is_reckoned_with() -> None:
+    """Where the camera tells its readout."""
     camera = replace(CAMERA, readout=0.03)
     sequence = Rendered(frames=FRAMES, camera=camera, noise=NONE, speed=2.0)
+    untold = Altered(sequence, lambda _, frame: frame)
+    untold.camera = CAMERA
     truth = sequence.ground_truth.world_T_camera
 
-    def off(rolling_shutter: bool, options: OdometryOptions) -> np.ndarray:
-        options = replace(options, rolling_shutter=rolling_shutter)
-        estimate = run(sequence, options).trajectory.world_T_camera
+    def off(estimate: np.ndarray) -> np.ndarray:
         apart = np.linalg.inv(np.linalg.inv(truth[0]) @ truth) @ estimate
         # over six frames, from the third on: before, nothing is known of the camera's speed
         drift = np.linalg.inv(apart[2:-6]) @ apart[8:]
@@ -431,7 +417,8 @@ def test_a_rolling_shutter_is_reckoned_with() -> None:
         return np.array([np.sqrt(np.mean(part**2)) for part in (moved, turned)])
 
     for options in (PLAIN, FRAME_TO_FRAME):
-        assert np.all(off(True, options) < 0.7 * off(False, options))
+        told, ignorant = (run(source, options).trajectory.world_T_camera for source in (sequence, untold))
+        assert np.all(off(told) < 0.7 * off(ignorant))
 
 
 def test_the_first_frame_is_put_back_once_a_motion_is_known(sequence: SyntheticSequence) -> None:
@@ -520,14 +507,33 @@ def late_depth(source: SyntheticSequence) -> Altered:
     return Altered(source[::2], alter)
 
 
+def without_stamps(source: Altered) -> Altered:
+    """A sequence that does not tell when its depth was taken."""
+    return Altered(source, lambda _, frame: replace(frame, depth_timestamp=None))
+
+
 def test_synchronised_depth_drifts_less() -> None:
     late = late_depth(Rendered(frames=40, camera=CAMERA, noise=NONE, rate=60.0, speed=4.0))
-    figures = {}
-    for synchronise in (True, False):
-        metrics = run(late, replace(PLAIN, synchronise=synchronise)).metrics
+    figures = []
+    for source in (late, without_stamps(late)):
+        metrics = run(source).metrics
         assert metrics["lost_pairs"] == 0
-        figures[synchronise] = metrics["rpe_translation_rmse_m_per_frame"]
-    assert figures[True] < 0.92 * figures[False]
+        figures.append(known(metrics["rpe_translation_rmse_m_per_frame"]))
+    assert figures[0] < 0.92 * figures[1]
+
+
+def test_what_is_switched_off_is_not_reckoned_with() -> None:
+    """A readout and a delay of depth, each of which changes the poses where it is told."""
+    late = late_depth(Rendered(frames=12, camera=CAMERA, noise=NONE, rate=60.0, speed=4.0))
+    rolling = without_stamps(late)
+    rolling.camera = replace(CAMERA, readout=0.03)
+    both = Altered(late, lambda _, frame: frame)
+    both.camera = rolling.camera
+    off = replace(FRAME_TO_FRAME, rolling_shutter=False, synchronise=False)
+    expected = run(without_stamps(late), FRAME_TO_FRAME).trajectory.world_T_camera
+    for told in (late, rolling):
+        assert np.abs(run(told, FRAME_TO_FRAME).trajectory.world_T_camera - expected).max() > 1e-3
+    np.testing.assert_allclose(run(both, off).trajectory.world_T_camera, expected, atol=1e-4)
 
 
 def test_synchronising_without_delay_changes_nothing(sequence: SyntheticSequence) -> None:

@@ -17,7 +17,7 @@ import pytest
 from small import CAMERA, GENETIC
 
 from gavo_jax.cli import main, run
-from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Progress, track
@@ -42,10 +42,10 @@ OFTEN = "import sys; from gavo_jax.cli import main, run; run.CHECKPOINT_SECONDS 
 
 
 @pytest.fixture(scope="session")
-def clip(tmp_path_factory) -> Path:
+def clip(tmp_path_factory, forty_frames) -> Path:
     """Forty frames of 160×120 pixels, one of them torn, one white: no test changes them."""
     folder = tmp_path_factory.mktemp("clips") / "clip"
-    write_tum(SyntheticSequence(frames=40, camera=CAMERA), folder)
+    shutil.copytree(forty_frames, folder)
     rgb = [folder / row.split()[1] for row in (folder / "rgb.txt").read_text().splitlines()[1:]]
     rgb[9].write_bytes(rgb[9].read_bytes()[:2000])
     return folder
@@ -64,8 +64,14 @@ def whole(clip, tmp_path_factory) -> Path:
     return folder
 
 
-def same_ending(one: Path, other: Path) -> bool:
-    """Whether two runs ended with the same files, byte by byte but for the times they took."""
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """No figures: they are made of what the files say."""
+    monkeypatch.setattr(run, "draw", lambda *_, **__: None)
+
+
+def same_ending(one: Path, other: Path, drawn: bool = True) -> bool:
+    """Whether two runs ended with the same files, byte by byte but for the times they took; figures alone by name."""
 
     def rows(folder: Path) -> list[dict[str, str]]:
         table = csv.DictReader((folder / "frames.csv").read_text().splitlines())
@@ -75,7 +81,8 @@ def same_ending(one: Path, other: Path) -> bool:
         metrics = json.loads((folder / "metrics.json").read_text())
         return {key: value for key, value in metrics.items() if key not in TIMINGS}
 
-    names = [sorted(path.name for path in folder.iterdir()) for folder in (one, other)]
+    left_out = () if drawn else (".png", ".svg")
+    names = [sorted(path.name for path in folder.iterdir() if path.suffix not in left_out) for folder in (one, other)]
     return (
         names[0] == names[1]
         and (one / "trajectory.txt").read_bytes() == (other / "trajectory.txt").read_bytes()
@@ -106,7 +113,7 @@ def cut_short(monkeypatch: pytest.MonkeyPatch, after: int, fault: type[BaseExcep
 
 
 @pytest.mark.parametrize(("after", "every"), [(1, 0.0), (9, 0.0), (20, 0.05), (20, 1e9), (38, 0.0)])
-def test_resumed_run_ends_as_one_in_one_go(clip, whole, tmp_path, monkeypatch, after, every):
+def test_resumed_run_ends_as_one_in_one_go(clip, whole, tmp_path, monkeypatch, undrawn, after, every):
     with monkeypatch.context() as patch:
         cut_short(patch, after, Power, every)
         with pytest.raises(Power):
@@ -114,7 +121,7 @@ def test_resumed_run_ends_as_one_in_one_go(clip, whole, tmp_path, monkeypatch, a
     assert not (tmp_path / "out" / "metrics.json").exists()
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.txt")) == after + 1
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
-    assert same_ending(tmp_path / "out", whole)
+    assert same_ending(tmp_path / "out", whole, drawn=False)
 
 
 def test_interrupted_run_is_resumed(clip, whole, tmp_path, monkeypatch):
@@ -141,14 +148,21 @@ def test_nothing_to_resume(clip, whole, tmp_path, capsys):
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
-@pytest.fixture
-def broken(clip, tmp_path, monkeypatch) -> Path:
-    """The folder of a run that was cut short, with a checkpoint."""
-    with monkeypatch.context() as patch:
+@pytest.fixture(scope="module")
+def cut(clip, tmp_path_factory) -> Path:
+    """The folder of a run that was cut short, with a checkpoint: no test changes it."""
+    folder = tmp_path_factory.mktemp("cut") / "out"
+    with pytest.MonkeyPatch.context() as patch:
         cut_short(patch, 4, Power)
         with pytest.raises(Power):
-            main(arguments(clip, tmp_path / "out"))
-    return tmp_path / "out"
+            main(arguments(clip, folder))
+    return folder
+
+
+@pytest.fixture
+def broken(cut, tmp_path) -> Path:
+    """The same, to be damaged."""
+    return shutil.copytree(cut, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -236,7 +250,7 @@ def test_a_damaged_checkpoint_is_always_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["rgb", "depth"])
-def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, part):
+def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, undrawn, part):
     """Of the frames that were seen; what comes after them is read as it is now."""
     own = tmp_path / "clip"
     shutil.copytree(clip, own)
@@ -309,7 +323,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFIN
 
 
 @pytest.mark.parametrize("limit", [1000, 4000])
-def test_a_full_disk_is_one_line_and_leaves_whole_rows(clip, whole, tmp_path, limit):
+def test_a_full_disk_is_one_line_and_leaves_whole_rows(clip, whole, tmp_path, undrawn, limit):
     command = [sys.executable, "-c", SMALL, str(limit), *arguments(clip, tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=READ_ONLY_CACHE)
     assert done.returncode == 2, done.stderr
@@ -319,7 +333,7 @@ def test_a_full_disk_is_one_line_and_leaves_whole_rows(clip, whole, tmp_path, li
         rows = (tmp_path / "out" / "trajectory.txt").read_text()
         assert rows.endswith("\n") and (whole / "trajectory.txt").read_text().startswith(rows)
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
-    assert same_ending(tmp_path / "out", whole)
+    assert same_ending(tmp_path / "out", whole, drawn=False)
 
 
 def test_full_standard_output_is_one_line(clip, tmp_path):
