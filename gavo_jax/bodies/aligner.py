@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.consensus import Opinion, dissent_of, has_blocks
+from gavo_jax.bodies.consensus import Opinion, dissent_of
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
-from gavo_jax.bodies.scene import AwareState, Retina
+from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.tracking import Clock, TrackerState
@@ -92,21 +92,16 @@ class BodyAware:
         """Whether bodies' motions are found."""
         return self.search.settings.odometry.bodies == "track"
 
-    @property
-    def asks(self) -> bool:
-        """Whether the image is large enough for its area to be asked."""
-        return has_blocks(self.retina.camera)
-
     def warm_up(self) -> float:
         """Compile what every frame needs: the search, and the look at what it explains."""
         seconds, start = self.first.warm_up(), time.perf_counter()
         state = self.blank_state()
-        if self.asks:
-            opinion = self.retina.ask_area(state.scene, state.tracker, np.eye(4))
+        look = self.retina.look(state.scene, state.tracker, np.eye(4))
+        if look.opinion is not None:
             clock = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
-            jax.block_until_ready(self._without(state.tracker, opinion, clock))
-            jax.block_until_ready(dissent_of(opinion, np.eye(4, dtype=np.float32)))
-        jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
+            jax.block_until_ready(self._without(state.tracker, look.opinion, clock))
+            jax.block_until_ready(dissent_of(look.opinion, np.eye(4, dtype=np.float32)))
+        jax.block_until_ready(look)
         return seconds + time.perf_counter() - start
 
     def blank_state(self) -> AwareState:
@@ -128,23 +123,21 @@ class BodyAware:
         scene, retina = state.scene, self.retina
         before = np.asarray(scene.roll.labels) > 0
         first = self.first.align(state.tracker, frame, clock)
-        attempt, dissent = self._agreed(state, frame, clock, first)
-        look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+        attempt, look = self._agreed(state, frame, clock, first)
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
         if (arisen > SUSPICIOUS and attempt is first) or (not attempt.usable and (np.any(before) or np.any(found))):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
                 attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
-            dissent = self._dissent(state, attempt)
-            look = retina.look(scene, attempt.state, attempt.result.target_T_reference)
+            look = self._look(state, attempt)
             found = _bodies(look.belief, before)
+        if look.opinion is not None and float(look.opinion.dissent) > MISTRUSTED:
+            attempt = _mistrusted(attempt)
         roll = Roll(*map(np.asarray, scene.roll))
         seen = ()
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
-        if dissent > MISTRUSTED:
-            attempt = _mistrusted(attempt)
         tracker: TrackerState = attempt.state
         whole = tracker.previous if self.tracks else None
         after = retina.renewed(scene, look)._replace(roll=roll, carried=np.asarray(carried, np.int32))
@@ -152,29 +145,24 @@ class BodyAware:
             tracker = retina.without(tracker, found > 0)
         return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
 
-    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, float]:
+    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion; and
-        what the area's dissent from it is.
+        what is seen by its motion.
         """
-        if not self.asks:
-            return attempt, 0.0
-        opinion = self._opinion(state, attempt)
+        look = self._look(state, attempt)
         for _ in range(ROUNDS):
-            if not float(opinion.dissent) > RELUCTANT * float(opinion.least):
+            opinion = look.opinion
+            if opinion is None or not float(opinion.dissent) > RELUCTANT * float(opinion.least):
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
             dissent = dissent_of(opinion, np.asarray(again.result.target_T_reference, np.float32))
             if not (again.usable and RELUCTANT * float(dissent) < float(opinion.dissent)):
                 break
-            attempt, opinion = again, self._opinion(state, again)
-        return attempt, float(opinion.dissent)
+            attempt, look = again, self._look(state, again)
+        return attempt, look
 
-    def _dissent(self, state: AwareState, attempt: Attempt) -> float:
-        """What the area's dissent from an attempt is; 0 where it cannot be asked."""
-        return float(self._opinion(state, attempt).dissent) if self.asks else 0.0
-
-    def _opinion(self, state: AwareState, attempt: Attempt) -> Opinion:
-        return self.retina.ask_area(state.scene, attempt.state, attempt.result.target_T_reference)
+    def _look(self, state: AwareState, attempt: Attempt) -> Look:
+        return self.retina.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
         """A tracker without the points that dissent, which expects the motion that the others ask for."""

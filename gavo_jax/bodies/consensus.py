@@ -15,7 +15,7 @@ from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import image_plane
 from gavo_jax.image.shutter import Slopes
-from gavo_jax.objective.derivatives import normal_equations, pixel_jacobian
+from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp, log, rigid_inverse
 
 STRIDE = 2
@@ -141,29 +141,31 @@ def _equations(
     nothing = jnp.zeros_like(r.grey)
     along_grey = Slopes(r.grey_sample.along_u, r.grey_sample.along_v, nothing)
     along_depth = Slopes(-r.depth_sample.along_u, -r.depth_sample.along_v, nothing + 1.0)
-    terms = []
+    parts: list[jax.Array] = [counted / CELL**2] + [nothing] * 27
     for residual, mask, least, slopes in (
         (r.grey, r.inside, LEAST_GREY, along_grey),
         (r.depth, r.depth_valid, LEAST_DEPTH, along_depth),
     ):
         scale = jnp.maximum(1.48 * _middle_of_many(jnp.abs(residual), mask * counted > 0), least)
         weight = jnp.where(mask > 0, (1.0 + (residual / (BOUND * scale)) ** 2) ** -2 / scale**2, 0.0)
-        jacobian = jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0)
-        terms.append([_blocked(a, camera) for a in (jacobian, residual, weight)])
-    gradient, hessian = jax.vmap(lambda *own: normal_equations(list(own)), (((1, 0, 0)),) * 2)(*map(tuple, terms))
+        rows = [*jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0), residual]
+        own = [weight * rows[i] * rows[j] for i in range(6) for j in range(i, 7)]
+        parts = [parts[0], *(part + one for part, one in zip(parts[1:], own, strict=True))]
+    credit, *sums = _block_sums(jnp.stack(parts), camera)
+    entry = {pair: one for pair, one in zip(((i, j) for i in range(6) for j in range(i, 7)), sums, strict=True)}
+    gradient = jnp.stack([entry[i, 6] for i in range(6)], axis=-1)
+    hessian = jnp.stack([jnp.stack([entry[min(i, j), max(i, j)] for j in range(6)], -1) for i in range(6)], -2)
     size = jnp.trace(hessian, axis1=1, axis2=2)[:, None, None]
     inverse = _inverses(hessian + (1e-3 * size + 1.0) * jnp.eye(6))
-    return Blocks(hessian, gradient, inverse, jnp.mean(_blocked(counted, camera), axis=-1))
+    return Blocks(hessian, gradient, inverse, credit)
 
 
-def _blocked(values: Float[Array, "*c n"], camera: Camera) -> Float[Array, "*c b m"]:
-    """Values of all pixels asked as those of blocks; what is left over at the right and below is left out."""
+def _block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
+    """Of values at all pixels asked; what is left over at the right and below is left out."""
     height, width = (-(-size // STRIDE) for size in (camera.height, camera.width))
     rows, columns = _grid(camera)
-    front = values.shape[:-1]
-    image = values.reshape(*front, height, width)[..., : rows * CELL, : columns * CELL]
-    cells = jnp.moveaxis(image.reshape(*front, rows, CELL, columns, CELL), -3, -2)
-    return cells.reshape(*front, rows * columns, CELL * CELL)
+    image = values.reshape(-1, height, width)[:, : rows * CELL, : columns * CELL]
+    return image.reshape(-1, rows, CELL, columns, CELL).sum((2, 4)).reshape(-1, rows * columns)
 
 
 def _inverses(matrices: Float[Array, "b 6 6"]) -> Float[Array, "b 6 6"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.belief import Belief, form_belief
-from gavo_jax.bodies.consensus import Opinion, ask_area
+from gavo_jax.bodies.consensus import Opinion, ask_area, has_blocks
 from gavo_jax.bodies.evidence import View, seen_level, view_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.masking import without_points
@@ -63,6 +63,8 @@ class Look(NamedTuple):
     views: View
     """The scene's, should that be its motion, and `views_T_here` the motions into them."""
     views_T_here: Float[Array, "3 4 4"]
+    opinion: Opinion | None
+    """What the area of the last frame says of that motion; None where an image is too small to be asked."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class Retina:
         return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), self.view(tracker)))
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
-        """What a motion makes of the new frame's pixels."""
+        """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
         keep = (1, 2) if int(scene.age) + 1 < OLD else (2, 0)
         return _look(
             (scene.known, scene.views, scene.views_T_last),
@@ -133,16 +135,6 @@ class Retina:
         motion = jnp.asarray(target_T_reference, jnp.float32)[None]
         return form_belief(last, new, motion, self.camera, scene.known, carried=False)
 
-    def ask_area(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Opinion:
-        """What the area of the last frame says of a motion."""
-        return _ask(
-            (scene.known, scene.views),
-            (tracker.previous_image, tracker.motion, tracker.seconds),
-            np.asarray(target_T_reference, np.float32),
-            self.full,
-            levels=self.levels,
-        )
-
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
         age = (int(scene.age) + 1) % OLD
@@ -156,24 +148,6 @@ class Retina:
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
         return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
-
-
-@partial(CachedProgram, static=("levels",), returns=(Opinion,))
-def _ask(
-    known: tuple[Float[Array, "h w"], View],
-    new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
-    target_T_reference: Float[Array, "4 4"],
-    camera: Camera,
-    *,
-    levels: Levels,
-) -> Opinion:
-    """Asked about every frame, as `_look` is."""
-    before, views = known
-    image, motion, seconds = new
-    there = view_of(image, levels, motion * (camera.readout / seconds))
-    seen = camera.level(levels.numbers[seen_level(levels)])
-    credit = jnp.clip(0.5 - before, 0.0, 1.0)
-    return ask_area(jax.tree.map(lambda leaf: leaf[0], views), there, target_T_reference, credit, seen)
 
 
 @partial(CachedProgram, static=("levels",), returns=(Look,))
@@ -194,5 +168,8 @@ def _look(
     two = jax.tree.map(lambda leaf: leaf[:2], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
     belief = form_belief(here, two, views_T_here[:2], seen, before, carried=True)
+    credit = jnp.clip(0.5 - before, 0.0, 1.0)
+    last = jax.tree.map(lambda leaf: leaf[0], views)
+    opinion = ask_area(last, here, target_T_reference, credit, seen) if has_blocks(seen) else None
     views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)
-    return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]))
+    return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
