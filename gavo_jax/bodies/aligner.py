@@ -34,10 +34,13 @@ MAJORITY = 0.5
 ROUNDS = 3
 """Of searching without what moves by the last round's motion, at most."""
 RELUCTANT = 1.6
-"""Ratio of dissents from which on the area asks for another motion."""
-MISTRUSTED = 18.0
-"""Dissent from which on a motion may be a body's. Where only noise is left the middle block gains 5.3, the median of
-chi-squared with six degrees of freedom; real clips have about 9 in the middle pair and 17 in the worst.
+"""Ratio of dissents from which on the area asks for another motion,"""
+BETTER = 1.2
+"""and from which on one that was found is taken."""
+MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
+"""Dissents from which on a motion may be a body's, without bodies in view and with some. Where only noise is left the
+middle block gains 5.3, the median of chi-squared with six degrees of freedom; real clips have about 9 in the middle
+pair and 17 in the worst.
 """
 GAIN = 0.01
 """Support that a round has to add for another one to follow."""
@@ -132,7 +135,8 @@ class BodyAware:
                 attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
-        if look.opinion is not None and float(look.opinion.dissent) > MISTRUSTED:
+        limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
+        if look.opinion is not None and float(look.opinion.dissent) > limit:
             attempt = _mistrusted(attempt)
         roll = Roll(*map(np.asarray, scene.roll))
         seen = ()
@@ -156,7 +160,7 @@ class BodyAware:
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
             dissent = dissent_of(opinion, np.asarray(again.result.target_T_reference, np.float32))
-            if not (again.usable and RELUCTANT * float(dissent) < float(opinion.dissent)):
+            if not (again.usable and BETTER * float(dissent) < float(opinion.dissent)):
                 break
             attempt, look = again, self._look(state, again)
         return attempt, look
