@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
-from gavo_jax.bodies.belief import Belief
+from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion, dissent_of
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
@@ -52,6 +52,10 @@ NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
 SUSPICIOUS = 0.02
 """Share of the image with bodies, away from where some were, from which on other motions are asked."""
+SUSPECTED = 0.3
+"""Suspicion from which on a pixel's points do not take part,"""
+MOST_ASIDE = 0.6
+"""unless so much of the image is suspected: then only what moves does not."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
@@ -144,9 +148,14 @@ class BodyAware:
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
         whole = tracker.previous if self.tracks else None
-        after = retina.renewed(scene, look)._replace(roll=roll, carried=np.asarray(carried, np.int32))
-        if np.any(found):
-            tracker = retina.without(tracker, found > 0)
+        trusted = not int(attempt.result.findings) & bit(AlignmentStatus.MOVING_BODY)
+        suspected = suspect(look.belief, found > 0, trusted=trusted)
+        after = retina.renewed(scene, look)._replace(
+            roll=roll, carried=np.asarray(carried, np.int32), suspected=suspected
+        )
+        aside = suspected > SUSPECTED  # by a wrong motion the scene seems to move: what was just found is left
+        if np.any(aside):
+            tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else found > 0)
         return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:

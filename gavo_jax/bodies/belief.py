@@ -2,6 +2,9 @@
 
 Each pixel has a belief between -1 (static) and +1 (moving on its own). It is carried along with the surface that it
 lies on, moved by what the new image says, and smoothed among neighbours that no depth edge separates.
+
+A body that stops looks like the scene, and takes the camera along when it starts again. So a surface on which a body
+was seen stays suspected for about a second, and so does what of it comes into view, unless it is at rest beyond doubt.
 """
 
 from functools import partial
@@ -9,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.bodies.evidence import Evidence, View, gather_evidence
@@ -21,6 +25,16 @@ NOTHING = 0.004
 """Share of the image known to move below which no body is looked for: sharing out takes longer than all else."""
 FAR = 12.0
 """Depth evidence beyond which what is seen is another surface and not the same one, moved."""
+SAME = 5.0
+"""Depth evidence up to which a pixel shows the surface that was seen at its place before."""
+FADING = 0.96
+"""Part of a suspicion that stays from frame to frame."""
+RELEASED = -0.7
+"""Belief from which on a surface is at rest beyond doubt, and suspected no more."""
+TIED = 0.5
+"""Two neighbours lie on one surface from this tie on; see `_links`."""
+ENTERING = 10
+"""Pixels that a suspicion spreads by in a frame, into what was not seen in the one before."""
 
 
 class Belief(NamedTuple):
@@ -38,6 +52,8 @@ class Belief(NamedTuple):
     """Which pixels the first of the others does not see, as something stands before them."""
     arisen: Float[Array, ""]
     """Share of the image that moves and was not known to."""
+    suspected: Float[Array, "h w"]
+    """From 0 to 1: how lately a body was seen on the pixel's surface, before this frame."""
 
 
 @partial(jax.jit, static_argnames="carried")
@@ -47,6 +63,7 @@ def form_belief(
     others_T_here: Float[Array, "v 4 4"],
     camera: Camera,
     before: Float[Array, "h w"],
+    suspected: Float[Array, "h w"],
     *,
     carried: bool,
 ) -> Belief:
@@ -58,10 +75,11 @@ def form_belief(
         others_T_here: The motions into them.
         camera: Of the views' level.
         before: What was known before: of the first of the others' pixels where it is to be `carried`, else of these.
+        suspected: What was suspected before, likewise.
         carried: See `before`.
     """
     evidence = gather_evidence(here, others, others_T_here, camera)
-    known = _carry(before, evidence) if carried else before
+    known = _carry(before, evidence, _seen_before(evidence, SAME)) if carried else before
     moves, rests = _weigh(evidence)
     moves, rests = _box(moves), _box(rests)
     news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
@@ -85,7 +103,22 @@ def form_belief(
         jnp.sum(credit * (moving > 0)) / total,
         hidden,
         jnp.mean(arisen),
+        jax.lax.cond(jnp.any(suspected > 0), lambda: follow(suspected, evidence, grey), lambda: suspected)
+        if carried
+        else suspected,
     )
+
+
+def suspect(belief: Belief, bodies: Bool[np.ndarray, "h w"], *, trusted: bool) -> Float[np.ndarray, "h w"]:
+    """What is suspected after a frame: its bodies, and what was suspected before.
+
+    Args:
+        belief: Of the frame's pixels.
+        bodies: Where the frame shows bodies.
+        trusted: Whether the camera's motion is; by a wrong one the scene seems to move, and nothing is learnt.
+    """
+    before = np.where(np.asarray(belief.known) < RELEASED, 0.0, np.asarray(belief.suspected))
+    return np.asarray(np.maximum(FADING * before, bodies) if trusted else before, np.float32)
 
 
 def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
@@ -105,13 +138,32 @@ def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     return moves, rests
 
 
-def _carry(before: Float[Array, "h w"], e: Evidence) -> Float[Array, "h w"]:
-    """What was known of the surfaces that the pixels lie on, where these were seen in the first other view."""
+def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+    """What was known of the surfaces that the pixels lie on, where these are the `same` in the first other view."""
     height, width = before.shape
     u, v = jnp.round(e.place[0]).astype(jnp.int32)
     u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
-    same = (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < 5.0))
     return jnp.where(same, before[v, u], 0.0)
+
+
+def _seen_before(e: Evidence, limit: float) -> Bool[Array, "h w"]:
+    """Which pixels' surfaces the first other view shows: by depth, up to some evidence against it."""
+    return (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < limit))
+
+
+def follow(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Suspicions carried with their surfaces, which may have moved, and spread to what of these was not seen before."""
+    same = _seen_before(e, 2.0 * FAR)
+    across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))
+
+    def spread(_: int, s: jax.Array) -> jax.Array:
+        right, below = jnp.pad(s, ((0, 0), (0, 1)))[:, 1:] * across, jnp.pad(s, ((0, 1), (0, 0)))[1:] * down
+        left = jnp.pad(across * s, ((0, 0), (1, 0)))[:, :-1]
+        above = jnp.pad(down * s, ((1, 0), (0, 0)))[:-1]
+        around = jnp.maximum(jnp.maximum(left, right), jnp.maximum(above, below))
+        return jnp.where(same, s, jnp.maximum(s, around))
+
+    return jax.lax.fori_loop(0, ENTERING, spread, _carry(suspected, e, same))
 
 
 def _box(image: Float[Array, "h w"], radius: int = 2) -> Float[Array, "h w"]:

@@ -33,6 +33,8 @@ class Scene(NamedTuple):
 
     known: Float[Array, "h w"]
     """See `Belief`; of the last frame's pixels."""
+    suspected: Float[Array, "h w"]
+    """See `belief.suspect`; the same."""
     roll: Roll
     """The bodies that it shows."""
     views: View
@@ -108,9 +110,8 @@ class Retina:
         words: Any = np.zeros((3, *self.size), np.uint32)
         views = View(Target(words, words), jnp.zeros((3, 6)))
         nothing: Any = np.zeros((), np.int32)
-        return Scene(
-            jnp.zeros(self.size), Roll.empty(self.size), views, jnp.tile(jnp.eye(4), (3, 1, 1)), nothing, nothing
-        )
+        unknown, still = jnp.zeros(self.size), jnp.tile(jnp.eye(4), (3, 1, 1))
+        return Scene(unknown, unknown, Roll.empty(self.size), views, still, nothing, nothing)
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
@@ -120,7 +121,7 @@ class Retina:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
         keep = (1, 2) if int(scene.age) + 1 < OLD else (2, 0)
         return _look(
-            (scene.known, scene.views, scene.views_T_last),
+            (scene.known, scene.suspected, scene.views, scene.views_T_last),
             (tracker.previous_image, tracker.motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             np.array(keep, np.int32),
@@ -133,7 +134,7 @@ class Retina:
         last = jax.tree.map(lambda leaf: leaf[0], scene.views)
         new = jax.tree.map(lambda leaf: leaf[None], self.view(tracker))
         motion = jnp.asarray(target_T_reference, jnp.float32)[None]
-        return form_belief(last, new, motion, self.camera, scene.known, carried=False)
+        return form_belief(last, new, motion, self.camera, scene.known, scene.suspected, carried=False)
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
@@ -152,7 +153,7 @@ class Retina:
 
 @partial(CachedProgram, static=("levels",), returns=(Look,))
 def _look(
-    known: tuple[Float[Array, "h w"], View, Float[Array, "3 4 4"]],
+    known: tuple[Float[Array, "h w"], Float[Array, "h w"], View, Float[Array, "3 4 4"]],
     new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
     target_T_reference: Float[Array, "4 4"],
     keep: Integer[Array, " 2"],
@@ -161,14 +162,14 @@ def _look(
     levels: Levels,
 ) -> Look:
     """One program for all that is asked about every frame: a call costs more than what it computes."""
-    before, views, views_T_last = known
+    before, suspected, views, views_T_last = known
     image, motion, seconds = new
     here = view_of(image, levels, motion * (camera.readout / seconds))
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
-    belief = form_belief(here, two, views_T_here[:2], seen, before, carried=True)
-    credit = jnp.clip(0.5 - before, 0.0, 1.0)
+    belief = form_belief(here, two, views_T_here[:2], seen, before, suspected, carried=True)
+    credit = jnp.clip(0.5 - jnp.maximum(before, suspected), 0.0, 1.0)
     last = jax.tree.map(lambda leaf: leaf[0], views)
     opinion = ask_area(last, here, target_T_reference, credit, seen) if has_blocks(seen) else None
     views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)

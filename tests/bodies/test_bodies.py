@@ -14,8 +14,9 @@ import pytest
 from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
-from gavo_jax.bodies.belief import Belief, form_belief
-from gavo_jax.bodies.evidence import View, view_of
+from gavo_jax.bodies.aligner import SUSPECTED
+from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
+from gavo_jax.bodies.evidence import Evidence, View, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
@@ -40,11 +41,11 @@ IGNORED = replace(TRACKED, odometry=replace(TRACKED.odometry, bodies="off"))
 
 
 class Carded:
-    """A still camera before a room; a textured card that covers a sixth of the image moves to the right."""
+    """A still camera before a room; a textured card that covers a sixth of the image moves to the right, and stops."""
 
     name, camera, ground_truth = "card", CAMERA, None
 
-    def __init__(self, moves: bool = True) -> None:
+    def __init__(self, moves: bool = True, stops: int = FRAMES) -> None:
         self.scene = SyntheticSequence(frames=1, camera=CAMERA)[0]
         self.timestamps = np.arange(FRAMES) / 30
         rng = np.random.default_rng(0)
@@ -52,20 +53,20 @@ class Carded:
             cv2.resize(rng.normal(0, 60, (n, 2 * n)), (144, 108), interpolation=cv2.INTER_CUBIC) for n in (6, 15)
         ]
         self.texture = np.clip(blotches[0] + 0.5 * blotches[1] + 120, 10, 240)
-        self.moves = moves
+        self.steps = np.minimum(np.arange(FRAMES), stops) * moves
 
     def __len__(self) -> int:
         return FRAMES
 
     def mask(self, index: int) -> np.ndarray:
         """Pixels of the card."""
-        left = 60 + CAMERA.fx * STEP / DISTANCE * index * self.moves
+        left = 60 + CAMERA.fx * STEP / DISTANCE * self.steps[index]
         mask = np.zeros((CAMERA.height, CAMERA.width), bool)
         mask[40:148, round(left) : round(left) + 144] = True
         return mask
 
     def __getitem__(self, index: int) -> Frame:
-        left = 60 + CAMERA.fx * STEP / DISTANCE * index * self.moves
+        left = 60 + CAMERA.fx * STEP / DISTANCE * self.steps[index]
         grey, depth = self.scene.grey.astype(float), np.array(self.scene.depth)
         on = self.mask(index)
         v, u = np.nonzero(on)
@@ -103,9 +104,10 @@ def beliefs(sequence: Carded) -> list[Belief]:
     retina = Retina(CAMERA, TRACKED)
     views = [view(frame.grey, frame.depth, retina.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
     known, found = jnp.zeros(retina.size), []
+    nobody = jnp.zeros(retina.size)
     for before, here in pairwise(views):
         others = jax.tree.map(lambda leaf: leaf[None], before)
-        found.append(form_belief(here, others, jnp.eye(4)[None], retina.camera, known, carried=True))
+        found.append(form_belief(here, others, jnp.eye(4)[None], retina.camera, known, nobody, carried=True))
         known = found[-1].known
     return found
 
@@ -154,6 +156,52 @@ def test_what_stands_still_is_part_of_the_scene() -> None:
     aware, ignoring = run(sequence, TRACKED), run(sequence, IGNORED)
     assert not any(step.bodies for step in aware)
     np.testing.assert_array_equal([step.world_T_camera for step in aware], [step.world_T_camera for step in ignoring])
+
+
+def test_a_body_that_stops_stays_out_of_the_search() -> None:
+    sequence, odometry = Carded(stops=3), Odometry(CAMERA, TRACKED)
+    for index in range(FRAMES):
+        odometry.register(sequence[index], index / 30)
+    state = odometry.progress.tracker
+    factor = CAMERA.height // Retina(CAMERA, TRACKED).size[0]
+    on_card = sequence.mask(FRAMES - 1)[::factor, ::factor]
+    suspected = np.asarray(state.scene.suspected) > SUSPECTED
+    assert suspected[on_card].mean() > 0.9 and suspected[~on_card].mean() < 0.1
+    points = jax.tree.map(np.asarray, state.tracker.previous.points)
+    u, v = CAMERA.fx * points.x + CAMERA.cx, CAMERA.fy * points.y + CAMERA.cy
+    inside = sequence.mask(FRAMES - 1)[np.clip(v, 0, 239).astype(int), np.clip(u, 0, 319).astype(int)]
+    assert inside.mean() > 0.05 and inside[points.q > 0].mean() < 0.02
+
+
+def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_further() -> None:
+    shape = 1, 20, 30
+    columns = np.arange(30)
+    near = np.broadcast_to(np.where(columns < 15, 1.0, 0.4), shape[1:]).astype(np.float32)
+    place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
+    seen = np.broadcast_to((columns >= 6).astype(np.float32), shape)
+    nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    evidence = Evidence(nothing, nothing, nothing, seen, one, near, place)  # pyright: ignore[reportArgumentType]
+    before = np.broadcast_to(((columns >= 6) & (columns < 15)).astype(np.float32), shape[1:])
+    after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
+    np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
+    nobody = np.asarray(follow(jnp.zeros(shape[1:]), evidence, jnp.zeros(shape[1:])))
+    assert not nobody.any()
+
+
+def test_a_suspicion_fades_ends_where_all_is_at_rest_and_is_not_learnt_from_a_wrong_motion() -> None:
+    body = field(BOX) > 0
+    belief = beliefs(Carded(moves=False))[0]._replace(
+        known=np.where(field(OTHER) > 0, -0.9, 0.5), suspected=np.ones((60, 80))
+    )  # pyright: ignore
+    after = suspect(belief, body, trusted=True)
+    assert np.all(after[body] == 1) and not np.any(after[field(OTHER) > 0]) and 0.9 < after[0, 0] < 1
+    assert not np.any(suspect(belief._replace(suspected=np.zeros((60, 80))), body, trusted=False))  # pyright: ignore
+
+
+def test_a_strong_body_before_a_plain_room_does_not_take_the_camera_along_from_the_first_frame_on() -> None:
+    steps = run(Carded(), TRACKED)
+    assert max(np.linalg.norm(step.world_T_camera[:3, 3]) for step in steps) < 1e-3
+    assert np.linalg.norm(run(Carded(), IGNORED)[0].world_T_camera[:3, 3]) > 0.03
 
 
 def test_no_frame_after_the_warm_up_waits_for_a_program() -> None:
