@@ -99,6 +99,28 @@ class CachedProgram(Generic[P, R]):
                 program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)
         return program(*leaves)
 
+    def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:
+        """Whether a call would find its program, here or in the folder, and trace and compile nothing."""
+        if _folder is None:
+            return False
+        leaves, structure = jax.tree.flatten(args)
+        kinds = tuple(map(Kind.of, leaves))
+        if (self._function, structure, kinds, tuple(kwargs.items())) in _loaded:
+            return True
+        try:
+            return _read(self._path(_folder, structure, kinds, kwargs)) is not None
+        except Foreign:
+            return False
+
+    def _path(self, folder: Path, structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]) -> Path:
+        """The file of a program; raise Foreign where it has none."""
+        settings = identify((jax.tree.unflatten(structure, kinds), static))
+        function = self._function
+        configuration = [(name, getattr(jax.config, name, None)) for name in sorted(jax.config.values)]
+        program = (function.__module__, function.__qualname__, settings, configuration, jax.default_backend())
+        digest = hashlib.sha256(repr(program).encode()).hexdigest()
+        return folder / f"{function.__name__.strip('_')}-{digest[:32]}"
+
     def _load(
         self, folder: Path, leaves: list[Any], structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]
     ) -> Callable[..., R]:
@@ -109,14 +131,9 @@ class CachedProgram(Generic[P, R]):
 
         jitted = jax.jit(of_leaves)
         try:
-            settings = identify((jax.tree.unflatten(structure, kinds), static))
+            path = self._path(folder, structure, kinds, static)
         except Foreign:
             return jitted
-        function = self._function
-        configuration = [(name, getattr(jax.config, name, None)) for name in sorted(jax.config.values)]
-        program = (function.__module__, function.__qualname__, settings, configuration, jax.default_backend())
-        digest = hashlib.sha256(repr(program).encode()).hexdigest()
-        path = folder / f"{function.__name__.strip('_')}-{digest[:32]}"
         data = _read(path)
         if data is None:
             try:
@@ -126,8 +143,15 @@ class CachedProgram(Generic[P, R]):
             _write(path, data)
         # JAX sets LAPACK up when it lowers a call of it, and some versions at no other time: jax-ml/jax#29610
         jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
-        # compiled here, as a call of the jitted form would compile once more when it is given its own results
-        return jax.jit(export.deserialize(bytearray(data)).call).lower(*leaves).compile()
+        # compiled here, as a call of the jitted form would compile once more when it is given its own results; for the
+        # kinds of its inputs, as what XLA made is found again by how it was asked for, on the host or on the device
+        return jax.jit(export.deserialize(bytearray(data)).call).lower(*map(_abstract, leaves)).compile()
+
+
+def _abstract(leaf: Any) -> Any:
+    """What a program is compiled for: an array without its place and its values, or a Python number."""
+    kind = Kind.of(leaf)
+    return leaf if kind.shape == () and kind.weak else jax.ShapeDtypeStruct(kind.shape, kind.type, weak_type=kind.weak)
 
 
 def _register(node: type) -> None:

@@ -226,3 +226,13 @@ def test_every_preset_can_be_kept(method: str, preset: str) -> None:
     assert identified == identify((settings.solver, settings.alignment, settings.odometry))
     others = [presets.preset(method, other) for other in PRESETS if other != preset]
     assert all(identified != identify((other.solver, other.alignment, other.odometry)) for other in others)
+
+
+def test_it_is_told_beforehand_whether_a_program_is_kept(folder: Path) -> None:
+    assert not program.is_kept(NUMBERS, OPTIONS)
+    program(NUMBERS, OPTIONS)
+    assert program.is_kept(NUMBERS, OPTIONS) and not program.is_kept(NUMBERS, OPTIONS, points=True)
+    start_anew(folder)
+    assert program.is_kept(jnp.asarray(NUMBERS), OPTIONS) and traces == 1
+    keep_programs_in(None)
+    assert not program.is_kept(NUMBERS, OPTIONS)

@@ -22,9 +22,9 @@ from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, moved_on
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.se3 import exp, log
+from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit
 
 DOUBTFUL = 0.1
@@ -195,7 +195,9 @@ class BodyAware:
             return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
 
         found = Candidate(first, retina.look_back(scene, first.state, first.result.target_T_reference))
-        predicted = retina.look_back(scene, first.state, exp(tracker.motion * (clock.elapsed / tracker.seconds)))
+        predicted = retina.look_back(
+            scene, first.state, moved_on(tracker.motion, np.float32(clock.elapsed / tracker.seconds))
+        )
         tried = [found]
         if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
             tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]

@@ -4,7 +4,7 @@ Each pixel has a belief between -1 (static) and +1 (moving on its own). It is ca
 lies on, moved by what the new image says, and smoothed among neighbours that no depth edge separates.
 
 A body that stops looks like the scene, and takes the camera along when it starts again. So a surface on which a body
-was seen stays suspected for about a second, and so does what of it comes into view, unless it is at rest beyond doubt.
+was seen stays suspected for about half a second, and so does what of it comes into view, unless it is at rest beyond doubt.
 """
 
 from functools import partial
@@ -27,7 +27,7 @@ FAR = 12.0
 """Depth evidence beyond which what is seen is another surface and not the same one, moved."""
 SAME = 5.0
 """Depth evidence up to which a pixel shows the surface that was seen at its place before."""
-FADING = 0.96
+FADING = 0.92
 """Part of a suspicion that stays from frame to frame."""
 RELEASED = -0.7
 """Belief from which on a surface is at rest beyond doubt, and suspected no more."""
@@ -63,7 +63,7 @@ def form_belief(
     others_T_here: Float[Array, "v 4 4"],
     camera: Camera,
     before: Float[Array, "h w"],
-    suspected: Float[Array, "h w"],
+    suspected: Float[Array, "h w"] | None = None,
     *,
     carried: bool,
 ) -> Belief:
@@ -75,7 +75,7 @@ def form_belief(
         others_T_here: The motions into them.
         camera: Of the views' level.
         before: What was known before: of the first of the others' pixels where it is to be `carried`, else of these.
-        suspected: What was suspected before, likewise.
+        suspected: What was suspected before, likewise; of no account where it is not carried.
         carried: See `before`.
     """
     evidence = gather_evidence(here, others, others_T_here, camera)
@@ -103,9 +103,7 @@ def form_belief(
         jnp.sum(credit * (moving > 0)) / total,
         hidden,
         jnp.mean(arisen),
-        jax.lax.cond(jnp.any(suspected > 0), lambda: follow(suspected, evidence, grey), lambda: suspected)
-        if carried
-        else suspected,
+        _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
     )
 
 
@@ -149,6 +147,10 @@ def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -
 def _seen_before(e: Evidence, limit: float) -> Bool[Array, "h w"]:
     """Which pixels' surfaces the first other view shows: by depth, up to some evidence against it."""
     return (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < limit))
+
+
+def _after(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    return jax.lax.cond(jnp.any(suspected > 0), lambda: follow(suspected, e, grey), lambda: jnp.zeros_like(suspected))
 
 
 def follow(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:

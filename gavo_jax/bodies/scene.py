@@ -131,10 +131,13 @@ class Retina:
 
     def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
         """What a motion makes of the last frame's pixels."""
-        last = jax.tree.map(lambda leaf: leaf[0], scene.views)
-        new = jax.tree.map(lambda leaf: leaf[None], self.view(tracker))
-        motion = jnp.asarray(target_T_reference, jnp.float32)[None]
-        return form_belief(last, new, motion, self.camera, scene.known, scene.suspected, carried=False)
+        return _look_back(
+            (scene.known, scene.views),
+            (tracker.previous_image, tracker.motion, tracker.seconds),
+            np.asarray(target_T_reference, np.float32),
+            self.full,
+            levels=self.levels,
+        )
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
@@ -174,3 +177,22 @@ def _look(
     opinion = ask_area(last, here, target_T_reference, credit, seen) if has_blocks(seen) else None
     views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)
     return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
+
+
+@partial(CachedProgram, static=("levels",), returns=(Belief,))
+def _look_back(
+    known: tuple[Float[Array, "h w"], View],
+    new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
+    target_T_reference: Float[Array, "4 4"],
+    camera: Camera,
+    *,
+    levels: Levels,
+) -> Belief:
+    """One program, so that it is kept between processes: it is asked for in the middle of a run."""
+    before, views = known
+    image, motion, seconds = new
+    here = view_of(image, levels, motion * (camera.readout / seconds))
+    last = jax.tree.map(lambda leaf: leaf[0], views)
+    seen = camera.level(levels.numbers[seen_level(levels)])
+    here = jax.tree.map(lambda leaf: leaf[None], here)
+    return form_belief(last, here, target_T_reference[None], seen, before, carried=False)

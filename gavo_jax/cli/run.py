@@ -17,6 +17,7 @@ from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
+from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.aligners import blank_of
@@ -58,7 +59,7 @@ def run(options: Run) -> int:
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
     enable_compilation_cache()
-    mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
     poses = ODOMETRY if mapper else TRAJECTORY
     with RunFolder(path, getattr(sequence, "files", ()), poses) as folder, viewer:
         odometry = Odometry(
@@ -105,7 +106,7 @@ def _track(
     odometry: Odometry,
     folder: RunFolder,
     viewer: Viewer,
-    mapper: Mapper | None,
+    mapper: BackgroundMapper | None,
 ) -> tuple[dict[str, Any], bool]:
     """Track the frames that are left and write the files; return what metrics.json says, and whether Ctrl-C came.
 

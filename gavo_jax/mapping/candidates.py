@@ -20,7 +20,7 @@ MIN_SECONDS = 1.0
 """Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
 """Predicted share of either one's points that the other sees,"""
-MIN_LIKENESS = 0.8
+MIN_LIKENESS = 0.88
 """and correlation of what both see."""
 APART = 3
 """Keyframes between two candidates: neighbours would say the same twice."""

@@ -116,10 +116,14 @@ class Mapper:
         return self.keyframes.is_due(step.world_T_camera, step.segment)
 
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:
-        """Take notice of what a run did before it was cut short; only what becomes a keyframe is decoded."""
+        """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded."""
         self.watch(_decoded(sequence, 0), None)
+        last = max((step.index for step in steps if not step.lost), default=0)
         for step in steps:
-            self.watch(_decoded(sequence, step.index) if self.is_due(step) else None, step)
+            frame = _decoded(sequence, step.index) if self.is_due(step) or step.index == last else None
+            if frame is not None and step.origin == "relocalised":
+                self.find(frame)
+            self.watch(frame, step)
 
     def finish(self) -> Loops:
         """Make the last frame a keyframe, look for loops once more with what is known now, and optimise."""
@@ -174,10 +178,7 @@ class Mapper:
             self._optimise()
 
     def _tie(self, keyframe: Keyframe) -> None:
-        """Tie a keyframe to the one that it was found by, or that it is found by now: a replay has not looked yet."""
-        if self._place is None:
-            others = [other for other in self.keyframes.searchable() if other is not keyframe]
-            self._place = self.recogniser.find(keyframe, others)
+        """Tie a keyframe to the one that it was found by."""
         if self._place is not None:
             self._link(keyframe, self._place.edge._replace(later=keyframe.number))
         self._place = None

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
@@ -65,6 +65,10 @@ class Aligner(Protocol):
         ...
 
 
+BEGINNING = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
+"""Of a first frame."""
+
+
 @dataclass(frozen=True)
 class Search:
     """Our own: the compiled program of `tracking.track_frame`.
@@ -86,8 +90,7 @@ class Search:
         start, collects = time.perf_counter(), gc.isenabled()
         gc.disable()  # tracing makes objects by the hundred thousand that all stay; looking through them takes a fifth
         try:
-            size = (self.camera.height, self.camera.width)
-            self.start(Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0))
+            self.start(self._blank_frame())
         finally:
             if collects:
                 gc.enable()
@@ -99,29 +102,38 @@ class Search:
 
     def start(self, frame: Frame) -> TrackerState:
         """The state after a first frame, by the program that serves every frame: there is nothing to find yet."""
-        return self.align(self.blank_state(), frame, Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))).state
+        return self.align(self.blank_state(), frame, BEGINNING).state
+
+    def _blank_frame(self) -> Frame:
+        size = (self.camera.height, self.camera.width)
+        return Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
+
+    def _inputs(self, state: TrackerState, frame: Frame, clock: Clock) -> tuple[Any, ...]:
+        """Of the program."""
+        settings, odometry = self.settings, traced_part(self.settings.odometry)
+        images = (frame.grey, frame.depth)
+        return state, *images, clock, self.key, self.camera, settings.solver, settings.alignment, odometry
+
+    def is_kept(self) -> bool:
+        """Whether the program was compiled before, so that `warm_up` loads it."""
+        inputs = self._inputs(self.blank_state(), self._blank_frame(), BEGINNING)
+        return track_frame.is_kept(*inputs, record=self.record)
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
         """Align with the previous frame and the keyframe; the motion is usable if it is `OK`."""
-        settings = self.settings
-        state, result, populations = track_frame(
-            state,
-            frame.grey,
-            frame.depth,
-            clock,
-            self.key,
-            self.camera,
-            settings.solver,
-            settings.alignment,
-            traced_part(settings.odometry),
-            record=self.record,
-        )
+        state, result, populations = track_frame(*self._inputs(state, frame, clock), record=self.record)
         result = on_host(result)
         return Attempt(state, result, result.status == AlignmentStatus.OK, candidates=_by_level(populations))
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
-        return rigid(exp(state.motion * (elapsed / float(state.seconds))))
+        return rigid(moved_on(state.motion, np.float32(elapsed / float(state.seconds))))
+
+
+@jax.jit  # one program, and not one for each of its dozens of operations
+def moved_on(motion: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, "4 4"]:
+    """The motion of a twist that goes on for a share of its time."""
+    return exp(motion * share)
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:
@@ -144,14 +156,17 @@ class Recovering:
     Attributes:
         first: What is asked first.
         second: What is asked where that is unusable; made when it is needed.
+        kept: Of the second's programs one that `warm_up` loads, where it was compiled before; None: that waits, too.
     """
 
     first: Aligner
     second: Callable[[], Aligner]
+    kept: Search | None = None
 
     def warm_up(self) -> float:
         """That of the first one; the second compiles when it is needed."""
-        return self.first.warm_up()
+        seconds = self.first.warm_up()
+        return seconds + self.kept.warm_up() if self.kept is not None and self.kept.is_kept() else seconds
 
     def start(self, frame: Frame) -> Any:
         """By the first one."""
@@ -262,7 +277,8 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
         wide = wide_search(search)
         return with_bodies(wide, wide)
 
-    return Recovering(careful, behind)
+    # loading it takes seconds, which a short run had better spare and a long one had better not stop for
+    return Recovering(careful, behind, wide_search(search) if search.settings.odometry.loops else None)
 
 
 def blank_of(aligner: Any) -> Any:

@@ -11,6 +11,7 @@ from jaxtyping import Bool
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
+from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
@@ -91,7 +92,7 @@ def run_odometry(
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
-    mapper = Mapper(sequence.camera) if settings.odometry.loops else None
+    mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
     odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
     compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []

@@ -25,6 +25,7 @@ TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.j
 ODOMETRY, LOOPS = "odometry.txt", "loops.csv"
 """What a run with loops adds: the trajectory as it was before they corrected it, and the loops."""
 BODIES = "bodies.csv"
+MOTIONS = "motions.csv"
 CHECKPOINT = "checkpoint.npz"
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""

@@ -27,6 +27,7 @@ from gavo_jax.output.files import (
     FRAMES,
     LOOPS,
     METRICS,
+    MOTIONS,
     ODOMETRY,
     RECORDING,
     TRAJECTORY,
@@ -40,6 +41,7 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_steps
+from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, segment_comment
@@ -146,15 +148,16 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        remove_files(
-            self.path, METRICS, CHECKPOINT, CONFIG, TRAJECTORY, ODOMETRY, LOOPS, FRAMES, BODIES, RECORDING, VIEW
-        )
+        growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
+        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, LOOPS, RECORDING, VIEW, *growing)
         remove_figures(self.path)
         write_json(self.path / CONFIG, config)
         self._open(dict.fromkeys(self._growing(config)))
         self._files[FRAMES].append(",".join(FRAME_COLUMNS))
         if BODIES in self._files:
             self._files[BODIES].append(",".join(BODY_COLUMNS))
+        if MOTIONS in self._files:
+            self._files[MOTIONS].append(",".join(MOTION_COLUMNS))
         self._files[self._poses].append(TRAJECTORY_HEADER)
         self._files[self._poses].append(format_tum_row(timestamp, np.eye(4)))
         self._whole = (self._marks(), self._seen.up_to(0), None)
@@ -197,8 +200,10 @@ class RunFolder:
 
     def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:
         """Files that grow with a run."""
-        bodies = getattr(config.get("odometry"), "bodies", "off")
-        return (self._poses, FRAMES) if bodies == "off" else (self._poses, FRAMES, BODIES)
+        odometry = config.get("odometry")
+        bodies = (BODIES,) if getattr(odometry, "bodies", "off") != "off" else ()
+        motions = (MOTIONS,) if getattr(odometry, "loops", False) else ()
+        return (self._poses, FRAMES, *bodies, *motions)
 
     def finished(self) -> dict[str, Any] | None:
         """The metrics of an earlier run in this folder that came to its end; None where there is none.
@@ -225,6 +230,8 @@ class RunFolder:
         if BODIES in self._files:
             for body in body_rows(step):
                 self._files[BODIES].append(_as_line(body))
+        if MOTIONS in self._files:
+            self._files[MOTIONS].append(_as_line(motion_row(step)))
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
             if step.segment != self._segment:
                 comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
@@ -245,9 +252,10 @@ class RunFolder:
             save_checkpoint(self.path / CHECKPOINT, Checkpoint(progress, files, images))
 
     def steps(self) -> list[Step]:
-        """The steps of the run so far, as the files tell them; see `read_steps`."""
+        """The steps of the run so far, as the files tell them: see `read_steps`, and with loops to all digits."""
         self._cut()
-        return read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
+        steps = read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
+        return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
 
     def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
         """Write metrics.json, whole or not at all; after it a run that is complete needs no checkpoint any more.

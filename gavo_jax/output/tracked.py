@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.interrupts import interruptible
-from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
@@ -30,7 +30,7 @@ def track_visibly(
     odometry: Odometry,
     on_step: Callable[[Step], None] | None = None,
     viewer: Viewer = NO_VIEWER,
-    mapper: Mapper | None = None,
+    mapper: BackgroundMapper | None = None,
 ) -> Tracked:
     """Compile, then track every frame, from where the driver stands, under a progress bar and before a viewer's eyes.
 

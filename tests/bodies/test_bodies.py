@@ -104,10 +104,9 @@ def beliefs(sequence: Carded) -> list[Belief]:
     retina = Retina(CAMERA, TRACKED)
     views = [view(frame.grey, frame.depth, retina.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
     known, found = jnp.zeros(retina.size), []
-    nobody = jnp.zeros(retina.size)
     for before, here in pairwise(views):
         others = jax.tree.map(lambda leaf: leaf[None], before)
-        found.append(form_belief(here, others, jnp.eye(4)[None], retina.camera, known, nobody, carried=True))
+        found.append(form_belief(here, others, jnp.eye(4)[None], retina.camera, known, carried=True))
         known = found[-1].known
     return found
 

@@ -69,7 +69,7 @@ def test_images_are_bounded_and_the_likest_are_candidates():
     assert len(keyframes.all) == 25 and len(kept) == 10
     assert max(k.index for k in kept) == 24
     found = find_candidates(keyframes.all[24], kept[:-1], keyframes.camera)
-    assert found and all(c.likeness > 0.8 and c.overlap >= 0.5 for c in found)
+    assert found and all(c.likeness > 0.88 and c.overlap >= 0.5 for c in found)
     assert all(c.later.timestamp - c.earlier.timestamp >= 1.0 for c in found)
     numbers = sorted(c.earlier.number for c in found)
     assert all(b - a >= 3 for a, b in zip(numbers, numbers[1:], strict=False))

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 
 from gavo_jax.mapping.correction import correct, joined
 from gavo_jax.mapping.keyframes import Keyframe, Look
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.motions import adjoint, between, exp, log
-from gavo_jax.mapping.pose_graph import Solution, optimise
+from gavo_jax.mapping.pose_graph import Solution, _leverage, optimise
 from gavo_jax.mapping.verification import Edge
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -113,3 +114,11 @@ def test_motions_are_their_own_inverses():
     np.testing.assert_allclose(between(a, b, 1.0), b, atol=1e-9)
     step = 1e-4 * RNG.normal(size=6)
     np.testing.assert_allclose(a @ exp(step), exp(adjoint(a) @ step) @ a, atol=1e-7)
+
+
+@pytest.mark.parametrize(("count", "within"), [(40, 1e-9), (120, 0.02)])
+def test_leverages_are_those_of_the_dense_jacobian(count, within):
+    jacobian = np.random.default_rng(1).normal(size=(6 * count, 60)) * np.geomspace(1.0, 100.0, 60)
+    rows = np.arange(6, 6 * count)
+    dense = np.einsum("ij,jk,ik->i", jacobian, np.linalg.inv(jacobian.T @ jacobian), jacobian)
+    np.testing.assert_allclose(_leverage(csc_array(jacobian), rows), dense[rows].sum(), rtol=within)

@@ -124,6 +124,27 @@ def test_resumed_run_ends_as_one_in_one_go(clip, whole, tmp_path, monkeypatch, u
     assert same_ending(tmp_path / "out", whole, drawn=False)
 
 
+@pytest.mark.parametrize(("after", "fault"), [(9, Power), (20, KeyboardInterrupt), (38, Power)])
+def test_resumed_run_with_loops_ends_as_one_in_one_go(clip, tmp_path, monkeypatch, undrawn, after, fault):
+    pytest.importorskip("gtsam")
+    monkeypatch.setattr("gavo_jax.mapping.candidates.MIN_SECONDS", 0.2)
+    monkeypatch.setattr("gavo_jax.mapping.keyframes.SPACING", 0.03)
+    in_one_go, out = arguments(clip, tmp_path / "whole", "--loops"), arguments(clip, tmp_path / "out", "--loops")
+    assert main(in_one_go) == 0
+    with monkeypatch.context() as patch:
+        cut_short(patch, after, fault)
+        if fault is Power:
+            with pytest.raises(Power):
+                main(out)
+        else:
+            assert main(out) == 130
+    assert main([*out, "--resume"]) == 0
+    assert len((tmp_path / "whole" / "loops.csv").read_text().splitlines()) > 1, "there are loops"
+    assert same_ending(tmp_path / "out", tmp_path / "whole", drawn=False)
+    for name in ("loops.csv", "motions.csv", "odometry.txt"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
 def test_interrupted_run_is_resumed(clip, whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         cut_short(patch, 5, KeyboardInterrupt, 1e9)

@@ -1,0 +1,59 @@
+"""motions.csv: of each pair all digits of what a map is made of, so that a run that is resumed makes the same map."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.odometry.driver import Step
+
+MATRICES = ("world_T_camera", "target_T_reference")
+UPPER = np.triu_indices(6)
+MOTION_COLUMNS = (
+    ("index", "timestamp", "reference_timestamp")
+    + tuple(f"{name}_{row}{column}" for name in MATRICES for row in range(3) for column in range(4))
+    + tuple(f"covariance_{row}{column}" for row, column in zip(*UPPER, strict=True))
+)
+"""Of motions.csv, one row per pair: the frame's index, stamps in seconds, the upper three rows of the pose and of the
+pair's motion, metres, and the upper triangle of its covariance, of (v, w), metres and radians."""
+
+
+def motion_row(step: Step) -> list[Any]:
+    """Values of `MOTION_COLUMNS` of one step, in digits that read back exactly."""
+    matrices = (step.world_T_camera, step.alignment.target_T_reference)
+    numbers = [*(np.asarray(matrix, np.float64)[:3].ravel() for matrix in matrices)]
+    numbers.append(np.asarray(step.alignment.covariance, np.float64)[UPPER])
+    stamps = (step.timestamp, step.reference_timestamp)
+    return [step.index, *(repr(float(number)) for number in (*stamps, *np.concatenate(numbers)))]
+
+
+def with_motions(steps: list[Step], path: Path) -> list[Step]:
+    """Steps with what a motions.csv says of them.
+
+    Raises:
+        GavoError: It cannot be read, or is of other steps.
+    """
+    rows = list(csv.reader(read_text(path).splitlines()[1:]))
+    try:
+        return [_with_motion(step, *row) for step, row in zip(steps, rows, strict=True)]
+    except (TypeError, ValueError):
+        raise GavoError(f"{path}: not the motions of this run") from None
+
+
+def _with_motion(step: Step, index: str, *texts: str) -> Step:
+    if int(index) != step.index or len(texts) != len(MOTION_COLUMNS) - 1:
+        raise ValueError(index)
+    numbers = np.array(texts, np.float64)
+    covariance = np.zeros((6, 6))
+    covariance[UPPER] = covariance.T[UPPER] = numbers[26:]
+    pose, motion = (np.vstack([rows.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for rows in (numbers[2:14], numbers[14:26]))
+    return replace(
+        step,
+        timestamp=float(numbers[0]),
+        reference_timestamp=float(numbers[1]),
+        world_T_camera=pose,
+        alignment=step.alignment._replace(target_T_reference=motion, covariance=covariance),
+    )
