@@ -120,7 +120,7 @@ def _contents(path: Path) -> str:
     inside = sorted(path.iterdir())
     if not inside:
         return f"an empty folder, not one of: {known}"
-    sources = [child.name for child in inside if child.is_dir() and _kind_of(child) is not None]
+    sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
         return f"a folder of {len(sources)} sources ({_listed(sources)}), of which one is to be named"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"

@@ -99,12 +99,42 @@ def test_names_that_are_stamps_are_paired_by_time(folder, stems, seconds):
     for stem, second in zip(stems, seconds, strict=True):
         later = f"{second + 0.01:.6f}" if "." in stem else stem
         image(folder / f"depth/{later}.png", raw(METRES[0], 1000))
-    image(folder / "depth/1400000000.5.png" if "." in stems[0] else folder / "depth/1400000000000000.png", DEPTHS[0])
+    other_day = "1400000000.5" if "." in stems[0] else stems[0].replace("13", "14", 1)
+    image(folder / f"depth/{other_day}.png", DEPTHS[0])
     sequence = open_source(folder, Reading(camera=CAMERA))
     np.testing.assert_allclose(sequence.timestamps, seconds, atol=1e-6)
     assert isinstance(sequence, PlainFolder) and sequence.left_out == ("1 depth images: no colour image within 0.02 s",)
     delay = sequence[1].depth_timestamp
     assert delay is not None and abs(delay - seconds[1] - (0.01 if "." in stems[0] else 0.0)) < 1e-6
+
+
+def test_folders_may_be_written_large_and_hold_what_systems_leave(folder):
+    for i in range(4):
+        image(folder / f"RGB/{i}.PNG", GREYS[i])
+        image(folder / f"Depth/{i}.PNG", raw(METRES[i], 1000))
+        for kind in ("RGB", "Depth"):
+            (folder / f"{kind}/._{i}.png").write_bytes(b"\0\5\x16\7")
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    assert isinstance(sequence, PlainFolder) and len(sequence) == 4 and sequence.left_out == ()
+    np.testing.assert_array_equal(sequence[3].grey, GREYS[3])
+
+
+def test_colour_is_what_is_named_so(folder):
+    """Beside confidence and masks, whose names sort before and after."""
+    for i in range(2):
+        for kind, pixels in (("conf", GREYS[3]), ("rgb", GREYS[i]), ("mask", GREYS[3])):
+            image(folder / f"frame_{kind}_{i}.png", pixels)
+        image(folder / f"frame_depth_{i}.png", raw(METRES[i], 1000))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
+
+
+@pytest.mark.parametrize("layout", ["scannet", "seven_scenes", "open3d"])
+def test_two_images_of_one_number_are_refused(folder, layout):
+    color = next(wrote(folder, layout).rglob("*.color.png" if layout == "seven_scenes" else "*.jpg"))
+    image(color.with_suffix(".bmp"), np.zeros_like(GREYS[0]))
+    with pytest.raises(GavoError, match="has the same number as"):
+        open_source(folder)
 
 
 def test_a_published_camera_stands_in_for_a_file(folder):
@@ -205,6 +235,10 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
         open_source(tmp_path)
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
+    (tmp_path / "walk.bag").write_bytes(b"")
+    with pytest.raises(GavoError, match=r"a folder of 1 sources \(walk\.bag\), of which one is to be named"):
+        open_source(tmp_path)
+    (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
     with pytest.raises(GavoError, match=r"a folder of 1 sources \(room0\), of which one is to be named"):
         open_source(tmp_path)
