@@ -351,6 +351,8 @@ class _Bag:
             names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
             best = [name for name in names if any(word in name for word in words)] or names
             if len(best) != 1:
+                if not depth:
+                    raise GavoError(f"{self.path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
                 what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
                 raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
             found += best

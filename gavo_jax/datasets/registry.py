@@ -122,7 +122,7 @@ def _contents(path: Path) -> str:
         return f"an empty folder, not one of: {known}"
     sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
-        return f"a folder of {len(sources)} sources ({_listed(sources)}), of which one is to be named"
+        return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
 
 

@@ -346,7 +346,10 @@ def test_evaluate_refuses(gavo, clip):
     truth = clip / "groundtruth.txt"
     assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "delta")
-    assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100", "--unit frames")
+    later = clip / "later.txt"
+    later.write_text("9000 0 0 0 0 0 0 1\n9002 0 0 0 0 0 0 1\n")
+    assert is_refused(gavo("evaluate", later, truth), "later.txt", "from 9000.000 to 9002.000 s, the truth from 0.000")
 
 
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):

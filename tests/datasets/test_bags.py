@@ -284,7 +284,7 @@ def test_what_a_recording_lacks_is_said(tmp_path):
     recorder = Recorder(tmp_path / "none.bag", "ros1")
     recorder.info("/camera_info", 1.0, CAMERA)
     recorder.close()
-    with pytest.raises(GavoError, match=r"none\.bag: no colour images; there are images on no topic"):
+    with pytest.raises(GavoError, match=r"none\.bag: holds no images: no topic of sensor_msgs/msg/Image"):
         open_source(tmp_path / "none.bag")
 
 

@@ -236,11 +236,11 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
     (tmp_path / "walk.bag").write_bytes(b"")
-    with pytest.raises(GavoError, match=r"a folder of 1 sources \(walk\.bag\), of which one is to be named"):
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of walk\.bag"):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
-    with pytest.raises(GavoError, match=r"a folder of 1 sources \(room0\), of which one is to be named"):
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of room0"):
         open_source(tmp_path)
 
 
