@@ -162,6 +162,8 @@ class ScanNet(NumberedFolder):
         found = _millimetres(load_calibration(color, partial(size_of_first, [first]), MILLIMETRES))
         if not depth.is_file() or first.depth is None:
             return found
+        for name in ("color", "depth"):
+            _check_identity(path / "intrinsic" / f"extrinsic_{name}.txt")
         height, width = read_depth(first.depth).shape
         other = load_calibration(depth, (width, height), MILLIMETRES).color
         if other == found.color:
@@ -243,10 +245,12 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = _plain_files(path)
-        entries, left_out = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
+        by_stamp = _by_stamp(path, color, depth, reading)
+        entries, left_out = by_stamp or _by_number(path, color, depth, reading)
         own = partial(cls.calibrate, path, entries[0], reading)
         calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
-        return cls(root.name, entries, calibration, truth_in(path), reading, left_out)
+        truth = truth_in(path, 1.0 if by_stamp else 1 / (reading.rate or RATE))
+        return cls(root.name, entries, calibration, truth, reading, left_out)
 
 
 class Open3DFolder(PlainFolder):
@@ -329,6 +333,15 @@ def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Readin
 def _millimetres(calibration: Calibration) -> Calibration:
     """The same where the file says nothing of depth: the dataset does."""
     return calibration if calibration.states_depth_scale else calibration.with_depth_scale(MILLIMETRES)
+
+
+def _check_identity(file: Path) -> None:
+    """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
+    if not file.is_file():
+        return
+    pose = _pose(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+    if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
+        raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
 
 
 def _pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:

@@ -125,6 +125,12 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
 
 def _counts(names: Sequence[str]) -> list[float] | None:
     counts = [int(number) for number in _at_the_end(names, r"\d+")]
+    unit = unit_of(counts)
+    return None if unit is None else [unit * count for count in counts]
+
+
+def unit_of(counts: Sequence[float]) -> float | None:
+    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
     if not counts:
         return None
     of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
@@ -133,7 +139,7 @@ def _counts(names: Sequence[str]) -> list[float] | None:
     steps = np.diff(sorted(counts))
     if len(steps) > 1 and MILLISECONDS[0] <= steps.min() < steps.max() <= min(steps.min() + JITTER, MILLISECONDS[1]):
         device.append(UNITS[1])
-    return next(([unit * count for count in counts] for unit in (*usual, *device, *of_clock)), None)
+    return next(iter((*usual, *device, *of_clock)), None)
 
 
 def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:

@@ -137,6 +137,22 @@ def test_two_images_of_one_number_are_refused(folder, layout):
         open_source(folder)
 
 
+def test_truth_by_the_numbers_of_frames_has_their_times(folder):
+    wrote(folder, "plain")
+    (folder / "groundtruth.txt").write_text("".join(f"{i} 0 0 {i} 0 0 0 1\n" for i in range(4)))
+    for rate in (None, 10.0):
+        sequence = open_source(folder, Reading(rate=rate))
+        assert sequence.ground_truth is not None
+        np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps)
+
+
+def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
+    wrote(folder, "scannet")
+    np.savetxt(folder / "intrinsic/extrinsic_color.txt", np.eye(4) + 0.05 * np.eye(4, k=3))
+    with pytest.raises(GavoError, match=r"extrinsic_color\.txt: is not the identity: say --camera"):
+        open_source(folder)
+
+
 def test_a_published_camera_stands_in_for_a_file(folder):
     wrote(folder, "seven_scenes")
     (folder / "camera-intrinsics.txt").unlink()
