@@ -56,6 +56,16 @@ class Reading:
         """Whether the source has to bring its camera."""
         return isinstance(self.camera, str) and self.camera == "auto"
 
+    def given(self) -> list[str]:
+        """Options of the command that say how a source is read, as far as they are given."""
+        values = {
+            "--depth-scale": self.depth_scale,
+            "--rate": self.rate,
+            "--colour-topic": self.color_topic,
+            "--depth-topic": self.depth_topic,
+        }
+        return [option for option, value in values.items() if value is not None]
+
     def calibration(
         self,
         own: Callable[[], Calibration],

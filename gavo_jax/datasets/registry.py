@@ -43,6 +43,11 @@ class Dataset(Protocol):
 BUILT_IN: tuple[Dataset, ...] = (TumSequence, SevenScenes, ScanNet, Replica, BagSequence, Open3DFolder, PlainFolder)
 """In the order in which they are asked."""
 
+TOPICS = {"--colour-topic", "--depth-topic"}
+
+USELESS: dict[Dataset, set[str]] = {BagSequence: {"--rate"}}
+"""Options that a kind of source, built in, has no use for; of the others `TOPICS`."""
+
 _registered: list[Dataset] = []
 
 
@@ -89,7 +94,10 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
         raise GavoError(f"{str(path)!r}: unusable: {getattr(error, 'strerror', None) or error}") from None
     if not exists:
         raise GavoError(f"{path}: no such folder or file: name one, or the word synthetic")
-    return recognise(path).open(path, reading)
+    dataset = recognise(path)
+    if dataset in BUILT_IN and (useless := set(reading.given()) & USELESS.get(dataset, TOPICS)):
+        raise GavoError(f"{path}: {min(useless)} says nothing of a {dataset.kind}")
+    return dataset.open(path, reading)
 
 
 def recognise(path: Path) -> Dataset:
