@@ -186,6 +186,14 @@ def test_the_unit_of_floats_can_be_said(tmp_path, color_file):
     assert np.abs(frame.depth / camera.depth_scale - METRES).max() < 1e-3
 
 
+def test_floats_beside_whole_numbers_are_in_no_common_unit(tmp_path, color_file):
+    pair = [(color_file, write(tmp_path / name, raw)) for name, raw in (("a.npy", METRES), ("b.png", RAW))]
+    with pytest.raises(GavoError, match=r"b\.png: depth in whole numbers, and in floats in .*a\.npy.*--depth-scale"):
+        open_pair(pair, Calibration(CAMERA))[0]
+    pair[1] = color_file, write(tmp_path / "none.png", np.zeros_like(RAW))
+    assert open_pair(pair, Calibration(CAMERA))[0].depth.any()
+
+
 def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
     frame, camera = read(color_file, write(tmp_path / "depth.npy", METRES * 8))
     assert camera.depth_scale == 1000
