@@ -31,6 +31,9 @@ MODELS = {
 }
 """Names of distortion models, as ROS, Kalibr and others call them."""
 
+SAME_CAMERA = 0.5
+"""Pixels by which colour and depth camera of a scan may differ where depth is registered."""
+
 MOST_SKEW = 0.5
 """Pixels: pixels whose rows and columns are so far from square to each other are no camera's of ours."""
 
@@ -295,8 +298,34 @@ def _parse_xml(path: Path, text: str) -> Table:
     return _parse_storage(path, text)
 
 
+def _parse_sens(path: Path, text: str) -> Table:
+    """The `info.txt` that BundleFusion, 3RScan and ScanNet's `.sens` come with: `name = values`, matrices of 4×4."""
+    values = {name.strip(): value.split() for name, _, value in (line.partition("=") for line in text.splitlines())}
+    identity = np.eye(4).ravel()
+
+    def camera(kind: str) -> Table:
+        matrix = np.array([float(value) for value in values[f"m_calibration{kind}Intrinsic"]]).reshape(4, 4)
+        turned = [float(value) for value in values.get(f"m_calibration{kind}Extrinsic", identity)]
+        if not np.allclose(turned, identity, atol=1e-6):
+            raise GavoError(f"{path}: m_calibration{kind}Extrinsic: not the identity, the only one that is read")
+        size = {side.lower(): int(values[f"m_{kind.lower()}{side}"][0]) for side in ("Width", "Height")}
+        return {**of_matrix(str(path), matrix[:3, :3].ravel().tolist()), **size}
+
+    try:
+        color, depth = camera("Color"), camera("Depth")
+        scale = {"depth_scale": float(values["m_depthShift"][0])} if "m_depthShift" in values else {}
+    except GavoError:
+        raise
+    except (KeyError, ValueError, IndexError) as error:
+        raise GavoError(f"{path}: looks like the info.txt of a scan, but is none: {_line(error)}") from None
+    same = all(abs(color[key] - depth[key]) < SAME_CAMERA for key in color)
+    return {**color, **scale} if same else {**color, **scale, "depth": depth}
+
+
 def _parse_numbers(path: Path, text: str) -> Table:
     """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`; `#` comments."""
+    if "m_calibrationColorIntrinsic" in text:
+        return _parse_sens(path, text)
     lines = [re.split(r"[\s,]+", line.split("#")[0].strip()) for line in text.splitlines()]
     try:
         rows = [[float(field) for field in line] for line in lines if line != [""]]

@@ -108,7 +108,8 @@ class NumberedFolder(FileSequence):
 class SevenScenes(NumberedFolder):
     """A sequence of 7-Scenes (Shotton et al. 2013): `frame-000000.color.png`, `.depth.png`, `.pose.txt`.
 
-    Depth is in millimetres, 65535 where there is none, and not registered to colour.
+    Depth is in millimetres, 65535 where there is none, and not registered to colour. BundleFusion and 3RScan name their
+    files alike; their `info.txt` has the cameras.
     """
 
     kind: ClassVar[str] = "7-Scenes sequence"
@@ -128,8 +129,9 @@ class SevenScenes(NumberedFolder):
 
     @classmethod
     def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
-        """The camera file beside the frames, else the dataset's."""
-        file = own_camera_file(path)
+        """The camera file beside the frames, or a scan's info.txt, else the dataset's."""
+        infos = (path / name for name in ("info.txt", "_info.txt"))
+        file = own_camera_file(path) or next((file for file in infos if file.is_file()), None)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
         return _millimetres(load_calibration(file, partial(size_of_first, [first]), MILLIMETRES))

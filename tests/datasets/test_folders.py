@@ -1,5 +1,6 @@
 """Folders of every dataset: recognised by what lies in them, and read to the same frames."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 from typing import ClassVar
@@ -162,6 +163,41 @@ def test_a_published_camera_stands_in_for_a_file(folder):
         image(folder / f"frame-{i:06}.color.png", np.zeros((480, 640), np.uint8))
         image(folder / f"frame-{i:06}.depth.png", np.full((480, 640), 1500, np.uint16))
     assert open_source(folder).camera == Camera(585, 585, 320, 240, 640, 480, depth_scale=1000)
+
+
+def sens(color: Camera, depth: Camera, shift: float = 0.0) -> str:
+    """The info.txt of a scan."""
+    lines = ["m_versionNumber = 4", f"m_depthShift = {color.depth_scale:g}"]
+    for kind, camera in (("Color", color), ("Depth", depth)):
+        matrix, pose = np.eye(4), np.eye(4)
+        matrix[:3, :3], pose[0, 3] = camera.matrix, shift
+        lines += [f"m_{kind.lower()}Width = {camera.width}", f"m_{kind.lower()}Height = {camera.height}"]
+        for what, numbers in (("Intrinsic", matrix), ("Extrinsic", pose)):
+            lines.append(f"m_calibration{kind}{what} = {' '.join(map(str, numbers.ravel()))} ")
+    return "\n".join(lines) + "\n"
+
+
+def test_an_info_of_a_scan_has_the_cameras(folder):
+    """As BundleFusion and 3RScan have it, whose frames are named as those of 7-Scenes."""
+    wrote(folder, "seven_scenes")
+    (folder / "camera-intrinsics.txt").unlink()
+    mine = Camera(130.0, 130.5, 80.0, 60.0, 160, 120, depth_scale=1000.0)
+    (folder / "info.txt").write_text(sens(mine, dataclasses.replace(mine, fx=130.2)))
+    sequence = open_source(folder)
+    assert isinstance(sequence, SevenScenes) and sequence.calibration.color == mine
+    assert sequence.calibration.depth is None
+    (folder / "info.txt").write_text(sens(mine, dataclasses.replace(mine, fx=140.0)))
+    other = open_source(folder)
+    assert isinstance(other, SevenScenes) and other.calibration.depth is not None
+    assert other.calibration.depth.fx == 140 and other[0].depth.any()
+    for text, fault in (
+        (sens(mine, mine, 0.03), "Extrinsic: not the identity"),
+        (sens(mine, mine).replace("m_depthWidth", "m_width"), "m_depthWidth"),
+        (sens(mine, mine)[:-150], "info.txt of a scan"),
+    ):
+        (folder / "info.txt").write_text(text)
+        with pytest.raises(GavoError, match=fault):
+            open_source(folder)
 
 
 def test_the_folders_name_may_say_the_camera(tmp_path):
