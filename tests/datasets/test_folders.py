@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, image, kinect, raw
+from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, MATRIX, METRES, POSES, image, kinect, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets import registry
@@ -206,6 +206,18 @@ def test_the_folders_name_may_say_the_camera(tmp_path):
         image(tmp_path / f"fr3_walk/rgb/{i}.png", np.zeros((480, 640), np.uint8))
         image(tmp_path / f"fr3_walk/depth/{i}.png", np.full((480, 640), 9000, np.uint16))
     assert open_source(tmp_path / "fr3_walk").camera == Camera.preset("fr3").rectified()
+
+
+def test_sun3d_counts_eight_to_a_millimetre(folder):
+    """And names its images by number and microseconds."""
+    for i in range(4):
+        name = f"{i + 1:07}-{33333 * i:012}"
+        image(folder / f"image/{name}.jpg", GREYS[i])
+        image(folder / f"depth/{name}.png", 8 * kinect(np.geomspace(0.8, 3.0, 120 * 160).reshape(120, 160), 1000))
+    np.savetxt(folder / "intrinsics.txt", MATRIX)
+    sequence = open_part(str(folder))
+    assert sequence.camera.depth_scale == 8000 and sequence.camera.fx == CAMERA.fx
+    np.testing.assert_allclose(sequence.timestamps, np.arange(4) * 0.033333, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0])
