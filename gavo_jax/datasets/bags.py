@@ -128,7 +128,7 @@ class BagSequence:
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """By the file's ending, or the folder's metadata."""
-        return (path / METADATA).is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+        return (path / METADATA).is_file() if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:

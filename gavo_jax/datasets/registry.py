@@ -124,6 +124,8 @@ def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
+        if path.is_file() and _kind_of(path.parent) is not None:
+            return f"a file of a source, whose folder is to be named: {path.parent}"
         return f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
     if not inside:

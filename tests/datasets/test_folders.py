@@ -1,6 +1,7 @@
 """Folders of every dataset: recognised by what lies in them, and read to the same frames."""
 
 import dataclasses
+import os
 import shutil
 from pathlib import Path
 from typing import ClassVar
@@ -304,8 +305,18 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
+    with pytest.raises(GavoError, match=r"traj\.txt: a file of a source, whose folder is to be named: .*room0$"):
+        open_source(tmp_path / "room0/traj.txt")
     with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of room0"):
         open_source(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_is_no_recording(tmp_path):
+    """To open it would wait for ever."""
+    os.mkfifo(tmp_path / "x.bag")
+    with pytest.raises(GavoError, match=r"x\.bag: a file of 0 bytes, not one of"):
+        open_source(tmp_path / "x.bag")
 
 
 class Lines:
