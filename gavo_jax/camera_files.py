@@ -171,13 +171,16 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
 
 def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
-    """Refuse a principal point that is the middle of an image of another size."""
+    """Refuse a principal point that is the middle of an image of another size, or of one on its side."""
     x, y = (2 * at / side for at, side in zip(point, size, strict=True))
-    if abs(x - y) < LIKE and abs(x - 1) > OFF_CENTRE and abs(y - 1) > OFF_CENTRE:
+    across, down = (2 * at / side for at, side in zip(point, reversed(size), strict=True))
+    is_off = abs(x - 1) > OFF_CENTRE / 2 and abs(y - 1) > OFF_CENTRE / 2
+    is_turned = is_off and abs(across - 1) < LIKE and abs(down - 1) < LIKE
+    if is_turned or abs(x - y) < LIKE and abs(x - 1) > OFF_CENTRE and abs(y - 1) > OFF_CENTRE:
         other = f"{2 * point[0]:.0f}x{2 * point[1]:.0f}"
         raise GavoError(
             f"{place}: {point[0]:g} {point[1]:g}: the middle of an image of about {other}, not of {size[0]}x{size[1]}: "
-            "scale fx, fy, cx and cy to the images"
+            f"{'turn' if is_turned else 'scale'} fx, fy, cx and cy to the images"
         )
 
 

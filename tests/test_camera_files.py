@@ -250,6 +250,7 @@ FAULTS = {
     "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: must be a number from -1 to 1, not 40"),
     "larger image.txt": ("1170 1170 647 483\n", "middle of an image of about 1294x966, not of 640x480"),
     "smaller image.toml": (TOML.replace("640", "1280").replace("480", "960"), "about 639x479, not of 1280x960"),
+    "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: turn fx"),
     "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
     "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
