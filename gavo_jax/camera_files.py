@@ -9,13 +9,23 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import MAX_SIDE, PRESETS, Camera
-from gavo_jax.camera_makes import PARSERS, Table
+from gavo_jax.camera_makes import MODELS, PARSERS, Table
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES = 65536
 
 LONGEST_LENS = 20
 """Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
+
+SHORTEST_LENS = 0.1
+"""The same, of a view of 157 degrees; less is a focal length in millimetres."""
+
+OFF_CENTRE, LIKE = 0.25, 0.1
+"""Where the principal point is off the middle by such a share of it, and by nearly the same share along both sides,
+the numbers are of an image of another size."""
+
+MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
+"""Of OpenCV's coefficients; what is larger was meant as something else."""
 
 DEPTH_SCALE = 5000.0
 """Where nobody says it: that of the TUM benchmark."""
@@ -30,20 +40,6 @@ CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model",
 DEVICE_KEYS = ("depth_delay",)
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
-
-MODELS = {
-    "pinhole": "pinhole",
-    "none": "pinhole",
-    "plumb_bob": "pinhole",
-    "radtan": "pinhole",
-    "brown": "pinhole",
-    "rational": "pinhole",
-    "rational_polynomial": "pinhole",
-    "fisheye": "fisheye",
-    "equidistant": "fisheye",
-    "kannalabrandt8": "fisheye",
-}
-"""Names of distortion models, as ROS, Kalibr and others call them."""
 
 
 Size = tuple[int, int]
@@ -158,11 +154,13 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
     width, height = whole("width"), whole("height")
     distortion, model = _distortion(path, part, values)
+    cx, cy = number("cx", -width, 2 * width), number("cy", -height, 2 * height)
+    _check_middle(f"{path}: {part}cx, {part}cy", (cx, cy), (width, height))
     return Camera(
-        fx=number("fx", 1, LONGEST_LENS * width),
-        fy=number("fy", 1, LONGEST_LENS * height),
-        cx=number("cx", -width, 2 * width),
-        cy=number("cy", -height, 2 * height),
+        fx=number("fx", SHORTEST_LENS * width, LONGEST_LENS * width),
+        fy=number("fy", SHORTEST_LENS * height, LONGEST_LENS * height),
+        cx=cx,
+        cy=cy,
         width=width,
         height=height,
         distortion=distortion,
@@ -170,6 +168,20 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
         readout=number("readout", 0, 1, 0.0),
         model=model,
     )
+
+
+def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
+    """Refuse a principal point that is the middle of an image of another size, or of one on its side."""
+    x, y = (2 * at / side for at, side in zip(point, size, strict=True))
+    across, down = (2 * at / side for at, side in zip(point, reversed(size), strict=True))
+    is_off = abs(x - 1) > OFF_CENTRE / 2 and abs(y - 1) > OFF_CENTRE / 2
+    is_turned = is_off and abs(across - 1) < LIKE and abs(down - 1) < LIKE
+    if is_turned or abs(x - y) < LIKE and abs(x - 1) > OFF_CENTRE and abs(y - 1) > OFF_CENTRE:
+        other = f"{2 * point[0]:.0f}x{2 * point[1]:.0f}"
+        raise GavoError(
+            f"{place}: {point[0]:g} {point[1]:g}: the middle of an image of about {other}, not of {size[0]}x{size[1]}: "
+            f"{'turn' if is_turned else 'scale'} fx, fy, cx and cy to the images"
+        )
 
 
 def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float, ...], Any]:
@@ -180,15 +192,27 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
     numbers = values.get("distortion", [])
     lengths = (0, 4) if model == "fisheye" else (0, 4, 5, 8, 12, 14)
     if not isinstance(numbers, list) or len(numbers) not in lengths or ("distortion" in values and numbers == []):
-        wanted = "4 numbers (k1 k2 k3 k4)" if model == "fisheye" else "4, 5 or 8 numbers (k1 k2 p1 p2 [k3 [k4 k5 k6]])"
-        raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}")
-    checked = tuple(_number(f"{path}: {part}distortion", value, -1000, 1000) for value in numbers)
+        wanted = (
+            "4 numbers (k1 k2 k3 k4)"
+            if model == "fisheye"
+            else "4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]])"
+        )
+        raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}, not of {_count(numbers)}")
+    tangential = MOST_RADIAL if model == "fisheye" else MOST_TANGENTIAL
+    most = (MOST_K1, MOST_RADIAL, tangential, tangential, *[MOST_RADIAL] * 10)
+    checked = tuple(
+        _number(f"{path}: {part}distortion", value, -limit, limit) for value, limit in zip(numbers, most, strict=False)
+    )
     return checked + (0.0,) * max(0, (4 if model == "fisheye" else 5) - len(checked)), model
+
+
+def _count(numbers: Any) -> str:
+    return str(len(numbers)) if isinstance(numbers, list) else shown(numbers)
 
 
 def _number(place: str, value: Any, low: float, high: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise GavoError(f"{place}: must be a number from {low:g} to {high:g}")
+        raise GavoError(f"{place}: must be a number from {low:g} to {high:g}, not {shown(value)}")
     return float(value)
 
 

@@ -13,9 +13,29 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gavo_jax.errors import GavoError, parse_toml
+from gavo_jax.errors import GavoError, parse_toml, shown
 
 Table = dict[str, Any]
+
+MODELS = {
+    "pinhole": "pinhole",
+    "none": "pinhole",
+    "plumb_bob": "pinhole",
+    "radtan": "pinhole",
+    "brown": "pinhole",
+    "rational": "pinhole",
+    "rational_polynomial": "pinhole",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
+    "kannalabrandt8": "fisheye",
+}
+"""Names of distortion models, as ROS, Kalibr and others call them."""
+
+SAME_CAMERA = 0.5
+"""Pixels by which colour and depth camera of a scan may differ where depth is registered."""
+
+MOST_SKEW = 0.5
+"""Pixels: pixels whose rows and columns are so far from square to each other are no camera's of ours."""
 
 
 def _parse_yaml(path: Path, text: str) -> Table:
@@ -69,16 +89,41 @@ def _of_known_make(path: Path, values: Any) -> Table:
         if is_of_make(values):
             try:
                 return read(path, values)
-            except (TypeError, ValueError, KeyError, IndexError, AttributeError):
+            except GavoError:
+                raise
+            except KeyError as error:
+                raise GavoError(f"{path}: {read.__doc__ or ''} Its entry {error} is missing") from None
+            except (TypeError, ValueError, IndexError, AttributeError):
                 raise GavoError(f"{path}: {read.__doc__ or ''} Entries are missing or of another kind") from None
     return values
+
+
+def of_matrix(place: str, numbers: list[Any]) -> Table:
+    """fx, fy, cx and cy of a 3×3 matrix, row by row or, as Open3D and MATLAB have it, column by column.
+
+    Args:
+        place: names the file in messages.
+        numbers: nine.
+
+    Raises:
+        GavoError: they are no camera matrix.
+        ValueError: they are not nine.
+    """
+    fx, skew, cx, below, fy, cy, left, right, one = numbers
+    if not any(isinstance(number, str) for number in numbers):
+        if not any(numbers):
+            raise GavoError(f"{place}: the camera matrix is zero: nobody calibrated the camera: say --camera")
+        if not (cx or cy):
+            skew, cx, below, cy, left, right = below, left, skew, right, cx, cy
+        if below or left or right or one != 1 or abs(skew) > MOST_SKEW:
+            raise GavoError(f"{place}: not a camera matrix (fx 0 cx, 0 fy cy, 0 0 1): {shown(numbers)}")
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
 
 def _read_open3d(path: Path, values: Table) -> Table:
     """Looks like Open3D's intrinsics."""
     values = values.get("intrinsic", values)
-    fx, _, _, _, fy, _, cx, cy, _ = values["intrinsic_matrix"]  # column by column
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": values["width"], "height": values["height"]}
+    return {**of_matrix(str(path), values["intrinsic_matrix"]), "width": values["width"], "height": values["height"]}
 
 
 def _read_replica(path: Path, values: Table) -> Table:
@@ -97,9 +142,8 @@ def _read_ros(path: Path, values: Table) -> Table:
     def numbers(entry: Any) -> list[Any]:
         return list(entry["data"] if isinstance(entry, dict) else entry or [])
 
-    fx, _, cx, _, fy, cy, _, _, _ = numbers(first("camera_matrix", "K", "k"))
     return {
-        **{"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        **of_matrix(str(path), numbers(first("camera_matrix", "K", "k"))),
         **{"width": first("image_width", "width"), "height": first("image_height", "height")},
         **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
         **{key: values[key] for key in ("depth_scale", "readout") if key in values},
@@ -107,8 +151,10 @@ def _read_ros(path: Path, values: Table) -> Table:
 
 
 def camera_info_distortion(model: str, numbers: list[Any]) -> Table:
-    """Our keys for what a ROS camera_info says of the lens; an empty list stands for none."""
-    return {"distortion": numbers, "model": model or "plumb_bob"} if len(numbers) else {}
+    """Our keys for what a ROS camera_info says of the lens; an empty list stands for none, but of a fisheye."""
+    if len(numbers):
+        return {"distortion": numbers, "model": model or "plumb_bob"}
+    return {"model": model} if MODELS.get(str(model).lower()) == "fisheye" else {}
 
 
 def _read_kalibr(path: Path, values: Table) -> Table:
@@ -172,22 +218,20 @@ def _parse_storage(path: Path, text: str) -> Table:
 def _storage_matrices(path: Path, storage: Any) -> Table:
     def matrix(*names: str) -> np.ndarray | None:
         found = (storage.getNode(name) for name in names)
-        return next((_matrix_of(node) for node in found if not node.empty() and node.isMap()), None)
+        return next((_matrix_of(node) for node in found if not node.empty()), None)
 
     def whole(*names: str) -> int | None:
         found = (storage.getNode(name) for name in names)
         return next((int(node.real()) for node in found if not node.empty() and node.isInt()), None)
 
     intrinsics = matrix("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
-    if intrinsics is None or intrinsics.shape != (3, 3):
+    if intrinsics is None or intrinsics.size != 9:
         raise GavoError(f"{path}: camera_matrix: missing, or not 3x3")
-    table: Table = dict(zip(("fx", "fy", "cx", "cy"), intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+    table = of_matrix(str(path), intrinsics.ravel().tolist())
     coefficients = matrix("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1")
-    if coefficients is not None and coefficients.size:
-        model = storage.getNode("distortion_model")
-        fisheye = whole("fisheye_model", "fisheye")
-        named = model.string() if model.isString() else "fisheye" if fisheye else "plumb_bob"
-        table |= camera_info_distortion(named, coefficients.ravel().tolist())
+    model = storage.getNode("distortion_model")
+    named = model.string() if model.isString() else "fisheye" if whole("fisheye_model", "fisheye") else "plumb_bob"
+    table |= camera_info_distortion(named, [] if coefficients is None else coefficients.ravel().tolist())
     size = storage.getNode("image_size")
     sides = [int(size.at(i).real()) for i in range(2)] if size.isSeq() and size.size() == 2 else [None, None]
     width, height = whole("image_width", "width", "image_Width"), whole("image_height", "height", "image_Height")
@@ -198,9 +242,16 @@ def _storage_matrices(path: Path, storage: Any) -> Table:
 
 
 def _matrix_of(node: Any) -> np.ndarray:
-    """A matrix of a FileStorage; not by its own `mat()`, which writes beyond its memory where sizes do not agree."""
+    """A matrix of a FileStorage, or the numbers of a plain list.
+
+    Not by its own `mat()`, which writes beyond its memory where sizes do not agree.
+    """
+    if node.isSeq():
+        return np.array([_real(node.at(i)) for i in range(node.size())])
+    if not node.isMap():
+        raise TypeError("a matrix that is neither a matrix nor a list")
     data = node.getNode("data")
-    numbers = [data.at(i).real() for i in range(data.size())] if data.isSeq() else []
+    numbers = [_real(data.at(i)) for i in range(data.size())] if data.isSeq() else []
     rows, columns = (node.getNode(name) for name in ("rows", "cols"))
     if not (rows.isInt() and columns.isInt()) or int(rows.real()) * int(columns.real()) != len(numbers):
         raise TypeError("a matrix whose rows and columns are not those of its data")
@@ -215,16 +266,30 @@ def _storage_orb(storage: Any) -> Table | None:
 
     def real(name: str) -> float | None:
         node = storage.getNode(name)
-        return None if node.empty() or not (node.isReal() or node.isInt()) else node.real()
+        return None if node.empty() else _real(node, name)
 
     table: Table = {key: real(f"{prefix}.{key}") for key in ("fx", "fy", "cx", "cy")}
     for key in ("width", "height"):
         value = real(f"Camera.{key}")
         table[key] = None if value is None else int(value)
-    lens = [real(f"{prefix}.{key}") for key in ("k1", "k2", "p1", "p2", "k3")]
-    table["distortion"] = [value or 0.0 for value in lens]
+    kind = storage.getNode("Camera.type")
+    table["model"] = _orb_model(kind.string() if kind.isString() else "PinHole")
+    keys = ("k1", "k2", "k3", "k4") if table["model"] == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    table["distortion"] = [real(f"{prefix}.{key}") or 0.0 for key in keys]
     table["depth_scale"] = real("DepthMapFactor") or real("RGBD.DepthMapFactor")
     return {key: value for key, value in table.items() if value is not None}
+
+
+def _orb_model(kind: str) -> str:
+    """Our name of ORB-SLAM's camera type; one that is not known stays as it is, and is refused."""
+    return {"PinHole": "pinhole", "Rectified": "pinhole", "KannalaBrandt8": "fisheye"}.get(kind, kind)
+
+
+def _real(node: Any, name: str = "a list") -> float:
+    """The number that a node of a FileStorage is, which itself takes text for 0."""
+    if not (node.isReal() or node.isInt()):
+        raise TypeError(f"{name}: not a number")
+    return node.real()
 
 
 def _parse_xml(path: Path, text: str) -> Table:
@@ -233,8 +298,34 @@ def _parse_xml(path: Path, text: str) -> Table:
     return _parse_storage(path, text)
 
 
+def _parse_sens(path: Path, text: str) -> Table:
+    """The `info.txt` that BundleFusion, 3RScan and ScanNet's `.sens` come with: `name = values`, matrices of 4×4."""
+    values = {name.strip(): value.split() for name, _, value in (line.partition("=") for line in text.splitlines())}
+    identity = np.eye(4).ravel()
+
+    def camera(kind: str) -> Table:
+        matrix = np.array([float(value) for value in values[f"m_calibration{kind}Intrinsic"]]).reshape(4, 4)
+        turned = [float(value) for value in values.get(f"m_calibration{kind}Extrinsic", identity)]
+        if not np.allclose(turned, identity, atol=1e-6):
+            raise GavoError(f"{path}: m_calibration{kind}Extrinsic: not the identity, the only one that is read")
+        size = {side.lower(): int(values[f"m_{kind.lower()}{side}"][0]) for side in ("Width", "Height")}
+        return {**of_matrix(str(path), matrix[:3, :3].ravel().tolist()), **size}
+
+    try:
+        color, depth = camera("Color"), camera("Depth")
+        scale = {"depth_scale": float(values["m_depthShift"][0])} if "m_depthShift" in values else {}
+    except GavoError:
+        raise
+    except (KeyError, ValueError, IndexError) as error:
+        raise GavoError(f"{path}: looks like the info.txt of a scan, but is none: {_line(error)}") from None
+    same = all(abs(color[key] - depth[key]) < SAME_CAMERA for key in color)
+    return {**color, **scale} if same else {**color, **scale, "depth": depth}
+
+
 def _parse_numbers(path: Path, text: str) -> Table:
     """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`; `#` comments."""
+    if "m_calibrationColorIntrinsic" in text:
+        return _parse_sens(path, text)
     lines = [re.split(r"[\s,]+", line.split("#")[0].strip()) for line in text.splitlines()]
     try:
         rows = [[float(field) for field in line] for line in lines if line != [""]]
@@ -243,11 +334,11 @@ def _parse_numbers(path: Path, text: str) -> Table:
             lens = {"distortion": distortion} if distortion else {}
             return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
         matrix = np.array(rows)
-        if matrix.shape not in ((3, 3), (4, 4), (3, 4)):
+        if matrix.shape not in ((3, 3), (4, 4), (3, 4)) or matrix[:3, 3:].any():
             raise ValueError
     except ValueError:
         raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy") from None
-    return dict(zip(("fx", "fy", "cx", "cy"), matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+    return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 
 
 def _line(error: BaseException) -> str:

@@ -49,7 +49,10 @@ def shown(value: Any) -> str:
     """Return a value as code would write it, cut to what fits into a message."""
     cutter = reprlib.Repr()
     cutter.maxstring = cutter.maxother = cutter.maxlong = MAX_SHOWN
-    return cutter.repr(value)
+    try:
+        return cutter.repr(value)
+    except ValueError:  # Python writes no whole number of thousands of digits
+        return f"a {type(value).__name__} of too many digits"
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -57,13 +57,21 @@ class Recorder:
         more = {"seq": self.count} if self.is_1 else {}
         return self.store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame, **more)
 
-    def image(self, topic: str, stamp: float, pixels: np.ndarray, encoding: str, received: float | None = None) -> None:
+    def image(
+        self,
+        topic: str,
+        stamp: float,
+        pixels: np.ndarray,
+        encoding: str,
+        received: float | None = None,
+        frame: str = "camera",
+    ) -> None:
         rows = np.ascontiguousarray(pixels)
         self.write(
             topic,
             "Image",
             stamp if received is None else received,
-            header=self.header(stamp),
+            header=self.header(stamp, frame),
             height=pixels.shape[0],
             width=pixels.shape[1],
             encoding=encoding,

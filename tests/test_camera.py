@@ -190,7 +190,7 @@ def test_camera_files(tmp_path):
         (TOML.replace("fx = 50.0", "fx = '50'"), "fx"),
         (TOML.replace("fx = 50.0", "fx = true"), "fx"),
         (TOML.replace("fx = 50.0", "fx = 1e9"), "fx"),
-        (TOML.replace("fx = 50.0", "fx = 1281"), "fx: must be a number from 1 to 1280"),
+        (TOML.replace("fx = 50.0", "fx = 1281"), "fx: must be a number from 6.4 to 1280, not 1281"),
         (TOML.replace("fy = 52", "fy = 52000"), "fy"),
         (TOML.replace("fx = 50.0", "fx = 1" + "0" * 400), "fx"),
         (TOML.replace("fx = 50.0", "fx = 0x" + "f" * 5000), "fx"),

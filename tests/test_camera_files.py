@@ -100,13 +100,23 @@ Camera.width: 640
 Camera.height: 480
 DepthMapFactor: 1000.0
 """
+ORB_FISH = "%YAML:1.0\n" + "\n".join(
+    f"Camera1.{key}: {value!r}"
+    for key, value in zip(
+        ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), (500.0, 510.0, 319.5, 239.5, *EQUIDISTANT), strict=True
+    )
+)
+ORB_FISH += '\nCamera.type: "KannalaBrandt8"\nCamera.width: 640\nCamera.height: 480\n'
+ROWS, COLUMNS = MATRIX.ravel().tolist(), MATRIX.T.ravel().tolist()
+LIST_OF_OPENCV = f"%YAML:1.0\nimage_width: 640\nimage_height: 480\ncamera_matrix: {ROWS}\nD: {RADTAN}\n"
 TOML = "fx=500\nfy=510\ncx=319.5\ncy=239.5\nwidth=640\nheight=480\n"
 
-NONE, BROWN, RATIO, FISH = (
+NONE, BROWN, RATIO, FISH, IDEAL_FISH = (
     PINHOLE,
     replace(PINHOLE, distortion=(*RADTAN, 0.0)),
     replace(PINHOLE, distortion=tuple(RATIONAL)),
     replace(PINHOLE, distortion=tuple(EQUIDISTANT), model="fisheye"),
+    replace(PINHOLE, distortion=(0.0,) * 4, model="fisheye"),
 )
 FILES = {
     "ros plumb_bob.yaml": (ros1("plumb_bob", [*RADTAN, 0.0]), BROWN),
@@ -128,6 +138,13 @@ FILES = {
     "open3d pose.json": (json.dumps({"extrinsic": [1], "intrinsic": OPEN3D}), NONE),
     "replica.json": (json.dumps(REPLICA), replace(NONE, depth_scale=6553.5)),
     "own.json": (json.dumps({"fx": 500, "fy": 510, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}), NONE),
+    "ros fisheye without numbers.yaml": (ros1("equidistant", []), IDEAL_FISH),
+    "ros columns.yaml": (ros1("plumb_bob", RADTAN).replace(str(ROWS), str(COLUMNS)), BROWN),
+    "kalibr fisheye without numbers.yaml": (kalibr("equidistant", []), IDEAL_FISH),
+    "opencv lists.yaml": (LIST_OF_OPENCV, BROWN),
+    "opencv fisheye without numbers.yml": (storage(".yml", OPENCV, True, []), IDEAL_FISH),
+    "orb fisheye.yaml": (ORB_FISH, FISH),
+    "open3d rows.json": (json.dumps({**OPEN3D, "intrinsic_matrix": ROWS}), NONE),
     "own.toml": (TOML + f"distortion={RATIONAL}\nmodel='rational'\n", RATIO),
     "own fisheye.toml": (TOML + f"distortion={EQUIDISTANT}\nmodel='fisheye'\n", FISH),
 }
@@ -148,6 +165,7 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
     [
         ("500 0 319.5\n0 510 239.5\n0 0 1\n", NONE),
         ("\n".join(" ".join(map(str, row)) for row in np.block([[MATRIX, np.zeros((3, 1))], [np.eye(4)[3:]]])), NONE),
+        ("500 0 0\n0 510 0\n319.5 239.5 1\n", NONE),
         ("500 510 319.5 239.5\n", NONE),
         ("# fx fy cx cy\n500, 510, 319.5, 239.5, 0.1, -0.2, 0.001, -0.002\n", BROWN),
     ],
@@ -220,6 +238,21 @@ FAULTS = {
         "camera_matrix",
     ),
     "orb without.yaml": (ORB.replace("Camera.cx", "Camera.cz"), "cx: missing"),
+    "orb text.yaml": (ORB.replace("0.1\n", '"0.1"\n'), "Camera.k1: not a number"),
+    "orb odd.yaml": (ORB.replace("PinHole", "Scaramuzza"), "Scaramuzza"),
+    "opencv text.yaml": (LIST_OF_OPENCV.replace("500.0", '"x"'), "not a number"),
+    "kalibr alone.yaml": (kalibr("radtan", RADTAN, True).split("  T_cn")[0], "T_cn_cnm1"),
+    "ros zero.yaml": (ros1("plumb_bob", RADTAN).replace(str(ROWS), str([0.0] * 9)), "nobody calibrated"),
+    "ros skewed.yaml": (ros1("plumb_bob", RADTAN).replace("500.0, 0.0", "500.0, 9.0"), "not a camera matrix"),
+    "a pose.txt": ("1 0 0 2\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "neither a matrix"),
+    "a turn.txt": ("1 0 0\n0 1 0\n0 0 1\n", "cx, cy: 0 0"),
+    "size first.txt": ("640 480 500 510 319.5 239.5 0 0\n", "distortion"),
+    "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: must be a number from -1 to 1, not 40"),
+    "larger image.txt": ("1170 1170 647 483\n", "middle of an image of about 1294x966, not of 640x480"),
+    "smaller image.toml": (TOML.replace("640", "1280").replace("480", "960"), "about 639x479, not of 1280x960"),
+    "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: turn fx"),
+    "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),
+    "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
     "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
     "text.txt": ("hello\n", "neither a matrix"),
 }

@@ -2,18 +2,20 @@
 
 import json
 import sys
+from functools import partial
 
 import jax
 import numpy as np
 
 from gavo_jax.alignment.pairs import align as align_pair
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.camera import preset_for_sequence
 from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.options import Align
-from gavo_jax.cli.selection import check_seed, choose_settings
+from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
-from gavo_jax.datasets.files import open_pair
+from gavo_jax.datasets.depth_unit import fault_of_scale
+from gavo_jax.datasets.files import Entry, Reading, open_pair, own_camera_file, preset_by_name, size_of_first
+from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.files import describe
@@ -24,10 +26,14 @@ from gavo_jax.trajectory import inverse
 def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance` and `status` of one pair."""
     check_seed(options.seed)
+    check_positive("--depth-scale", options.depth_scale, 1e6)
     calibration = _calibration(options)
     settings = choose_settings(options).settings
-    pair = open_pair([(options.rgb0, options.depth0), (options.rgb1, options.depth1)], calibration)
+    images = [(options.rgb0, options.depth0), (options.rgb1, options.depth1)]
+    pair = open_pair(images, calibration, Reading(depth_scale=options.depth_scale))
     (reference, target), camera = pair, pair.camera
+    if not options.force and (fault := fault_of_scale(pair)):
+        raise GavoError(f"{options.depth0}: {fault}, or go on with --force")
     enable_compilation_cache()
     with waiting("compiling and aligning …"):
         key = jax.random.key(options.seed)
@@ -40,6 +46,8 @@ def align(options: Align) -> int:
         "covariance": found.covariance,
         "status": found.status.name.lower(),
         "status_sentence": found.sentence,
+        "camera_from": calibration.origin,
+        "depth_units_per_metre": pair.depth_unit.file,
     }
     print(json.dumps(describe(answer), indent=2, allow_nan=False))
     if sys.stdout.isatty():
@@ -65,6 +73,9 @@ def in_words(found: Alignment) -> str:
 
 
 def _calibration(options: Align) -> Calibration:
-    if options.camera == "auto":
-        return load_calibration(preset_for_sequence(options.rgb0.absolute().parent.parent.name))
-    return load_calibration(options.camera)
+    size = partial(size_of_first, [Entry(0.0, options.rgb0, options.depth0)])
+    if options.camera != "auto":
+        return load_calibration(options.camera, size)
+    folder = options.rgb0.absolute().parent
+    file = own_camera_file(folder) or own_camera_file(folder.parent)
+    return preset_by_name(folder.parent) if file is None else load_calibration(file, size)

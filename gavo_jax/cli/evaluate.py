@@ -22,7 +22,8 @@ def evaluate(options: Evaluate) -> int:
         absolute = absolute_trajectory_error(estimate, truth)
         distance = distance_error(estimate, truth)
     except GavoError as error:
-        raise GavoError(f"{options.estimate} against {options.groundtruth}: {error}") from None
+        hint = _hint(estimate, truth, options)
+        raise GavoError(f"{options.estimate} against {options.groundtruth}: {error}{hint}") from None
     series = {
         "rpe_translation": relative.translation,
         "rpe_rotation": relative.rotation,
@@ -41,6 +42,19 @@ def evaluate(options: Evaluate) -> int:
         if not options.json:
             say(f"figures in {folder}")
     return 0
+
+
+def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
+    """Why the stamps may lead to no error, and what would help."""
+    stamps = estimate.timestamps, truth.timestamps
+    if min(map(len, stamps)) == 0:
+        return ""
+    (first, last), (start, end) = ((some.min(), some.max()) for some in stamps)
+    if first > end or last < start:
+        return f": the estimate goes from {first:.3f} to {last:.3f} s, the truth from {start:.3f} to {end:.3f} s"
+    if options.unit == "s" and last - first <= options.delta:
+        return f": the estimate lasts {last - first:.2f} s: set --delta, or --unit frames"
+    return ""
 
 
 def _print(options: Evaluate, series: dict[str, ErrorSeries]) -> None:

@@ -50,16 +50,20 @@ def _time(facts: dict[str, Any]) -> str:
 def _camera(camera: dict[str, Any]) -> str:
     size = f"{camera['width']}x{camera['height']}"
     intrinsics = " ".join(f"{name} {camera[name]:g}" for name in ("fx", "fy", "cx", "cy"))
-    lens = f", {camera['model']} distortion {camera['distortion']}" if any(camera["distortion"]) else ""
+    lens = f", {camera['model']} distortion {camera['distortion']}" if _is_distorted(camera) else ""
     shutter = f", rolling shutter of {1e3 * camera['readout']:g} ms" if camera["readout"] else ""
     return f"{size}, {intrinsics}{lens}{shutter}"
+
+
+def _is_distorted(camera: dict[str, Any]) -> bool:
+    return camera["model"] == "fisheye" or any(camera["distortion"])
 
 
 def _recorded(recorded: dict[str, Any] | None) -> list[tuple[str, str]]:
     """The cameras before undistortion and registration, where they differ."""
     if recorded is None:
         return []
-    lines = [("colour as recorded", _camera(recorded["color"]))] if any(recorded["color"]["distortion"]) else []
+    lines = [("colour as recorded", _camera(recorded["color"]))] if _is_distorted(recorded["color"]) else []
     if "depth" in recorded:
         lines.append(("depth camera", _camera(recorded["depth"]) + ", registered to colour"))
     return lines

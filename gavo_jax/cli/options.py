@@ -141,7 +141,11 @@ class Align(Search):
     depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
     """Depth image of the target frame."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """As in `gavo run`; auto goes by the name of the folder above RGB0's."""
+    """As in `gavo run`; auto takes the camera file beside RGB0 or one folder up, else goes by that folder's name."""
+    depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
+    """As in `gavo run`."""
+    force: bool = False
+    """As in `gavo run`."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """As in `gavo run`."""
 

@@ -47,9 +47,8 @@ def reading_of(source: Source) -> Reading:
     Raises:
         GavoError: a number that cannot be.
     """
-    for option, value, most in (("--depth-scale", source.depth_scale, 1e6), ("--rate", source.rate, 1e4)):
-        if value is not None and not 1e-3 <= value <= most:
-            raise GavoError(f"{option}: must be a number from 0.001 to {most:g}, not {value:g}")
+    check_positive("--depth-scale", source.depth_scale, 1e6)
+    check_positive("--rate", source.rate, 1e4)
     return Reading(
         depth_scale=source.depth_scale,
         rate=source.rate,
@@ -77,6 +76,12 @@ def check_seed(seed: int) -> None:
     """Raise GavoError for a seed that JAX's keys do not take."""
     if not 0 <= seed <= MAX_SEED:
         raise GavoError(f"--seed: must be from 0 to {MAX_SEED}, not {seed}")
+
+
+def check_positive(option: str, value: float | None, most: float) -> None:
+    """Raise GavoError for a number that is given and is not from 0.001 to `most`."""
+    if value is not None and not 1e-3 <= value <= most:
+        raise GavoError(f"{option}: must be a number from 0.001 to {most:g}, not {value:g}")
 
 
 def _check_at_least(option: str, value: int, least: int) -> None:

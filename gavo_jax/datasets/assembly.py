@@ -53,10 +53,15 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
         given: units per metre, if somebody says so.
 
     Raises:
-        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`.
+        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`; or some images
+            hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
+    whole = [image.name for image in samples if image.raw.dtype == np.uint16 and image.raw.any()]
+    if whole and given is None:
+        other = next(image.name for image in samples if image.raw.dtype != np.uint16)
+        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {other}: say --depth-scale, of both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     median = float(np.median(readings)) if readings.size else METRES
     file = given or _likely_unit(median, calibration)

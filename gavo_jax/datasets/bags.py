@@ -2,10 +2,12 @@
 
 import contextlib
 import io
+import itertools
+import re
 import struct
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,7 +22,16 @@ from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, Frame
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
 from gavo_jax.datasets.files import SAMPLED, Reading
-from gavo_jax.datasets.messages import CAMERA_INFO, COMPRESSED, IMAGE, camera_table, color_of, depth_of, is_depth
+from gavo_jax.datasets.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    camera_table,
+    color_of,
+    depth_of,
+    is_calibrated,
+    is_depth,
+)
 from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 from gavo_jax.trajectory import Trajectory, associate
@@ -35,6 +46,15 @@ FAR_AHEAD = 64
 NOWHERE: tuple[int, int] = (2**62, 2**62)
 """Behind every message: where a stream stands before it is entered."""
 
+FEW = 30
+"""Messages of a topic that are looked at for one that says something."""
+
+ROUNDED = 0.05
+"""Pixels by which the same camera may differ from one camera_info to another."""
+
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+"""In the name of a topic whose images are free of distortion."""
+
 COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered")
 """Words in the names of topics that are chosen before others."""
 
@@ -47,7 +67,20 @@ class _Topic(NamedTuple):
     received: np.ndarray
     """Nanoseconds."""
     stamps: np.ndarray
-    """Seconds, of their headers."""
+    """Seconds, of their headers; 0 where they have none."""
+
+
+def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
+    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival."""
+    if all(topic.stamps.any() for topic in topics):
+        return tuple(topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
+    return tuple(topic._replace(stamps=topic.received * 1e-9) for topic in topics)
+
+
+def _span(topic: _Topic) -> str:
+    if not len(topic.stamps):
+        return f"{topic.name} has no message"
+    return f"{topic.name} goes from {np.nanmin(topic.stamps):.3f} to {np.nanmax(topic.stamps):.3f}"
 
 
 class BagSequence:
@@ -75,12 +108,11 @@ class BagSequence:
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
         self.ground_truth: Trajectory | None = None
         color, depth = self._bag.choose(reading)
-        self._topics = tuple(self._bag.topic(name) for name in (color, depth))
+        self._topics = _in_one_time(self._bag.topic(color), self._bag.topic(depth))
         i, j = associate(self._topics[0].stamps, self._topics[1].stamps, reading.max_difference)
         if len(i) == 0:
-            raise GavoError(
-                f"{path}: no stamps of {color} and {depth} within {reading.max_difference:g} s of each other"
-            )
+            spans = " and ".join(_span(topic) for topic in self._topics)
+            raise GavoError(f"{path}: no stamps within {reading.max_difference:g} s of each other: {spans}")
         order = np.argsort(self._topics[0].stamps[i], kind="stable")
         self._pairs = np.stack([i, j], 1)[order]
         self._timestamps = self._topics[0].stamps[i][order]
@@ -96,7 +128,7 @@ class BagSequence:
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """By the file's ending, or the folder's metadata."""
-        return (path / METADATA).is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+        return (path / METADATA).is_file() if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
@@ -284,22 +316,21 @@ class _Bag:
             return self._reader.deserialize(raw, kind)
 
     def topic(self, name: str) -> _Topic:
-        """Go over the messages of a topic for their stamps; those without one get the time they were received."""
+        """Go over the messages of a topic for their stamps."""
         connections = [connection for connection in self._reader.connections if connection.topic == name]
         received, stamps = [], []
         with blamed(str(self.path)):
             for _, time, raw in self._reader.messages(connections):
                 received.append(time)
                 stamps.append(_stamp(raw, self._reader.is2))
-        if not any(stamps):
-            stamps = [time * 1e-9 for time in received]
         return _Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
 
-    def first(self, name: str) -> Any | None:
-        """The first message of a topic."""
+    def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
+        """The first message of a topic, of the first few those that are good."""
         with blamed(str(self.path)):
-            found = next(self.stream([name]), None)
-            return None if found is None else self._reader.deserialize(found[1], found[2])
+            few = itertools.islice(self.stream([name]), FEW)
+            messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
+            return next(filter(is_good, messages), None)
 
     def choose(self, reading: Reading) -> tuple[str, str]:
         """The topics of colour and depth, those that are named or those that the messages' types speak for."""
@@ -317,9 +348,11 @@ class _Bag:
                     raise GavoError(f"{self.path}: {option}: no images on {given!r}: those are on {_named(depth)}")
                 found.append(given)
                 continue
-            names = [name for name, is_one in depth.items() if is_one == is_wanted]
+            names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
             best = [name for name in names if any(word in name for word in words)] or names
             if len(best) != 1:
+                if not depth:
+                    raise GavoError(f"{self.path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
                 what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
                 raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
             found += best
@@ -334,8 +367,10 @@ class _Bag:
         camera = self._camera(name, info, color)
         other = self._info(depth)
         moved = None if other is None else self._camera(*other, depth)
-        if other is None or moved is None or moved.rectified() == camera.rectified():
+        if moved is not None and _is_same(moved, camera):
             return Calibration(camera, origin=name, states_depth_scale=False)
+        if other is None or moved is None:
+            return self._alone(camera, name, (color, depth), info.header.frame_id)
         color_T_depth = between(self._transforms(), info.header.frame_id, other[1].header.frame_id)
         if color_T_depth is None:
             raise GavoError(
@@ -345,6 +380,19 @@ class _Bag:
         origin = f"{name}, {other[0]} and {FIXED_TOPIC}"
         return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
 
+    def _alone(self, camera: Camera, name: str, topics: tuple[str, str], frame: str) -> Calibration:
+        """One camera for both topics, where nothing says that depth, without a camera_info, lies in another frame."""
+        image = self.first(topics[1])
+        other = frame if image is None else image.header.frame_id
+        color_T_depth = between(self._transforms(), frame, other)
+        if frame and other and (color_T_depth is None or not np.allclose(color_T_depth, np.eye(4))):
+            raise GavoError(
+                f"{self.path}: no camera_info for {topics[1]}, whose images lie in the frame {other[:60]!r} and not in "
+                f"{frame[:60]!r} as {topics[0]}: say --camera with a file of both cameras ([depth], colour_T_depth), "
+                "or of one if depth is registered to colour"
+            )
+        return Calibration(camera, origin=name, states_depth_scale=False)
+
     def _transforms(self) -> dict[tuple[str, str], np.ndarray]:
         """The fixed transforms of the recording."""
         topics = [c.topic for c in self._reader.connections if (c.topic, c.msgtype) == (FIXED_TOPIC, TRANSFORMS)]
@@ -353,18 +401,21 @@ class _Bag:
             return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
 
     def _info(self, topic: str) -> tuple[str, Any] | None:
-        """Name and first message of the camera_info beside a topic of images."""
+        """Name and first message of the camera_info beside a topic of images; one that says something, if any does."""
         infos = [c.topic for c in self._reader.connections if c.msgtype == CAMERA_INFO]
         parts = topic.split("/")
         for length in range(len(parts) - 1, 0, -1):
             name = "/".join([*parts[:length], "camera_info"])
-            if name in infos and (message := self.first(name)) is not None:
+            if name in infos and (message := self.first(name, is_calibrated) or self.first(name)) is not None:
                 return name, message
         return None
 
     def _camera(self, name: str, info: Any, topic: str) -> Camera:
-        with blamed(f"{self.path}: {name}"):
-            return camera_from_table(f"{self.path}: {name}", camera_table(info, "rect" in topic), MILLIMETRES)
+        place = f"{self.path}: {name}"
+        if not is_calibrated(info):
+            raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
+        with blamed(place):
+            return camera_from_table(place, camera_table(info, bool(RECTIFIED.search(topic))), MILLIMETRES)
 
 
 class _File(io.BufferedReader):
@@ -400,6 +451,17 @@ def _stamp(raw: Any, is_2: bool) -> float:
     order = "<" if not is_2 or data[1] & 1 else ">"
     seconds, nanoseconds = struct.unpack(f"{order}II", data[4:12])
     return seconds + nanoseconds * 1e-9
+
+
+def _without_copies(names: list[str]) -> list[str]:
+    """Topics without those that hold the same images as another, compressed."""
+    return [name for name in names if name.rpartition("/")[0] not in names]
+
+
+def _is_same(a: Camera, b: Camera) -> bool:
+    """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
+    numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
+    return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))
 
 
 def _named(topics: Any) -> str:

@@ -18,6 +18,9 @@ from gavo_jax.datasets.images import without_invalid
 COMMON = (5000.0, 1000.0, 1.0)
 """Units per metre of files: of the TUM benchmark, millimetres, metres."""
 
+SHIFTED = 8000.0
+"""Of SUN3D: millimetres, moved up by three bits. Only steps speak for it."""
+
 LOOKED_AT = 3
 """Frames."""
 
@@ -97,10 +100,11 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
     """
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
     by_steps = sample.kinect_scale if is_kinect or looks_so else None
-    others = [other for other in COMMON if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
+    far = [other for other in (*COMMON, SHIFTED) if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
+    others = [other for other in far if other != SHIFTED]
     seen = [other for other in others if sample.near / other > KINECT_NEAREST]
-    for other in seen:
-        if by_steps is not None and abs(by_steps / other - 1) < STEP_TOLERANCE:
+    for other in far:
+        if sample.near / other > KINECT_NEAREST and by_steps is not None and abs(by_steps / other - 1) < STEP_TOLERANCE:
             return other
     if is_kinect and sample.median / scale < KINECT_NEAREST:
         return max(seen, default=None)
@@ -140,7 +144,12 @@ def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]
     return sample_depth(images), sequence.camera.depth_scale if unit is None else unit.file
 
 
-NAMES = {1.0: "metres", 1000.0: "millimetres", 5000.0: "the TUM benchmark's 5000 to a metre"}
+NAMES = {
+    1.0: "metres",
+    1000.0: "millimetres",
+    5000.0: "the TUM benchmark's 5000 to a metre",
+    SHIFTED: "SUN3D's 8000 to a metre",
+}
 """Common units in words."""
 
 

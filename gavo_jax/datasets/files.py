@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple, overload
@@ -55,6 +55,16 @@ class Reading:
     def is_auto(self) -> bool:
         """Whether the source has to bring its camera."""
         return isinstance(self.camera, str) and self.camera == "auto"
+
+    def given(self) -> list[str]:
+        """Options of the command that say how a source is read, as far as they are given."""
+        values = {
+            "--depth-scale": self.depth_scale,
+            "--rate": self.rate,
+            "--colour-topic": self.color_topic,
+            "--depth-topic": self.depth_topic,
+        }
+        return [option for option, value in values.items() if value is not None]
 
     def calibration(
         self,
@@ -224,9 +234,21 @@ def own_camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
 
 
-def truth_in(folder: Path) -> Trajectory | None:
-    """The true trajectory that lies in a folder, if one does; raises `GavoError` if it cannot be read."""
-    return Trajectory.read_tum(folder / TRUTH) if (folder / TRUTH).exists() else None
+def truth_in(folder: Path, unit: float = 1.0) -> Trajectory | None:
+    """The true trajectory that lies in a folder, if one does.
+
+    Args:
+        folder: of the frames.
+        unit: seconds of what the frames' stamps count; it holds for the truth's, too, where all are whole numbers.
+
+    Raises:
+        GavoError: it cannot be read.
+    """
+    if not (folder / TRUTH).exists():
+        return None
+    truth = Trajectory.read_tum(folder / TRUTH)
+    whole = np.array_equal(truth.timestamps, np.round(truth.timestamps))
+    return replace(truth, timestamps=unit * truth.timestamps) if whole and unit != 1 else truth
 
 
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +28,7 @@ from gavo_jax.datasets.files import (
     unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
+from gavo_jax.datasets.names import Found, by_number, images_among, stamps
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -37,24 +38,13 @@ RATE = 30.0
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
 
+COLOR_WORDS = ("colou?r|rgb", "image|frame|img")
+"""In the names of colour images that lie beside depth; the latter where the former say nothing."""
+
 MAX_POSE_BYTES = 4096
 
 SKEWED = 0.01
 """A pose whose rotation is off one by more is none."""
-
-STAMP_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e9, 1.0))
-"""Names that are numbers from so large on are stamps since 1970: nanoseconds, microseconds, milliseconds, seconds."""
-
-
-class Found(NamedTuple):
-    """Image files of a folder by the numbers in their names."""
-
-    color: dict[int, Path]
-    depth: dict[int, Path]
-
-    def unpaired(self, frames: int) -> list[str]:
-        """What makes no frame, a line each."""
-        return unpaired((len(self.color), len(self.depth)), frames, "of the same number")
 
 
 class NumberedFolder(FileSequence):
@@ -118,7 +108,8 @@ class NumberedFolder(FileSequence):
 class SevenScenes(NumberedFolder):
     """A sequence of 7-Scenes (Shotton et al. 2013): `frame-000000.color.png`, `.depth.png`, `.pose.txt`.
 
-    Depth is in millimetres, 65535 where there is none, and not registered to colour.
+    Depth is in millimetres, 65535 where there is none, and not registered to colour. BundleFusion and 3RScan name their
+    files alike; their `info.txt` has the cameras.
     """
 
     kind: ClassVar[str] = "7-Scenes sequence"
@@ -134,15 +125,13 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Both kinds lie in the folder itself."""
-        return Found(
-            _numbered(path.glob("frame-*.color.*"), COLOR_SUFFIXES),
-            _numbered(path.glob("frame-*.depth.*"), DEPTH_SUFFIXES),
-        )
+        return _found(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
 
     @classmethod
     def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
-        """The camera file beside the frames, else the dataset's."""
-        file = own_camera_file(path)
+        """The camera file beside the frames, or a scan's info.txt, else the dataset's."""
+        infos = (path / name for name in ("info.txt", "_info.txt"))
+        file = own_camera_file(path) or next((file for file in infos if file.is_file()), None)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
         return _millimetres(load_calibration(file, partial(size_of_first, [first]), MILLIMETRES))
@@ -166,7 +155,7 @@ class ScanNet(NumberedFolder):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Each kind has a folder."""
-        return Found(_images(path / "color", COLOR_SUFFIXES), _images(path / "depth", DEPTH_SUFFIXES))
+        return _found((path / "color").glob("*"), (path / "depth").glob("*"))
 
     @classmethod
     def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
@@ -175,6 +164,8 @@ class ScanNet(NumberedFolder):
         found = _millimetres(load_calibration(color, partial(size_of_first, [first]), MILLIMETRES))
         if not depth.is_file() or first.depth is None:
             return found
+        for name in ("color", "depth"):
+            _check_identity(path / "intrinsic" / f"extrinsic_{name}.txt")
         height, width = read_depth(first.depth).shape
         other = load_calibration(depth, (width, height), MILLIMETRES).color
         if other == found.color:
@@ -202,9 +193,7 @@ class Replica(NumberedFolder):
     def find(cls, path: Path) -> Found:
         """Both kinds lie in one folder."""
         results = path / "results"
-        return Found(
-            _numbered(results.glob("frame*"), COLOR_SUFFIXES), _numbered(results.glob("depth*"), DEPTH_SUFFIXES)
-        )
+        return _found(results.glob("frame*"), results.glob("depth*"))
 
     @classmethod
     def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
@@ -224,8 +213,8 @@ class Replica(NumberedFolder):
 class PlainFolder(FileSequence):
     """A folder of colour and a folder of depth images, or one folder of both told apart by their names.
 
-    Names that are stamps (seconds with decimals, or a time since 1970 in s, ms, µs or ns) are paired by time; else
-    images of the same number are of one frame, and its time is that number over the rate.
+    Names that are stamps are paired by time (see `names.stamps`); else images of the same number are of one frame, and
+    its time is that number over the rate.
     """
 
     kind: ClassVar[str] = "folder of colour and depth images"
@@ -258,10 +247,12 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = _plain_files(path)
-        entries, left_out = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
+        by_stamp = _by_stamp(path, color, depth, reading)
+        entries, left_out = by_stamp or _by_number(path, color, depth, reading)
         own = partial(cls.calibrate, path, entries[0], reading)
         calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
-        return cls(root.name, entries, calibration, truth_in(path), reading, left_out)
+        truth = truth_in(path, 1.0 if by_stamp else 1 / (reading.rate or RATE))
+        return cls(root.name, entries, calibration, truth, reading, left_out)
 
 
 class Open3DFolder(PlainFolder):
@@ -291,42 +282,33 @@ def _any(folder: Path, pattern: str) -> Path | None:
     return next(folder.glob(pattern), None)
 
 
-def _images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    return _numbered(folder.iterdir(), suffixes) if folder.is_dir() else {}
-
-
-def _numbered(files: Iterable[Path], suffixes: Sequence[str]) -> dict[int, Path]:
-    """Images by the last number in their names."""
-    found = {}
-    for file in sorted(files):
-        number = re.findall(r"\d+", file.name[: -len(file.suffix)])
-        if file.suffix.lower() in suffixes and number and len(number[-1]) <= 18:
-            found.setdefault(int(number[-1]), file)
-    return found
+def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
+    return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
 def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth files, each in the order of their names."""
+    folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
     for color in COLOR_FOLDERS:
         for depth in DEPTH_FOLDERS:
-            if (path / color).is_dir() and (path / depth).is_dir():
-                pair = ((path / color, COLOR_SUFFIXES), (path / depth, DEPTH_SUFFIXES))
-                return tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in ends) for folder, ends in pair)  # pyright: ignore[reportReturnType]
-    files = sorted(path.iterdir()) if path.is_dir() else []
-    depth = [file for file in files if "depth" in file.name.lower() and file.suffix.lower() in DEPTH_SUFFIXES]
-    named = re.compile("colou?r|rgb|image|frame", re.IGNORECASE)
-    color = [file for file in files if named.search(file.name) and file.suffix.lower() in COLOR_SUFFIXES]
-    return [file for file in color if file not in set(depth)], depth
+            if color in folders and depth in folders:
+                files = (folders[color].glob("*"), folders[depth].glob("*"))
+                return images_among(files[0], COLOR_SUFFIXES), images_among(files[1], DEPTH_SUFFIXES)
+    files = list(path.glob("*"))
+    depth = [file for file in images_among(files, DEPTH_SUFFIXES) if "depth" in file.name.lower()]
+    others = [file for file in images_among(files, COLOR_SUFFIXES) if "depth" not in file.name.lower()]
+    named = ([file for file in others if re.search(word, file.name, re.IGNORECASE)] for word in COLOR_WORDS)
+    return next(filter(None, named), []), depth
 
 
 def _by_stamp(
     path: Path, color: list[Path], depth: list[Path], reading: Reading
 ) -> tuple[list[Entry], list[str]] | None:
     """Frames by the stamps that all names are; None where they are none, or the rate is said."""
-    stamps = [[_stamp(file.stem) for file in files] for files in (color, depth)]
-    if reading.rate is not None or any(stamp is None for some in stamps for stamp in some):
+    found = [None if reading.rate else stamps([file.stem for file in files]) for files in (color, depth)]
+    if found[0] is None or found[1] is None:
         return None
-    first, second = (np.array(some, float) for some in stamps)
+    first, second = (np.array(some, float) for some in found)
     i, j = associate(first, second, reading.max_difference)
     if len(i) == 0:
         raise GavoError(
@@ -338,20 +320,9 @@ def _by_stamp(
     return sorted(entries, key=lambda entry: entry.stamp), left_out
 
 
-def _stamp(stem: str) -> float | None:
-    """Seconds, if a name is a stamp."""
-    number = re.search(r"(\d+(?:\.\d+)?)$", stem)
-    if number is None:
-        return None
-    value = float(number[1])
-    if "." in number[1]:
-        return value
-    return next((value * unit for least, unit in STAMP_UNITS if value >= least), None)
-
-
 def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> tuple[list[Entry], list[str]]:
     """Frames by the numbers in the names."""
-    found = Found(_numbered(color, COLOR_SUFFIXES), _numbered(depth, DEPTH_SUFFIXES))
+    found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
     if not numbers:
         counts = f"{len(color)} colour and {len(depth)} depth images"
@@ -366,9 +337,18 @@ def _millimetres(calibration: Calibration) -> Calibration:
     return calibration if calibration.states_depth_scale else calibration.with_depth_scale(MILLIMETRES)
 
 
+def _check_identity(file: Path) -> None:
+    """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
+    if not file.is_file():
+        return
+    pose = _pose(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+    if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
+        raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
+
+
 def _pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
     poses = {}
-    for file in sorted(files):
+    for file in images_among(files, (".txt",)):
         numbers = re.findall(r"\d+", file.name)
         fields = [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row]
         pose = _pose(str(file), fields)

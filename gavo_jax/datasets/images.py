@@ -5,8 +5,9 @@ import io
 import struct
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,14 +51,14 @@ def decode_color(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | UInt16[
         image = _color_array(_decode_npy(data, name))
     else:
         image = _decode(data, name, AS_COLOR)
-    if image is None or image.ndim != 3 or image.dtype not in (np.uint8, np.uint16):
+    if image is None or image.ndim != 3 or image.shape[-1] != 3 or image.dtype not in (np.uint8, np.uint16):
         found = "nothing" if image is None else _describe(image)
         raise FrameError(f"{name}: not a colour image: expected colour or grey of 8 or 16 bits, found {found}")
     return image
 
 
 def read_depth(path: str | Path) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]:
-    """Return raw depth, as it stands in the file: 16-bit integers, or float32 for all else.
+    """Return raw depth, as it stands in the file: whole numbers of 16 bits, or float32 for all else.
 
     What is no reading (0, 65535, negative, NaN, infinity) is left as it is: see `without_invalid`.
 
@@ -81,7 +82,9 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
     if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
         found = _describe(image)
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
-    return image if image.dtype == np.uint16 else image.astype(np.float32)
+    if image.dtype.kind in "ui" and image.max() <= NO_READING:
+        return np.maximum(image, 0).astype(np.uint16)  # of 16 bits, whatever they are kept in
+    return image.astype(np.float32)
 
 
 def to_8_bits(image: Shaped[np.ndarray, "h w *channels"], white: int) -> UInt8[np.ndarray, "h w *channels"]:
@@ -218,10 +221,10 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
 
 
 def _color_array(image: np.ndarray) -> np.ndarray:
-    """BGR of an array, which holds RGB or RGBA as Python has it."""
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=-1)
-    return np.ascontiguousarray(image[..., 2::-1]) if image.shape[-1] in (3, 4) else image[..., 0]
+    """BGR of an array, which holds RGB or RGBA as Python has it; what is neither, nor grey, comes back as it is."""
+    if image.ndim == 2 or image.shape[-1] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=-1)
+    return np.ascontiguousarray(image[..., 2::-1]) if image.shape[-1] in (3, 4) else image
 
 
 def _decode_exr(data: bytes, name: str) -> np.ndarray:
@@ -238,12 +241,20 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
             channels = OpenEXR.File(file.name).channels()
     except Exception as error:  # of several kinds, which the library does not document
         raise FrameError(f"{name}: torn or damaged OpenEXR image: {' '.join(str(error).split())[:100]}") from None
-    chosen = next((channels[key] for key in ("Z", "Y", "R", "depth", "D") if key in channels), None)
-    if chosen is None:
-        chosen = next(iter(channels.values()), None)
-    if chosen is None:
-        raise FrameError(f"{name}: an OpenEXR image without channels")
-    pixels = np.asarray(chosen.pixels)
+    return _depth_channel(channels, name)
+
+
+def _depth_channel(channels: Mapping[str, Any], name: str) -> np.ndarray:
+    """Of an OpenEXR image: the channel that its name says is depth, else the only one; colour may be grey."""
+    parts = {key: key.lower().split(".") for key in channels}
+    named = [key for key in channels if parts[key][-1] in ("z", "d") or any("depth" in part for part in parts[key])]
+    chosen = named or list(channels)
+    if len(chosen) != 1:
+        found = ", ".join(chosen)[:100] or "none"
+        raise FrameError(f"{name}: of the channels of this OpenEXR image one has to be depth, named Z: found {found}")
+    pixels = np.asarray(channels[chosen[0]].pixels)
+    if pixels.ndim == 3 and not all(np.array_equal(pixels[..., 0], pixels[..., i], True) for i in (1, 2)):
+        raise FrameError(f"{name}: an OpenEXR image of colour ({chosen[0]}), and no channel of depth, named Z")
     return pixels[..., 0] if pixels.ndim == 3 else pixels
 
 

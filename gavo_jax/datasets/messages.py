@@ -1,11 +1,13 @@
 """Images and cameras in the messages of ROS, whatever version: raw, compressed, and depth compressed its own way."""
 
+import re
 import struct
 from typing import Any
 
 import cv2
 import numpy as np
 
+from gavo_jax.camera_makes import camera_info_distortion
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth
 
@@ -44,9 +46,15 @@ DEPTH_HEADER = 12
 """Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
 
 
+INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity)\d*(?:[/_]|$)")
+"""In the name of a topic of 16-bit images that are brightness, and no depth."""
+
+
 def is_depth(kind: str, message: Any, topic: str) -> bool:
     """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
     encoding = message.encoding if kind == IMAGE else message.format
+    if INFRARED.search(topic) and "depth" not in topic.lower():
+        return False
     if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding:
         return True
     return "depth" in topic and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
@@ -113,6 +121,11 @@ def _pixels(message: Any, name: str) -> np.ndarray:
     return rows if channels == 1 else rows.reshape(height, width, channels)
 
 
+def is_calibrated(info: Any) -> bool:
+    """Whether a camera_info says anything: drivers without a calibration send zeros."""
+    return info.width > 0 and any(getattr(info, "k", getattr(info, "K", ())))
+
+
 def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
     """What a camera_info says, by the keys of a camera file.
 
@@ -128,5 +141,5 @@ def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
     size = {"width": int(info.width), "height": int(info.height)}
     if rectified and any(p):
         return {"fx": p[0], "fy": p[5], "cx": p[2], "cy": p[6], **size}
-    lens = {"distortion": d, "model": info.distortion_model or "plumb_bob"} if any(d) and not rectified else {}
+    lens = {} if rectified else camera_info_distortion(info.distortion_model, d if any(d) else [])
     return {"fx": k[0], "fy": k[4], "cx": k[2], "cy": k[5], **size, **lens}

@@ -43,6 +43,11 @@ class Dataset(Protocol):
 BUILT_IN: tuple[Dataset, ...] = (TumSequence, SevenScenes, ScanNet, Replica, BagSequence, Open3DFolder, PlainFolder)
 """In the order in which they are asked."""
 
+TOPICS = {"--colour-topic", "--depth-topic"}
+
+USELESS: dict[Dataset, set[str]] = {BagSequence: {"--rate"}}
+"""Options that a kind of source, built in, has no use for; of the others `TOPICS`."""
+
 _registered: list[Dataset] = []
 
 
@@ -89,7 +94,10 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
         raise GavoError(f"{str(path)!r}: unusable: {getattr(error, 'strerror', None) or error}") from None
     if not exists:
         raise GavoError(f"{path}: no such folder or file: name one, or the word synthetic")
-    return recognise(path).open(path, reading)
+    dataset = recognise(path)
+    if dataset in BUILT_IN and (useless := set(reading.given()) & USELESS.get(dataset, TOPICS)):
+        raise GavoError(f"{path}: {min(useless)} says nothing of a {dataset.kind}")
+    return dataset.open(path, reading)
 
 
 def recognise(path: Path) -> Dataset:
@@ -116,13 +124,15 @@ def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
+        if path.is_file() and _kind_of(path.parent) is not None:
+            return f"a file of a source, whose folder is to be named: {path.parent}"
         return f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
     if not inside:
         return f"an empty folder, not one of: {known}"
-    sources = [child.name for child in inside if child.is_dir() and _kind_of(child) is not None]
+    sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
-        return f"a folder of {len(sources)} sources ({_listed(sources)}), of which one is to be named"
+        return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
 
 

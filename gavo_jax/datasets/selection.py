@@ -42,8 +42,11 @@ def open_part(
         GavoError: what is wrong with the source or its camera; fewer than two frames; a depth scale that is wrong by 5
             or 1000, as the first frames look.
     """
+    reading = reading or Reading()
+    if source == SYNTHETIC and (given := reading.given()):
+        raise GavoError(f"{given[0]}: is not of the {SYNTHETIC} room")
     stop = None if frames is None else start + (frames - 1) * stride + 1
-    reading = replace(reading or Reading(), camera=camera)
+    reading = replace(reading, camera=camera)
     whole = _synthetic(camera, stop, moving, reading.color) if source == SYNTHETIC else open_source(source, reading)
     chosen = whole[start:stop:stride]
     if len(chosen) < 2:

@@ -24,6 +24,7 @@ from gavo_jax.datasets.files import (
     truth_in,
     unpaired,
 )
+from gavo_jax.datasets.names import unit_of
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import associate
 
@@ -36,12 +37,12 @@ MAX_LIST_BYTES = 16 * 2**20
 MAX_PATH = 1000
 """Characters of a path in a list."""
 
-MAX_STAMP = 1e15
-"""Seconds; beyond, microseconds are lost in double precision anyway."""
+MAX_STAMP = 1e10
+"""Seconds, three centuries since 1970: what is larger counts something else."""
 
 COLOR_LIST, DEPTH_LIST = "rgb.txt", "depth.txt"
-ASSOCIATIONS = "associations.txt"
-"""Both lists in one, as ICL-NUIM has it: `stamp path stamp path`."""
+ASSOCIATIONS = tuple(f"{name}.txt" for name in ("associations", "association", "associated", "associate", "assoc"))
+"""Both lists in one, as ICL-NUIM has it and `associate.py` prints it: `stamp path stamp path`."""
 
 INDEX_RATE = 30.0
 """Frames per second where the stamps are nothing but the numbers of the frames."""
@@ -100,7 +101,7 @@ class TumSequence(FileSequence):
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
-        color_rows, depth_rows = _read_lists(resolved, self.folder, rate)
+        color_rows, depth_rows, unit = _read_lists(resolved, self.folder, rate)
         entries = _associate_lists(color_rows, depth_rows, max_difference)
         if not entries:
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
@@ -111,7 +112,7 @@ class TumSequence(FileSequence):
             name or resolved.name,
             files,
             reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_first, files)),
-            truth_in(self.folder),
+            truth_in(self.folder, unit),
             reading,
             unpaired((len(color_rows), len(depth_rows)), len(entries), why),
         )
@@ -119,7 +120,7 @@ class TumSequence(FileSequence):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a list lies in the folder."""
-        return any((path / name).exists() for name in (COLOR_LIST, DEPTH_LIST, ASSOCIATIONS))
+        return any((path / name).exists() for name in (COLOR_LIST, DEPTH_LIST, *ASSOCIATIONS))
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> "TumSequence":
@@ -166,23 +167,43 @@ def _files(entry: _Entry) -> Entry:
     return Entry(color.stamp, color.path, depth and depth.path, depth and depth.stamp, doubt)
 
 
-def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row]]:
-    """Rows of colour and of depth, from two lists or from one of pairs."""
-    if (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists() or not (folder / ASSOCIATIONS).exists():
+def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row], float]:
+    """Rows of colour and of depth, from two lists or one of pairs, and the seconds of what their stamps counted."""
+    both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
+    if both is None or (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists():
         color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
-        return color, depth
-    path = folder / ASSOCIATIONS
+    else:
+        color, depth = _read_pairs(root, both)
+    stamps = [row.stamp for row in color], [row.stamp for row in depth]
+    if rate and not _are_whole(*stamps):
+        raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
+    unit = _unit(*stamps, rate)
+    for row in (*color, *depth):
+        if not abs(unit * row.stamp) < MAX_STAMP:
+            raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
+    color, depth = ([row._replace(stamp=unit * row.stamp) for row in rows] for rows in (color, depth))
+    return color, depth, unit
+
+
+def _unit(color: list[float], depth: list[float], rate: float | None) -> float:
+    """Seconds of what stamps count: one, or of whole numbers what they seem to; numbers of frames go by the rate."""
+    if not _are_whole(color, depth):
+        return 1.0
+    return 1 / rate if rate else unit_of(color) or 1 / INDEX_RATE
+
+
+def _are_whole(*lists: list[float]) -> bool:
+    return all(stamp == round(stamp) for stamps in lists for stamp in stamps)
+
+
+def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
+    """Read `stamp path stamp path` rows, depth first or last."""
     pairs = []
     for place, fields in data_rows(path, MAX_LIST_BYTES):
         if len(fields) != 4:
             raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
         pairs.append(pair[::-1] if "depth" in fields[1] else pair)
-    stamps = np.array([row.stamp for pair in pairs for row in pair])
-    if len(stamps) and rate is None and np.all(stamps == np.round(stamps)):
-        rate = INDEX_RATE
-    if rate is not None:
-        pairs = [[row._replace(stamp=row.stamp / rate) for row in pair] for pair in pairs]
     color, depth = (_in_time(path, [pair[at] for pair in pairs]) for at in (0, 1))
     return color, depth
 
@@ -203,7 +224,7 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
         stamp = float(time)
     except ValueError:
         stamp = math.nan
-    if not abs(stamp) < MAX_STAMP:
+    if not math.isfinite(stamp):
         raise GavoError(f"{place}: not a time stamp: {time[:60]!r}")
     try:
         resolved = (root / image).resolve()

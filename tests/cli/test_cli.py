@@ -287,6 +287,8 @@ BAD_OPTIONS = {
     "no stride": (["--stride", "0"], ["--stride"]),
     "negative seed": (["--seed", "-1"], ["--seed"]),
     "unknown option": (["--nonsense"], ["--nonsense"]),
+    "rate of stamps": (["--rate", "10"], ["clip", "--rate", "stamps"]),
+    "topic of a folder": (["--depth-topic", "/depth"], ["clip", "--depth-topic", "TUM RGB-D folder"]),
     "output is a file": (["--output", "clip/rgb.txt"], ["clip/rgb.txt"]),
     "output below a file": (["--output", "clip/rgb.txt/out"], ["clip/rgb.txt/out"]),
 }
@@ -307,9 +309,10 @@ def test_usage_error_is_one_line(gavo, arguments):
 
 def test_align_prints_json(gavo, clip):
     rgb, depth = images(clip, "rgb"), images(clip, "depth")
-    done = gavo("align", rgb[0], depth[0], rgb[2], depth[2], "--camera", clip / "camera.toml", *FAST)
+    done = gavo("align", rgb[0], depth[0], rgb[2], depth[2], *FAST)
     assert done.status == 0, done.err
     answer = json.loads(done.out)
+    assert answer["camera_from"] == str(clip / "camera.toml") and answer["depth_units_per_metre"] == 5000
     target_T_reference, covariance = np.array(answer["target_T_reference"]), np.array(answer["covariance"])
     assert target_T_reference.shape == (4, 4) and len(answer["xi"]) == 6 and answer["status"] == "ok"
     assert covariance.shape == (6, 6) and np.array_equal(covariance, covariance.T)
@@ -337,16 +340,23 @@ def test_align_refuses_a_bad_image(gavo, clip, role, fault):
     assert is_refused(gavo("align", *files, "--camera", clip / "camera.toml"), str(bad))
 
 
-def test_align_takes_the_camera_from_the_folder(gavo, clip):
+def test_align_needs_a_camera_and_a_likely_unit(gavo, clip):
     rgb, depth = images(clip, "rgb")[0], images(clip, "depth")[0]
+    (clip / "camera.toml").unlink()
     assert is_refused(gavo("align", rgb, depth, rgb, depth), "clip", "--camera")
+    (clip / "intrinsics.txt").write_text(f"{CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy}\n")
+    assert is_refused(gavo("align", rgb, depth, rgb, depth, "--depth-scale", 1), str(depth), "--force")
+    assert is_refused(gavo("align", rgb, depth, rgb, depth, "--depth-scale", 0), "--depth-scale", "0.001")
 
 
 def test_evaluate_refuses(gavo, clip):
     truth = clip / "groundtruth.txt"
     assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "delta")
-    assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100", "--unit frames")
+    later = clip / "later.txt"
+    later.write_text("9000 0 0 0 0 0 0 1\n9002 0 0 0 0 0 0 1\n")
+    assert is_refused(gavo("evaluate", later, truth), "later.txt", "from 9000.000 to 9002.000 s, the truth from 0.000")
 
 
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
@@ -410,7 +420,8 @@ def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
     path.write_text("index\n7\n" if fault == "frames.csv" else "{")
     assert is_refused(gavo("view", "out", "--viewer", "save"), fault)
     path.unlink()
-    assert is_refused(gavo("view", "out", "--viewer", "save"), fault, "no such file")
+    why = "no output folder of `gavo run`" if fault == "config.json" else "no such file"
+    assert is_refused(gavo("view", "out", "--viewer", "save"), fault, why)
     assert not (tmp_path / "out" / "view.rrd").exists()
 
 

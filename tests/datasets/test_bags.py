@@ -177,6 +177,93 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
 
 
+def test_brightness_of_16_bits_is_no_depth(tmp_path):
+    recorder = Recorder(tmp_path / "ir", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image(COLOR, stamp, BGRS[0], "bgr8")
+        recorder.image("/camera/ir/image_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.image("/camera/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+    recorder.close()
+    sequence = open_source(tmp_path / "ir", Reading(camera=CAMERA))
+    assert isinstance(sequence, BagSequence) and sequence._topics[1].name == "/camera/depth/image_raw"
+
+
+def test_of_a_topic_and_its_compressed_copy_the_former_is_read(tmp_path):
+    recorder = Recorder(tmp_path / "all", "mcap")
+    for shot in shots():
+        for style in (STYLES["raw"], STYLES["jpeg"]):
+            style(recorder, shot, shot.stamp)
+    recorder.close()
+    sequence = open_source(tmp_path / "all", Reading(camera=CAMERA))
+    assert isinstance(sequence, BagSequence) and [topic.name for topic in sequence._topics] == [COLOR, DEPTH]
+
+
+def test_a_camera_info_of_zeros_is_none(tmp_path):
+    """Some drivers send some before they know better, and some never do."""
+    zeros = replace(CAMERA, fx=0.0, fy=0.0, cx=0.0, cy=0.0)
+    for name, cameras in (("late", [zeros, CAMERA]), ("never", [zeros, zeros])):
+        recorder = Recorder(tmp_path / name, "mcap")
+        for stamp, camera in zip((1.0, 1.1), cameras, strict=True):
+            recorder.image(COLOR, stamp, BGRS[0], "bgr8")
+            recorder.image(DEPTH, stamp, MILLIMETRES[0], "16UC1")
+            camera = SimpleNamespace(**vars(camera), matrix=camera.matrix if camera.fx else np.zeros((3, 3)))
+            recorder.info("/camera/color/camera_info", stamp, camera)  # pyright: ignore[reportArgumentType]
+        recorder.close()
+    assert open_source(tmp_path / "late").camera.fx == CAMERA.fx
+    with pytest.raises(GavoError, match=r"color/camera_info: all zero: nobody calibrated the camera: say --camera"):
+        open_source(tmp_path / "never")
+
+
+@pytest.mark.parametrize(
+    ("topic", "model", "lens"),
+    [
+        ("/direct/image", "plumb_bob", LENS),
+        ("/camera/image", "equidistant", replace(CAMERA, distortion=(0.0,) * 4, model="fisheye")),
+        ("/camera/image_rect_color", "plumb_bob", CAMERA),
+    ],
+)
+def test_the_lens_goes_by_the_model_and_by_whole_words_of_the_topic(tmp_path, topic, model, lens):
+    recorder = Recorder(tmp_path / "lens", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image(topic, stamp, BGRS[0], "bgr8")
+        recorder.image("/depth", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/".join([*topic.split("/")[:-1], "camera_info"]), stamp, LENS if lens is CAMERA else lens, model)
+    recorder.close()
+    sequence = open_source(tmp_path / "lens")
+    assert isinstance(sequence, BagSequence)
+    assert sequence.calibration.color == replace(lens, depth_scale=1000.0)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_depth_of_another_frame_without_a_camera_is_not_taken_for_registered(tmp_path, known):
+    recorder = Recorder(tmp_path / "apart", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/cam/color/image_raw", stamp, BGRS[0], "bgr8", frame="color_optical")
+        recorder.info("/cam/color/camera_info", stamp, CAMERA, frame="color_optical")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1", frame="depth_optical")
+    if known:
+        recorder.fixed(1.0, {("color_optical", "depth_optical"): ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])})
+    recorder.close()
+    if known:
+        assert len(open_source(tmp_path / "apart")) == 2
+        return
+    with pytest.raises(GavoError, match=r"no camera_info for /cam/depth/image_raw, .*'depth_optical'.*--camera"):
+        open_source(tmp_path / "apart")
+    assert len(open_source(tmp_path / "apart", Reading(camera=CAMERA))) == 2
+
+
+def test_one_camera_is_one_for_all_rounding(tmp_path):
+    recorder = Recorder(tmp_path / "rounded", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/cam/color/image_raw", stamp, BGRS[0], "bgr8")
+        recorder.info("/cam/color/camera_info", stamp, CAMERA)
+        recorder.image("/cam/depth_registered/image", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/cam/depth_registered/camera_info", stamp, replace(CAMERA, fx=131.0001), frame="other")
+    recorder.close()
+    sequence = open_source(tmp_path / "rounded")
+    assert isinstance(sequence, BagSequence) and sequence.calibration.depth is None
+
+
 def test_what_a_recording_lacks_is_said(tmp_path):
     recorder = Recorder(tmp_path / "two", "sqlite")
     recorder.image("/left", 1.0, GREYS[0], "mono8")
@@ -185,7 +272,10 @@ def test_what_a_recording_lacks_is_said(tmp_path):
     recorder.close()
     for reading, fault in (
         (Reading(), "colour images on /left, /right; there are images on /left, /right, /z: say --colour-topic"),
-        (Reading(color_topic="/left"), "no stamps of /left and /z within 0.02 s"),
+        (
+            Reading(color_topic="/left"),
+            "no stamps within 0.02 s of each other: /left goes from 1.000 to 1.000 and /z",
+        ),
         (Reading(color_topic="/left", max_difference=10.0), "no camera_info for /left: say --camera"),
     ):
         with pytest.raises(GavoError) as caught:
@@ -194,7 +284,7 @@ def test_what_a_recording_lacks_is_said(tmp_path):
     recorder = Recorder(tmp_path / "none.bag", "ros1")
     recorder.info("/camera_info", 1.0, CAMERA)
     recorder.close()
-    with pytest.raises(GavoError, match=r"none\.bag: no colour images; there are images on no topic"):
+    with pytest.raises(GavoError, match=r"none\.bag: holds no images: no topic of sensor_msgs/msg/Image"):
         open_source(tmp_path / "none.bag")
 
 
@@ -209,13 +299,24 @@ def test_messages_without_partners_are_counted(tmp_path):
     ]
 
 
-def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path):
+@pytest.mark.parametrize("stamp", [0.0, 77.0])
+def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
+    """Of both topics, even where one has stamps."""
     recorder = Recorder(tmp_path / "zero", "mcap")
     for received in (5.0, 5.1):
-        recorder.image(COLOR, 0.0, BGRS[0], "bgr8", received)
+        recorder.image(COLOR, stamp, BGRS[0], "bgr8", received)
         recorder.image(DEPTH, 0.0, MILLIMETRES[0], "16UC1", received)
     recorder.close()
     np.testing.assert_allclose(open_source(tmp_path / "zero", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
+
+
+def test_a_message_without_a_stamp_is_left_out(tmp_path):
+    recorder = Recorder(tmp_path / "one", "mcap")
+    for stamp in (5.0, 0.0, 5.1):
+        recorder.image(COLOR, stamp, BGRS[0], "bgr8", stamp or 5.05)
+        recorder.image(DEPTH, stamp, MILLIMETRES[0], "16UC1", stamp or 5.05)
+    recorder.close()
+    np.testing.assert_allclose(open_source(tmp_path / "one", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
 
 
 @pytest.mark.parametrize("kind", KINDS)

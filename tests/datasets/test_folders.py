@@ -1,12 +1,14 @@
 """Folders of every dataset: recognised by what lies in them, and read to the same frames."""
 
+import dataclasses
+import os
 import shutil
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
-from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, image, kinect, raw
+from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, MATRIX, METRES, POSES, image, kinect, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets import registry
@@ -99,12 +101,58 @@ def test_names_that_are_stamps_are_paired_by_time(folder, stems, seconds):
     for stem, second in zip(stems, seconds, strict=True):
         later = f"{second + 0.01:.6f}" if "." in stem else stem
         image(folder / f"depth/{later}.png", raw(METRES[0], 1000))
-    image(folder / "depth/1400000000.5.png" if "." in stems[0] else folder / "depth/1400000000000000.png", DEPTHS[0])
+    other_day = "1400000000.5" if "." in stems[0] else stems[0].replace("13", "14", 1)
+    image(folder / f"depth/{other_day}.png", DEPTHS[0])
     sequence = open_source(folder, Reading(camera=CAMERA))
     np.testing.assert_allclose(sequence.timestamps, seconds, atol=1e-6)
     assert isinstance(sequence, PlainFolder) and sequence.left_out == ("1 depth images: no colour image within 0.02 s",)
     delay = sequence[1].depth_timestamp
     assert delay is not None and abs(delay - seconds[1] - (0.01 if "." in stems[0] else 0.0)) < 1e-6
+
+
+def test_folders_may_be_written_large_and_hold_what_systems_leave(folder):
+    for i in range(4):
+        image(folder / f"RGB/{i}.PNG", GREYS[i])
+        image(folder / f"Depth/{i}.PNG", raw(METRES[i], 1000))
+        for kind in ("RGB", "Depth"):
+            (folder / f"{kind}/._{i}.png").write_bytes(b"\0\5\x16\7")
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    assert isinstance(sequence, PlainFolder) and len(sequence) == 4 and sequence.left_out == ()
+    np.testing.assert_array_equal(sequence[3].grey, GREYS[3])
+
+
+def test_colour_is_what_is_named_so(folder):
+    """Beside confidence and masks, whose names sort before and after."""
+    for i in range(2):
+        for kind, pixels in (("conf", GREYS[3]), ("rgb", GREYS[i]), ("mask", GREYS[3])):
+            image(folder / f"frame_{kind}_{i}.png", pixels)
+        image(folder / f"frame_depth_{i}.png", raw(METRES[i], 1000))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
+
+
+@pytest.mark.parametrize("layout", ["scannet", "seven_scenes", "open3d"])
+def test_two_images_of_one_number_are_refused(folder, layout):
+    color = next(wrote(folder, layout).rglob("*.color.png" if layout == "seven_scenes" else "*.jpg"))
+    image(color.with_suffix(".bmp"), np.zeros_like(GREYS[0]))
+    with pytest.raises(GavoError, match="has the same number as"):
+        open_source(folder)
+
+
+def test_truth_by_the_numbers_of_frames_has_their_times(folder):
+    wrote(folder, "plain")
+    (folder / "groundtruth.txt").write_text("".join(f"{i} 0 0 {i} 0 0 0 1\n" for i in range(4)))
+    for rate in (None, 10.0):
+        sequence = open_source(folder, Reading(rate=rate))
+        assert sequence.ground_truth is not None
+        np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps)
+
+
+def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
+    wrote(folder, "scannet")
+    np.savetxt(folder / "intrinsic/extrinsic_color.txt", np.eye(4) + 0.05 * np.eye(4, k=3))
+    with pytest.raises(GavoError, match=r"extrinsic_color\.txt: is not the identity: say --camera"):
+        open_source(folder)
 
 
 def test_a_published_camera_stands_in_for_a_file(folder):
@@ -118,12 +166,59 @@ def test_a_published_camera_stands_in_for_a_file(folder):
     assert open_source(folder).camera == Camera(585, 585, 320, 240, 640, 480, depth_scale=1000)
 
 
+def sens(color: Camera, depth: Camera, shift: float = 0.0) -> str:
+    """The info.txt of a scan."""
+    lines = ["m_versionNumber = 4", f"m_depthShift = {color.depth_scale:g}"]
+    for kind, camera in (("Color", color), ("Depth", depth)):
+        matrix, pose = np.eye(4), np.eye(4)
+        matrix[:3, :3], pose[0, 3] = camera.matrix, shift
+        lines += [f"m_{kind.lower()}Width = {camera.width}", f"m_{kind.lower()}Height = {camera.height}"]
+        for what, numbers in (("Intrinsic", matrix), ("Extrinsic", pose)):
+            lines.append(f"m_calibration{kind}{what} = {' '.join(map(str, numbers.ravel()))} ")
+    return "\n".join(lines) + "\n"
+
+
+def test_an_info_of_a_scan_has_the_cameras(folder):
+    """As BundleFusion and 3RScan have it, whose frames are named as those of 7-Scenes."""
+    wrote(folder, "seven_scenes")
+    (folder / "camera-intrinsics.txt").unlink()
+    mine = Camera(130.0, 130.5, 80.0, 60.0, 160, 120, depth_scale=1000.0)
+    (folder / "info.txt").write_text(sens(mine, dataclasses.replace(mine, fx=130.2)))
+    sequence = open_source(folder)
+    assert isinstance(sequence, SevenScenes) and sequence.calibration.color == mine
+    assert sequence.calibration.depth is None
+    (folder / "info.txt").write_text(sens(mine, dataclasses.replace(mine, fx=140.0)))
+    other = open_source(folder)
+    assert isinstance(other, SevenScenes) and other.calibration.depth is not None
+    assert other.calibration.depth.fx == 140 and other[0].depth.any()
+    for text, fault in (
+        (sens(mine, mine, 0.03), "Extrinsic: not the identity"),
+        (sens(mine, mine).replace("m_depthWidth", "m_width"), "m_depthWidth"),
+        (sens(mine, mine)[:-150], "info.txt of a scan"),
+    ):
+        (folder / "info.txt").write_text(text)
+        with pytest.raises(GavoError, match=fault):
+            open_source(folder)
+
+
 def test_the_folders_name_may_say_the_camera(tmp_path):
     """A benchmark's images without its lists."""
     for i in range(2):
         image(tmp_path / f"fr3_walk/rgb/{i}.png", np.zeros((480, 640), np.uint8))
         image(tmp_path / f"fr3_walk/depth/{i}.png", np.full((480, 640), 9000, np.uint16))
     assert open_source(tmp_path / "fr3_walk").camera == Camera.preset("fr3").rectified()
+
+
+def test_sun3d_counts_eight_to_a_millimetre(folder):
+    """And names its images by number and microseconds."""
+    for i in range(4):
+        name = f"{i + 1:07}-{33333 * i:012}"
+        image(folder / f"image/{name}.jpg", GREYS[i])
+        image(folder / f"depth/{name}.png", 8 * kinect(np.geomspace(0.8, 3.0, 120 * 160).reshape(120, 160), 1000))
+    np.savetxt(folder / "intrinsics.txt", MATRIX)
+    sequence = open_part(str(folder))
+    assert sequence.camera.depth_scale == 8000 and sequence.camera.fx == CAMERA.fx
+    np.testing.assert_allclose(sequence.timestamps, np.arange(4) * 0.033333, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0])
@@ -205,9 +300,23 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
         open_source(tmp_path)
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
-    LAYOUTS["replica"][1](tmp_path / "room0")
-    with pytest.raises(GavoError, match=r"a folder of 1 sources \(room0\), of which one is to be named"):
+    (tmp_path / "walk.bag").write_bytes(b"")
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of walk\.bag"):
         open_source(tmp_path)
+    (tmp_path / "walk.bag").unlink()
+    LAYOUTS["replica"][1](tmp_path / "room0")
+    with pytest.raises(GavoError, match=r"traj\.txt: a file of a source, whose folder is to be named: .*room0$"):
+        open_source(tmp_path / "room0/traj.txt")
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of room0"):
+        open_source(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_is_no_recording(tmp_path):
+    """To open it would wait for ever."""
+    os.mkfifo(tmp_path / "x.bag")
+    with pytest.raises(GavoError, match=r"x\.bag: a file of 0 bytes, not one of"):
+        open_source(tmp_path / "x.bag")
 
 
 class Lines:

@@ -143,12 +143,55 @@ def test_arrays_of_any_numbers_are_depth(tmp_path, color_file, dtype):
     assert np.abs(metres - (values if np.dtype(dtype).kind == "f" else values / 1000)).max() < 3e-3
 
 
+def test_wide_integers_of_16_bits_are_those(tmp_path):
+    """65535 among them is no reading, as it is in an image of 16 bits."""
+    wide = RAW.astype(np.int64)
+    wide[0, :3] = -1, 0, 65535
+    found = read_depth(write(tmp_path / "depth.npy", wide))
+    assert found.dtype == np.uint16 and found[0, :3].tolist() == [0, 0, 65535]
+    wide[0, 0] = 70000
+    assert read_depth(write(tmp_path / "depth.npy", wide)).dtype == np.float32
+
+
+EXR = {
+    "one": ({"V": METRES}, None),
+    "grey": ({"RGB": np.dstack([METRES] * 3)}, None),
+    "grey with NaN": ({"RGB": np.dstack([np.where(METRES > 2, np.nan, METRES)] * 3)}, None),
+    "beside colour": ({"RGBA": np.dstack([METRES * 0] * 4), "Z": METRES}, None),
+    "of a layer": ({**{f"View.Combined.{c}": METRES * 0 for c in "RGB"}, "View.Depth.Z": METRES}, None),
+    "of a word": ({"RGB": np.dstack([METRES * 0] * 3), "Depth.V": METRES}, None),
+    "colour": ({"RGB": np.dstack([METRES, METRES * 0, METRES])}, "an OpenEXR image of colour"),
+    "several": ({"U": METRES, "V": METRES}, "one has to be depth, named Z: found U, V"),
+}
+
+
+@pytest.mark.parametrize("name", EXR)
+def test_the_channel_of_depth_is_found_by_its_name(tmp_path, name):
+    channels, fault = EXR[name]
+    library, path = pytest.importorskip("OpenEXR"), tmp_path / "depth.exr"
+    library.File({}, {key: np.ascontiguousarray(pixels) for key, pixels in channels.items()}).write(str(path))
+    if fault is None:
+        found = read_depth(path)
+        np.testing.assert_array_equal(found, np.where(np.isnan(found), found, METRES))
+        return
+    with pytest.raises(FrameError, match=fault):
+        read_depth(path)
+
+
 def test_the_unit_of_floats_can_be_said(tmp_path, color_file):
     inches = write(tmp_path / "depth.npy", METRES / np.float32(0.0254))
     frame, camera = read(color_file, inches, reading=Reading(depth_scale=1 / 0.0254))
     assert np.abs(frame.depth / camera.depth_scale - METRES).max() < 1e-3
     frame, camera = read(color_file, inches, replace(CAMERA, depth_scale=1 / 0.0254))
     assert np.abs(frame.depth / camera.depth_scale - METRES).max() < 1e-3
+
+
+def test_floats_beside_whole_numbers_are_in_no_common_unit(tmp_path, color_file):
+    pair = [(color_file, write(tmp_path / name, raw)) for name, raw in (("a.npy", METRES), ("b.png", RAW))]
+    with pytest.raises(GavoError, match=r"b\.png: depth in whole numbers, and in floats in .*a\.npy.*--depth-scale"):
+        open_pair(pair, Calibration(CAMERA))[0]
+    pair[1] = color_file, write(tmp_path / "none.png", np.zeros_like(RAW))
+    assert open_pair(pair, Calibration(CAMERA))[0].depth.any()
 
 
 def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
@@ -220,6 +263,13 @@ def test_arrays_of_other_things_are_refused(tmp_path):
         np.save(tmp_path / "depth.npy", array)
         with pytest.raises(FrameError, match=r"depth\.npy: not an image"):
             read_depth(tmp_path / "depth.npy")
+
+
+def test_grey_arrays_may_have_a_third_axis(tmp_path):
+    np.testing.assert_array_equal(read_color(write(tmp_path / "grey.npy", BGR[..., :1])), np.dstack([BGR[..., 0]] * 3))
+    for shape in ((3, 48, 64), (48, 64, 2)):
+        with pytest.raises(FrameError, match=f"found {shape[-1]} channels of 8 bits"):
+            read_color(write(tmp_path / "odd.npy", np.zeros(shape, np.uint8)))
 
 
 def test_openexr_says_what_to_install(tmp_path, monkeypatch):

@@ -147,6 +147,49 @@ def test_a_few_stamps_out_of_order_are_in_doubt(folder, kind, stamps, in_doubt):
     assert np.all(np.diff(sequence.timestamps) >= 0)
 
 
+COUNTS = {
+    "nanoseconds": (1305031102175304000, 33333333, 1305031102.175304, 30.0),
+    "milliseconds": (1305031102175, 33, 1305031102.175, 30.3),
+    "microseconds since switched on": (123456789, 33333, 123.456789, 30.0),
+    "numbers of frames": (7, 1, 7 / 30, 30.0),
+    "whole seconds": (1305031102, 1, 1305031102.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("form", ["two lists", "associate.txt"])
+def test_stamps_that_are_whole_numbers_count_what_gives_a_cameras_rate(folder, name, form):
+    first, step, seconds, rate = COUNTS[name]
+    stamps = [first + i * step for i in range(6)]
+    late = 400 if step > 1000 else 0  # of depth, in the same unit
+    if form == "two lists":
+        for kind, off in (("rgb", 0), ("depth", late)):
+            rows = [f"{stamp + off} {kind}/{i}.png" for i, stamp in enumerate(stamps)]
+            (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
+    else:
+        for kind in ("rgb", "depth"):
+            (folder / f"{kind}.txt").unlink()
+        rows = [f"{stamp + late} depth/{i}.png {stamp} rgb/{i}.png" for i, stamp in enumerate(stamps)]
+        (folder / form).write_text("\n".join(rows) + "\n")
+    (folder / "groundtruth.txt").write_text("\n".join(f"{stamp} 0 0 0 0 0 0 1" for stamp in stamps[:2]) + "\n")
+    if name == "nanoseconds":
+        (folder / "groundtruth.txt").unlink()  # which no TUM file of poses has
+    sequence = TumSequence(folder, CAMERA)
+    np.testing.assert_allclose(sequence.timestamps[0], seconds, atol=1e-6)
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / rate, rtol=1e-3)
+    if sequence.ground_truth is not None:
+        np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps[:2], atol=1e-6)
+    if form == "two lists" and name == "numbers of frames":
+        np.testing.assert_allclose(np.diff(TumSequence(folder, CAMERA, rate=10.0).timestamps), 0.1)
+
+
+def test_milliseconds_with_decimals_are_refused(folder):
+    for kind in ("rgb", "depth"):
+        edit(folder / f"{kind}.txt", "\n100.", "\n1305031102175.")
+    with pytest.raises(GavoError, match=r"rgb\.txt:2: not a time stamp: 1305031102175.*say it in seconds"):
+        TumSequence(folder, CAMERA)
+
+
 def test_a_missing_ground_truth_is_none(folder):
     (folder / "groundtruth.txt").unlink()
     assert TumSequence(folder, CAMERA).ground_truth is None

@@ -42,6 +42,11 @@ def sequences(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequences")
     for sequence in ("rgbd_dataset_freiburg1_xyz", "my_sequence", "data/rgbd_dataset_freiburg1_desk"):
         gavo.write_tum(gavo.SyntheticSequence(FRAMES, camera=CAMERA, speed=0.2), folder / sequence)
+    own = folder / "my_sequence"  # of two folders with numbers, as the tutorial has it
+    for kind in ("rgb", "depth"):
+        (own / f"{kind}.txt").unlink()
+        for number, file in enumerate(sorted((own / kind).iterdir())):
+            file.rename(own / kind / f"{number:04}.png")
     return folder
 
 

@@ -1,0 +1,155 @@
+"""What the names of image files say: which number tells the frames apart, and whether it is a time."""
+
+import re
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gavo_jax.datasets.files import unpaired
+from gavo_jax.errors import GavoError
+
+UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Seconds of what whole numbers may count."""
+
+EPOCH = (946684800.0, 4102444800.0)
+"""Seconds since 1970 of the years 2000 to 2100, from which stamps of a clock are."""
+
+INTERVALS = (2e-3, 10.0)
+"""Seconds between two frames."""
+
+DEVICE_INTERVALS = (2e-3, 1.0)
+"""The same, where nothing but the steps speaks for a unit: of stamps since a device was switched on."""
+
+MILLISECONDS, JITTER = (5, 200), 2
+"""Steps between whole numbers that may be milliseconds, if they differ, and by no more than so much."""
+
+MOST_DIGITS = 18
+"""What is longer is no number of a frame."""
+
+DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)(?:[.,_-](\d{3,9}))?$"
+)
+"""Day and time of day, to the second or finer."""
+
+REDWOOD = re.compile(r"\d{6,7}-(\d{12})$")
+"""A number and microseconds, as Redwood and SUN3D have it."""
+
+
+class Found(NamedTuple):
+    """Image files of a folder by the numbers in their names."""
+
+    color: dict[int, Path]
+    depth: dict[int, Path]
+
+    def unpaired(self, frames: int) -> list[str]:
+        """What makes no frame, a line each."""
+        return unpaired((len(self.color), len(self.depth)), frames, "of the same number")
+
+
+def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
+    """Images in the order of their names; hidden files, which some systems leave beside each file, are none."""
+    return sorted(file for file in files if file.suffix.lower() in suffixes and not file.name.startswith("."))
+
+
+def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
+    """Images by the number that tells them apart: the last in their names, or one before it that more frames share.
+
+    Names without a number are left out.
+
+    Raises:
+        GavoError: no number does, or it goes another way than the names; the message names a file.
+    """
+    both = [[file for file in files if _numbers(file)] for files in (color, depth)]
+    places = range(1, 1 + min((len(_numbers(file)) for files in both for file in files), default=0))
+    found = [Found(*({_numbers(file)[-place]: file for file in files} for files in both)) for place in places]
+    usable = [one for one in found if all(map(_is_in_order, one, both))]
+    if found and not usable:
+        odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
+        raise GavoError(next(filter(None, map(_fault, both)), odd))
+    return max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
+
+
+def _numbers(file: Path) -> list[int]:
+    digits = re.findall(r"\d+", file.name[: -len(file.suffix)])
+    return [int(some) for some in digits if len(some) <= MOST_DIGITS]
+
+
+def _is_in_order(images: dict[int, Path], files: Sequence[Path]) -> bool:
+    """Whether every file has a number of its own, which grows with all numbers of the names."""
+    return len(images) == len(files) and [images[n] for n in sorted(images)] == sorted(files, key=_numbers)
+
+
+def _fault(files: Sequence[Path]) -> str | None:
+    """Two files of which nothing tells which comes first."""
+    first: dict[tuple[int, ...], Path] = {}
+    for file in files:
+        if (other := first.setdefault(tuple(_numbers(file)), file)) is not file:
+            return f"{file}: has the same number as {other.name}: leave one of them there"
+    return None
+
+
+def stamps(names: Sequence[str]) -> list[float] | None:
+    """Seconds, where all names are stamps; None where they are not.
+
+    Stamps are seconds with decimals, day and time, or whole numbers: since 1970 in s, ms, µs or ns, or since a device
+    was switched on in ms, µs or ns. Nothing else may change from name to name, and the rate has to be that of a camera.
+    """
+    return next((found for read in (_redwood, _dates, _decimals, _counts) if (found := read(names))), None)
+
+
+def _redwood(names: Sequence[str]) -> list[float] | None:
+    found = [REDWOOD.search(name) for name in names]
+    return [1e-6 * int(match[1]) for match in found if match] if all(found) else None
+
+
+def _dates(names: Sequence[str]) -> list[float] | None:
+    found = [match for name in names if (match := DATE.search(name))]
+    try:
+        seconds = [
+            datetime(*(int(part) for part in match.groups()[:6]), tzinfo=UTC).timestamp() + float(f"0.{match[7] or 0}")
+            for match in found
+        ]
+    except ValueError:
+        return None
+    return seconds if len(found) == len(names) and _is_between(seconds, INTERVALS) else None
+
+
+def _decimals(names: Sequence[str]) -> list[float] | None:
+    found = _at_the_end(names, r"\d+\.\d+")
+    seconds = [float(number) for number in found]
+    return seconds if found and _is_between(seconds, INTERVALS) else None
+
+
+def _counts(names: Sequence[str]) -> list[float] | None:
+    counts = [int(number) for number in _at_the_end(names, r"\d+")]
+    unit = unit_of(counts)
+    return None if unit is None else [unit * count for count in counts]
+
+
+def unit_of(counts: Sequence[float]) -> float | None:
+    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
+    if not counts:
+        return None
+    of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
+    usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]
+    device = [unit for unit in UNITS[2:] if _is_between([unit * count for count in counts], DEVICE_INTERVALS)]
+    steps = np.diff(sorted(counts))
+    if len(steps) > 1 and MILLISECONDS[0] <= steps.min() < steps.max() <= min(steps.min() + JITTER, MILLISECONDS[1]):
+        device.append(UNITS[1])
+    return next(iter((*usual, *device, *of_clock)), None)
+
+
+def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:
+    """What ends the names, where all else in them is the same; else nothing."""
+    found = [re.fullmatch(rf"(.*?)({pattern})", name) for name in names]
+    heads = {match[1] for match in found if match}
+    return [match[2] for match in found if match] if all(found) and len(heads) == 1 else []
+
+
+def _is_between(seconds: Sequence[float], bounds: tuple[float, float]) -> bool:
+    """Whether most stamps lie so far apart."""
+    steps = np.diff(sorted(set(seconds)))
+    return not len(steps) or bool(bounds[0] <= np.percentile(steps, 50, method="lower") <= bounds[1])

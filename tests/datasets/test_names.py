@@ -1,0 +1,101 @@
+"""Names as cameras and people give them: which number counts the frames, and what is a time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gavo_jax.datasets.names import by_number, images_among, stamps
+from gavo_jax.errors import GavoError
+
+STEP = 33.333e-3
+TIMES = np.arange(6) * STEP
+CLOCK = 1305031102.175304
+
+
+def at(seconds: float, unit: float) -> list[str]:
+    return [str(round((seconds + time) / unit)) for time in TIMES]
+
+
+STAMPS = {
+    "seconds": [f"rgb_{CLOCK + time:.6f}" for time in TIMES],
+    "milliseconds": at(CLOCK, 1e-3),
+    "microseconds": at(CLOCK, 1e-6),
+    "nanoseconds": at(CLOCK, 1e-9),
+    "milliseconds since switched on": at(123.456, 1e-3),
+    "microseconds since switched on": at(123.456, 1e-6),
+    "nanoseconds since switched on": [f"frame-{name}" for name in at(123.456, 1e-9)],
+    "nanoseconds since two days": at(2e5, 1e-9),
+    "nanoseconds since twenty days": at(1.7e6, 1e-9),
+    "from zero": at(0.0, 1e-6),
+    "Redwood": [f"{i + 1:07}-{round(1e6 * time):012}" for i, time in enumerate(TIMES)],
+    "a day": [f"cam 2024-05-01 12-30-59.{900 + round(1e3 * time):03}" for time in TIMES[:3]],
+    "over a minute": ["20240501T123059,900", "20240501T123059,933", "20240501T123059,967", "20240501T123100,000"],
+}
+
+
+@pytest.mark.parametrize("name", STAMPS)
+def test_stamps_of_every_unit_have_the_cameras_rate(name):
+    found = stamps(STAMPS[name])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), STEP, atol=0.7e-3)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["0", "1", "2"],
+        ["000000", "000040", "000080", "000120"],
+        ["1", "40", "55", "200"],
+        ["scan1.0001", "scan1.0002", "scan1.0003"],
+        ["20240501_123059_000", "20240501_123059_001"],
+        ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
+        ["20249901123059", "20249901123060"],
+        ["a", "b"],
+    ],
+)
+def test_what_is_no_stamp_is_not_taken_for_one(names):
+    assert stamps(names) is None
+
+
+def test_a_stray_file_changes_no_unit():
+    found = stamps([*STAMPS["microseconds"], "1400000000000000"])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found)[:5], STEP, atol=1e-5)
+
+
+def paths(*names: str) -> list[Path]:
+    return [Path("clip") / name for name in names]
+
+
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [
+        (paths("9.jpg", "10.jpg"), paths("9.png", "10.png")),
+        (paths("rgb_9_640x480.jpg", "rgb_10_640x480.jpg"), paths("depth_9_320x240.png", "depth_10_320x240.png")),
+        (paths("9 (1).JPG", "10 (1).JPG"), paths("0009_v2.png", "0010_v2.png")),
+        (paths("9-000.jpg", "10-033.jpg"), paths("9-005.png", "10-041.png")),
+        (paths("9.jpg", "10.jpg", "cover.jpg"), paths("9.png", "10.png", "legend.png")),
+    ],
+)
+def test_the_number_that_tells_frames_apart_counts(color, depth):
+    found = by_number(color, depth)
+    assert list(found.color) == list(found.depth) == [9, 10]
+
+
+@pytest.mark.parametrize(
+    ("names", "fault"),
+    [
+        (("1.jpg", "2.jpg", "1.png"), r"clip/1\.png: has the same number as 1\.jpg"),
+        (("rgb_1.png", "seg_1.png"), r"clip/seg_1\.png: has the same number as rgb_1\.png"),
+        (("12-30-59.900.png", "12-30-59.933.png", "12-31-00.000.png"), "more than one number"),
+    ],
+)
+def test_names_that_leave_the_order_open_are_refused(names, fault):
+    with pytest.raises(GavoError, match=fault):
+        by_number(paths(*names), paths("1.png", "2.png"))
+
+
+def test_hidden_files_and_others_are_no_images():
+    files = paths("._1.png", ".hidden.png", "Thumbs.db", "2.PNG", "1.png")
+    assert images_among(files, (".png",)) == paths("1.png", "2.PNG")
