@@ -4,7 +4,8 @@ Each pixel has a belief between -1 (static) and +1 (moving on its own). It is ca
 lies on, moved by what the new image says, and smoothed among neighbours that no depth edge separates.
 
 A body that stops looks like the scene, and takes the camera along when it starts again. So a surface on which a body
-was seen stays suspected for about half a second, and so does what of it comes into view, unless it is at rest beyond doubt.
+was seen stays suspected for about half a second, and so does what of it comes into view, unless it is at rest beyond
+doubt.
 """
 
 from functools import partial
