@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.bodies.belief import Belief, suspect
-from gavo_jax.bodies.consensus import Opinion, dissent_of
+from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
@@ -33,7 +33,7 @@ MAJORITY = 0.5
 """Support from which on a motion is taken for the camera's although its points agree badly."""
 ROUNDS = 3
 """Of searching without what moves by the last round's motion, at most."""
-RELUCTANT = 1.6
+RELUCTANT = 2.0
 """Ratio of dissents from which on the area asks for another motion,"""
 BETTER = 1.2
 """and from which on one that was found is taken."""
@@ -107,7 +107,6 @@ class BodyAware:
         if look.opinion is not None:
             clock = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
             jax.block_until_ready(self._without(state.tracker, look.opinion, clock))
-            jax.block_until_ready(dissent_of(look.opinion, np.eye(4, dtype=np.float32)))
         jax.block_until_ready(look)
         return seconds + time.perf_counter() - start
 
@@ -168,10 +167,12 @@ class BodyAware:
             if opinion is None or not float(opinion.dissent) > RELUCTANT * float(opinion.least):
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
-            dissent = dissent_of(opinion, np.asarray(again.result.target_T_reference, np.float32))
-            if not (again.usable and BETTER * float(dissent) < float(opinion.dissent)):
+            if not again.usable:
                 break
-            attempt, look = again, self._look(state, again)
+            other = self._look(state, again)
+            if other.opinion is None or BETTER * float(other.opinion.dissent) > float(opinion.dissent):
+                break
+            attempt, look = again, other
         return attempt, look
 
     def _look(self, state: AwareState, attempt: Attempt) -> Look:

@@ -17,7 +17,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.levels import image_plane
 from gavo_jax.image.shutter import Slopes
 from gavo_jax.objective.derivatives import pixel_jacobian
-from gavo_jax.se3 import exp, log, rigid_inverse
+from gavo_jax.se3 import exp
 
 STRIDE = 2
 """Every so many pixels along either side are asked;"""
@@ -51,12 +51,8 @@ class Blocks(NamedTuple):
 class Opinion(NamedTuple):
     """What the area says of a motion."""
 
-    asked: Float[Array, "4 4"]
-    """That motion,"""
-    blocks: Blocks
-    """the blocks at it,"""
     dissent: Float[Array, ""]
-    """and what the middle one of the blocks would gain by a motion of its own."""
+    """What the middle one of the blocks would gain by a motion of its own."""
     least: Float[Array, ""]
     """The same with the motion below."""
     target_T_reference: Float[Array, "4 4"]
@@ -101,20 +97,11 @@ def ask_area(
     gains = gain_of_its_own(blocks, delta)
     least = _middle(gains, blocks.credit)
     return Opinion(
-        target_T_here,
-        blocks,
         middle_gain(nothing),
         least,
         exp(delta) @ target_T_here,
         _pixels_of(gains > DISSENT * least, camera),
     )
-
-
-@jax.jit
-def dissent_of(opinion: Opinion, motion: Float[Array, "4 4"]) -> Float[Array, ""]:
-    """As `Opinion.dissent`, of another motion than the one that was asked about."""
-    blocks = opinion.blocks
-    return _middle(gain_of_its_own(blocks, log(motion @ rigid_inverse(opinion.asked))), blocks.credit)
 
 
 def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
