@@ -1,4 +1,7 @@
-"""Recordings of ROS: bags of ROS 1, and of ROS 2 as SQLite or MCAP, read as a stream through the library rosbags."""
+"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because topics, clocks and streams share a reader of rosbags.
+
+They are read as a stream.
+"""
 
 import contextlib
 import io
