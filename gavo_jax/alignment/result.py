@@ -48,6 +48,7 @@ class Alignment(NamedTuple):
     def undetermined(self) -> str:
         """Of a pair that is `LOW_TEXTURE` the directions of motion that the images leave open, in the axes of the
         reference camera: some of ξ's six, as words, joined by "with" where only their mixture is open. Else empty.
+        An axis is named for its share of what is open, or where that share alone exceeds the tolerable deviation.
         """
         covariance = np.asarray(self.covariance, np.float64)
         if AlignmentStatus.LOW_TEXTURE not in self.statuses or not np.isfinite(covariance).all():
@@ -57,7 +58,8 @@ class Alignment(NamedTuple):
         is_open = values > min(1.0, values[-1])
         is_open[-1] = True
         share = np.sum(vectors[:, is_open] ** 2, axis=1)
-        main = [axis for axis in np.argsort(-share, kind="stable") if share[axis] > share.max() / 16]
+        variance = np.sum(values[is_open] * vectors[:, is_open] ** 2, axis=1)
+        main = [axis for axis in np.argsort(-share, kind="stable") if share[axis] > share.max() / 16 or variance[axis] > 1]
         words = (f"{('translation along', 'rotation about')[axis // 3]} {'xyz'[axis % 3]}" for axis in main)
         return (" with " if np.sum(is_open) == 1 else ", ").join(words)
 
