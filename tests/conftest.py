@@ -1,6 +1,7 @@
 """Fixtures and settings shared by all tests."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,9 @@ from pathlib import Path
 # JAX reads this when it is imported, so it comes first
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the package sets it where it is the first to import JAX
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of what a shell starts in the background; tests send it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # XLA's older way to write out a program takes little more than half the time, and the program runs a quarter slower:
 # the right choice where most time goes into compilation. `XLA_FLAGS= python -m pytest` tests what users run.
