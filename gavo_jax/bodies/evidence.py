@@ -16,7 +16,7 @@ from gavo_jax.image.sampling import GreySample, Target, look_up, sample_depth, s
 from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
-from gavo_jax.objective.estimates import estimate_brightness
+from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightness
 
 WIDEST = 160
 """Pixels: the finest level searched that is not wider is the one that bodies are seen on."""
@@ -155,6 +155,8 @@ def compare(
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)
     few: Residuals = jax.tree.map(lambda leaf: leaf[:, :: max(1, FEW // stride**2)], r)
+    # a regression on what shows other surfaces would take contrast out, and the dark parts of the scene would change
+    few = few._replace(inside=few.inside * (jnp.abs(few.depth) < LARGE_DEPTH_RESIDUAL))
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
     r = r._replace(grey=r.grey_sample.value - brightness.seen(seen_grey))

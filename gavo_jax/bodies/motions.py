@@ -16,7 +16,8 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
-from gavo_jax.odometry.tracking import Clock
+from gavo_jax.objective.points import Reference, unsettle_reference
+from gavo_jax.odometry.tracking import Clock, TrackerState
 
 if TYPE_CHECKING:
     from gavo_jax.bodies.aligner import BodyAware
@@ -64,8 +65,8 @@ def find_motions(
 def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: Roll, number: int) -> Alignment:
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
-    whole = state.whole
-    assert whole is not None
+    assert state.whole is not None
+    whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.motion) else state.whole
     tracker = state.tracker._replace(
         previous=whole,
         keyframe=whole,
@@ -74,6 +75,12 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
         usual=Usual.unknown(),
     )
     return aware.search.align(aware.retina.without(tracker, before.labels != number), frame, clock).result
+
+
+def _unsettled(whole: Reference, tracker: TrackerState, retina: Retina) -> Reference:
+    """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
+    twist = tracker.motion * (retina.full.readout / tracker.seconds)
+    return unsettle_reference(whole, twist, retina.planes)
 
 
 def _inverse_depth(attempt: Attempt, retina: Retina) -> Float64[np.ndarray, "h w"]:

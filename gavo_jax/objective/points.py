@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
-from gavo_jax.camera import Camera, to_ray
-from gavo_jax.image.levels import Levels
+from gavo_jax.camera import Camera, to_pixels, to_ray
+from gavo_jax.image.levels import ImagePlane, Levels
 from gavo_jax.image.pyramid import NO_PIXEL, Pyramid, make_atlas
 from gavo_jax.image.sampling import inverse_depth_slopes
 from gavo_jax.image.shutter import row_time
@@ -106,6 +106,23 @@ def settle_reference(reference: Reference, twist: Float[Array, " 6"]) -> Referen
         1.0 + back * (w[0] * y - w[1] * x + v[2] * q),
     )
     return reference._replace(points=_rays(settled, q), row_time=jnp.zeros_like(reference.row_time))
+
+
+@jax.jit
+def unsettle_reference(reference: Reference, twist: Float[Array, " 6"], planes: ImagePlane) -> Reference:
+    """The points where their rows saw them, after `settle_reference` by a twist.
+
+    Args:
+        reference: Settled, [L, N].
+        twist: That it was settled by.
+        planes: Of its levels, [L].
+    """
+    plane = jax.tree.map(lambda leaf: leaf[:, None], planes)
+    seen = reference
+    for _ in range(2):  # the row that a point was seen in is only known from where it was seen
+        row = row_time(to_pixels(plane, seen.points.x, seen.points.y)[1], plane)
+        seen = settle_reference(reference._replace(row_time=row), -twist)._replace(row_time=row)
+    return seen
 
 
 def _rays(coordinates: tuple[jax.Array, jax.Array, jax.Array], q: jax.Array) -> Points:

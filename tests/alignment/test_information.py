@@ -34,14 +34,17 @@ WALLS: dict[str, tuple[Texture, set[str]]] = {
 }
 
 
-def photograph(texture: Texture, slide: np.ndarray, noise: float, kinect: bool, seed: int) -> tuple[Any, Any]:
-    """Grey and depth of a wall before the camera, with a sensor's noise."""
+def photograph(
+    texture: Texture, slide: np.ndarray, noise: float, kinect: bool, seed: int, slope: float = 0.0
+) -> tuple[Any, Any]:
+    """Grey and depth of a wall before the camera, further off to the right by a slope, with a sensor's noise."""
     generator = np.random.default_rng(seed)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x = (u - CAMERA.cx) / CAMERA.fx * DISTANCE + slide[0]
-    y = (v - CAMERA.cy) / CAMERA.fy * DISTANCE + slide[1]
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    z = (DISTANCE + slope * slide[0]) / (1 - slope * x)
+    x, y = x * z + slide[0], y * z + slide[1]
     grey = np.clip(np.round(texture(x, y) + noise * generator.normal(size=x.shape)), 0, 255).astype(np.uint8)
-    inverse_depth = np.full(x.shape, 1 / DISTANCE)
+    inverse_depth = 1 / z
     if kinect:  # steps of an eighth of a pixel of disparity, and a noise of half of one
         inverse_depth = 0.00287 * np.round(inverse_depth / 0.00287 + 0.5 * generator.normal(size=x.shape))
     return grey, np.round(CAMERA.depth_scale / inverse_depth).astype(np.uint16)
@@ -63,6 +66,14 @@ def test_what_a_wall_leaves_open_is_named(name: str, noise: float, kinect: bool)
     assert all(direction in result.undetermined for direction in left_open)
     variances = np.linalg.eigvalsh(np.asarray(result.covariance, float))
     assert variances[-1] > 0.2 and variances[0] > -1e-6 * variances[-1]  # half a metre; single precision
+
+
+def test_a_direction_is_named_by_every_axis_that_it_is_open_along() -> None:
+    """The bands of a slanted wall run away from the camera as well, by a fifth of their way."""
+    texture = WALLS["oblique bands"][0]
+    before, after = (photograph(texture, step * SLIDE, 1.0, False, step, slope=0.3) for step in (0, 1))
+    named = align(before, after, CAMERA, GaussNewton()).undetermined
+    assert {part.removeprefix("translation along ") for part in named.split(" with ")} == {"x", "y", "z"}
 
 
 @pytest.mark.parametrize("kinect", [False, True])

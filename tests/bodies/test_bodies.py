@@ -16,7 +16,7 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.aligner import SUSPECTED
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
-from gavo_jax.bodies.evidence import Evidence, View, view_of
+from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
@@ -125,6 +125,24 @@ def test_a_body_is_found_where_it_is() -> None:
         assert set(roll.numbers) == {0, 1}
 
 
+def test_a_large_body_leaves_the_brightness_of_the_rest_alone() -> None:
+    """A regression on what it covers took contrast out, so that a dark screen seemed to change, and became a body."""
+    retina = Retina(CAMERA, TRACKED)
+    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
+    here = np.array(frame.grey)
+    here[:60] = 6  # a screen without texture
+    before, depth = here.copy(), np.array(frame.depth)
+    noise = np.random.default_rng(0).integers(0, 255, (15, 18)).astype(np.uint8)
+    before[60:, 60:] = cv2.resize(noise, (CAMERA.width - 60, CAMERA.height - 60), interpolation=cv2.INTER_CUBIC)
+    nearer = depth.copy()
+    nearer[60:, 60:] = 0.5 * CAMERA.depth_scale
+    now, others = view(here, depth, retina.levels), view(before, nearer, retina.levels)
+    others = jax.tree.map(lambda leaf: leaf[None], others)
+    seen = gather_evidence(now, others, jnp.eye(4)[None], retina.camera)
+    screen = np.asarray(seen.grey[0, 4:24, 4:-4])
+    assert np.median(screen) < 0.5
+
+
 def test_what_is_at_rest_supports_the_motion() -> None:
     moving, still = beliefs(Carded())[-1], beliefs(Carded(moves=False))[-1]
     assert float(still.contradicted) == 0 and float(still.support) > 0.9
@@ -148,6 +166,24 @@ def test_a_motion_in_the_camera_is_one_in_the_world() -> None:
     assert all(len(row) == len(BODY_COLUMNS) for row in rows)
     assert rows[0][0] == "0.100000" and rows[0][-1] == "ok" and rows[1][-1] == "seen"
     assert float(rows[0][BODY_COLUMNS.index("dy")]) == 0.05 and np.isnan(float(rows[1][BODY_COLUMNS.index("dx")]))
+
+
+def test_a_bodys_motion_is_its_own_under_a_rolling_shutter() -> None:
+    """Rows see a body go its own way: moved to the frame's moment along the camera's, it was off by 8 mm and 1.3°."""
+    sequence = SyntheticSequence(14, camera=replace(CAMERA, readout=0.03), bodies=1)
+    world_T_first, truth = sequence.ground_truth.world_T_camera[0], sequence.bodies_truth[0].world_T_part[0]
+    apart, turned = [], []
+    for step in track(sequence, TRACKED):
+        for body in step.bodies[:1]:
+            if not np.isfinite(body.displacement).all():
+                continue
+            moved = truth[step.index] @ np.linalg.inv(truth[step.index - 1])
+            moved = np.linalg.inv(world_T_first) @ moved @ world_T_first
+            before = np.linalg.inv(moved) @ np.append(body.centroid, 1.0)
+            apart.append(np.linalg.norm(body.displacement - body.centroid + before[:3]))
+            turned.append(np.linalg.norm(cv2.Rodrigues(moved[:3, :3].T @ cv2.Rodrigues(body.rotation)[0])[0]))
+    assert len(apart) > 3
+    assert np.median(apart) < 0.002 and np.median(turned) < np.radians(0.3)
 
 
 def test_what_stands_still_is_part_of_the_scene() -> None:
