@@ -183,6 +183,8 @@ DEPTH_EDGE = 0.015
 """Relative step of inverse depth that hardly lets anything across,"""
 GREY_EDGE = 25.0
 """and step of grey, in grey levels, where depth is missing."""
+ALIKE, HALF_KNOWN = 0.3, 0.03
+"""Tie of neighbours without depth, and of two of which one has some: a body ends where its depth does."""
 
 
 def share_out(
@@ -238,7 +240,8 @@ def _links(grey: Float[Array, "h w"], q: Float[Array, "h w"]) -> tuple[Float[Arr
         both = (q > 0) & (after_q > 0)
         nearest = jnp.maximum(jnp.maximum(q, after_q), 1e-3)
         by_depth = jnp.exp(-(((q - after_q) / (DEPTH_EDGE * nearest + 0.003)) ** 2))
-        by_grey = jnp.where((q > 0) == (after_q > 0), 0.3, 0.03) * jnp.exp(-(((grey - after_grey) / GREY_EDGE) ** 2))
+        alike = jnp.where((q > 0) == (after_q > 0), ALIKE, HALF_KNOWN)
+        by_grey = alike * jnp.exp(-(((grey - after_grey) / GREY_EDGE) ** 2))
         place = jax.lax.broadcasted_iota(jnp.int32, q.shape, axis)
         return jnp.where(place < q.shape[axis] - 1, jnp.where(both, by_depth, by_grey) + 1e-3, 0.0)
 
