@@ -59,7 +59,8 @@ class Alignment(NamedTuple):
         is_open[-1] = True
         share = np.sum(vectors[:, is_open] ** 2, axis=1)
         variance = np.sum(values[is_open] * vectors[:, is_open] ** 2, axis=1)
-        main = [axis for axis in np.argsort(-share, kind="stable") if share[axis] > share.max() / 16 or variance[axis] > 1]
+        is_main = (share > share.max() / 16) | (variance > 1)
+        main = [axis for axis in np.argsort(-share, kind="stable") if is_main[axis]]
         words = (f"{('translation along', 'rotation about')[axis // 3]} {'xyz'[axis % 3]}" for axis in main)
         return (" with " if np.sum(is_open) == 1 else ", ").join(words)
 

@@ -14,9 +14,9 @@ from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
+from gavo_jax.objective.points import Reference, unsettle_reference
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
-from gavo_jax.objective.points import Reference, unsettle_reference
 from gavo_jax.odometry.tracking import Clock, TrackerState
 
 if TYPE_CHECKING:
