@@ -13,7 +13,7 @@ from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.image.settling import still
 from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
-from gavo_jax.mapping.keyframes import Keyframes
+from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
@@ -73,6 +73,12 @@ def test_images_are_bounded_and_the_likest_are_candidates():
     assert all(c.later.timestamp - c.earlier.timestamp >= 1.0 for c in found)
     numbers = sorted(c.earlier.number for c in found)
     assert all(b - a >= 3 for a, b in zip(numbers, numbers[1:], strict=False))
+
+
+def test_shifts_of_many_are_those_of_any_two():
+    poses = np.stack([exp(0.4 * xi) for xi in np.random.default_rng(0).normal(size=(8, 6))])
+    wanted = [[shift(inverse(a) @ b, 2.0) for b in poses] for a in poses]
+    np.testing.assert_allclose(shifts(poses, 2.0), wanted, atol=1e-7)
 
 
 def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:
