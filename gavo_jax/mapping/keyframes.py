@@ -9,12 +9,14 @@ from jaxtyping import Float32, Float64
 
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
+from gavo_jax.features import Features
 from gavo_jax.image.settling import Still, still
 from gavo_jax.mapping.motions import size
 from gavo_jax.trajectory import inverse
 
 MAX_IMAGES = 300
-"""Keyframes that keep their images, some 0.25 MB each at 640 x 480; of more the most redundant one loses them."""
+"""Keyframes that keep their images, and what was made of these: some 0.45 MB each at 640 x 480. Of more the most
+redundant one loses them, and keeps what the graph needs, some 2 kB."""
 SPACING = 0.15
 """Shift of the image, radians, after which a new keyframe is due: 9 degrees, or 15 cm at 1 m."""
 SMALLER = 3
@@ -78,6 +80,10 @@ class Look(NamedTuple):
         return float(inside.mean()), correlation(self.grey[inside], there)
 
 
+NOTHING_SEEN = Look(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
+"""Of a keyframe without images."""
+
+
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Pearson's, 0 where one of the two is flat."""
     a, b = a - a.mean(), b - b.mean()
@@ -99,7 +105,8 @@ class Keyframe:
         step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
             unknown.
         images: Of half the size; None once they were given up.
-        look: What it looks like from afar.
+        look: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
+        features: Its keypoints, once they were needed.
     """
 
     number: int
@@ -115,12 +122,26 @@ class Keyframe:
     """Earlier keyframes that it was aligned with, and the guess of that,"""
     linked: set[int] = field(default_factory=set)
     """and those to which that led to an edge."""
+    features: Features | None = None
+
+    def give_up_images(self) -> None:
+        """Forget all that is heavy; the pose stays."""
+        self.images, self.look, self.features = None, NOTHING_SEEN, None
+        self.tried.clear()
 
 
 def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.ndarray, "*n"]:
     """How far motions shift the image of things at a distance (m), about, in radians."""
     length, angle = size(a_T_b)
     return angle + length / max(distance, 0.1)
+
+
+def shifts(world_T_camera: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "n n"]:
+    """`shift` between any two of some poses."""
+    # entry by entry: a product of matrices this small makes BLAS's threads wait for more, which costs many times as much
+    trace = sum(entry[:, None] * entry for entry in world_T_camera[:, :3, :3].reshape(-1, 9).T)
+    squared = sum((axis[:, None] - axis) ** 2 for axis in world_T_camera[:, :3, 3].T)
+    return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) + np.sqrt(squared) / max(distance, 0.1)
 
 
 class Keyframes:
@@ -197,6 +218,6 @@ class Keyframes:
         kept = self.searchable()
         if len(kept) <= self.most:
             return
-        poses = np.stack([keyframe.world_T_camera for keyframe in kept])
-        earlier = [shift(inverse(poses[i]) @ poses[:i], USUAL_DISTANCE).min() for i in range(1, len(kept) - 1)]
-        kept[1 + int(np.argmin(earlier))].images = None
+        apart = shifts(np.stack([keyframe.world_T_camera for keyframe in kept]), USUAL_DISTANCE)
+        apart[np.triu_indices(len(kept))] = np.inf
+        kept[1 + int(np.argmin(apart[1:-1].min(axis=1)))].give_up_images()

@@ -184,9 +184,10 @@ class Mapper:
         self._place = None
 
     def _link(self, keyframe: Keyframe, edge: Edge) -> None:
+        """Keep an edge, without the alignment that it came from."""
         if edge.earlier not in keyframe.linked:
             keyframe.linked.add(edge.earlier)
-            self.edges.append(edge)
+            self.edges.append(edge._replace(alignment=None))
 
     def _candidates(self, keyframe: Keyframe) -> list[Candidate]:
         """The loops that a keyframe may close."""

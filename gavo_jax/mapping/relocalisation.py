@@ -47,7 +47,6 @@ class Recogniser:
 
     def __init__(self, camera: Camera, verifier: Verifier):
         self.camera, self.verifier = camera, verifier
-        self._features: dict[int, Features] = {}
 
     def find(self, frame: Keyframe, keyframes: list[Keyframe]) -> Place | None:
         """Where a frame is, as a keyframe of its own; None where none of the others shows that.
@@ -76,10 +75,13 @@ class Recogniser:
         return None
 
     def _known(self, keyframe: Keyframe) -> Features:
-        """Keypoints of a keyframe, found when they are first needed."""
-        if keyframe.number not in self._features:
-            self._features[keyframe.number] = self._detect(keyframe)
-        return self._features[keyframe.number]
+        """Keypoints of a keyframe, found when they are first needed. SIFT's descriptors are whole numbers below 256,
+        and kept as bytes.
+        """
+        if keyframe.features is None:
+            found = self._detect(keyframe)
+            keyframe.features = found._replace(descriptors=found.descriptors.astype(np.uint8))
+        return keyframe.features._replace(descriptors=keyframe.features.descriptors.astype(np.float32))
 
     def _detect(self, keyframe: Keyframe) -> Features:
         images: Still | None = keyframe.images

@@ -50,7 +50,7 @@ class Edge(NamedTuple):
     disagreement: tuple[float, float] = (0.0, 0.0)
     """Metres and radians between there and back."""
     alignment: Alignment | None = None
-    """There: the earlier keyframe is the reference."""
+    """There: the earlier keyframe is the reference. A map's edges are kept without it."""
 
 
 @dataclass(frozen=True)

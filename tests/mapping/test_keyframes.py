@@ -13,7 +13,7 @@ from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.image.settling import still
 from gavo_jax.mapping.candidates import find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
-from gavo_jax.mapping.keyframes import Keyframes
+from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
@@ -73,6 +73,12 @@ def test_images_are_bounded_and_the_likest_are_candidates():
     assert all(c.later.timestamp - c.earlier.timestamp >= 1.0 for c in found)
     numbers = sorted(c.earlier.number for c in found)
     assert all(b - a >= 3 for a, b in zip(numbers, numbers[1:], strict=False))
+
+
+def test_shifts_of_many_are_those_of_any_two():
+    poses = np.stack([exp(0.4 * xi) for xi in np.random.default_rng(0).normal(size=(8, 6))])
+    wanted = [[shift(inverse(a) @ b, 2.0) for b in poses] for a in poses]
+    np.testing.assert_allclose(shifts(poses, 2.0), wanted, atol=1e-7)
 
 
 def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:
@@ -187,3 +193,39 @@ def test_a_frame_is_found_in_the_map_and_another_room_is_not():
     metres, radians = size(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
     assert metres < 0.03 and radians < 0.03
     assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0]) is None
+
+
+def weight(thing: Any, seen: set[int]) -> int:
+    """Bytes of all arrays that a thing holds and that were not seen before."""
+    if isinstance(thing, np.ndarray):
+        whole = thing if thing.base is None else thing.base
+        is_new = id(whole) not in seen
+        seen.add(id(whole))
+        return whole.nbytes if is_new else 0
+    if isinstance(thing, dict):
+        return weight(list(thing.values()), seen)
+    if isinstance(thing, list | tuple | set):
+        return sum(weight(part, seen) for part in thing)
+    return weight(vars(thing), seen) if hasattr(thing, "__dict__") else 0
+
+
+def test_what_is_heavy_is_held_for_a_stated_number_of_keyframes():
+    pytest.importorskip("gtsam")
+    path = Trajectory(np.arange(73) / RATE, there_and_back(25).world_T_camera[np.arange(73) % 24])
+    rounds = SyntheticSequence(trajectory=path, noise=NONE, camera=CAMERA)
+    mapper = Mapper(CAMERA, most=6)
+    mapper.watch(rounds[0], None)
+    for step in drifting(rounds, np.full(6, 1e-4)):
+        mapper.watch(rounds[step.index], step)
+        if step.index % 5 == 0:
+            mapper.find(rounds[step.index])
+    mapper.finish()
+    kept, seen = mapper.keyframes.searchable(), set()
+    heavy = weight(kept, seen)
+    others = [keyframe for keyframe in mapper.keyframes.all if keyframe.images is None]
+    assert len(kept) == 6 and len(others) > 4 and mapper.edges
+    assert weight(others, seen) < 2000 * len(others)
+    assert weight(mapper.edges, seen) < 1000 * len(mapper.edges)
+    assert weight(vars(mapper), seen) < 2000
+    pixels = CAMERA.width * CAMERA.height
+    assert heavy < len(kept) * 16 * pixels
