@@ -138,7 +138,7 @@ def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.n
 
 def shifts(world_T_camera: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "n n"]:
     """`shift` between any two of some poses."""
-    # entry by entry: a product of matrices this small makes BLAS's threads wait for more, which costs many times as much
+    # entry by entry: in a product of matrices this small the threads of BLAS cost many times what they give
     trace = sum(entry[:, None] * entry for entry in world_T_camera[:, :3, :3].reshape(-1, 9).T)
     squared = sum((axis[:, None] - axis) ** 2 for axis in world_T_camera[:, :3, 3].T)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) + np.sqrt(squared) / max(distance, 0.1)
