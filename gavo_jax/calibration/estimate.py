@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Integer
 
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
 from gavo_jax.calibration.scan import Least, Score, coarse, refine
@@ -33,6 +34,10 @@ WINDOWS = 2
 LEAST_FRAMES = 12
 MOST_SEARCHED = 3000
 """Frames among which the stretches are looked for."""
+APART = 3
+"""Frames from one to the other of the pairs that tell the focal length and the principal point: what these change grows
+with the motion, and what the shutter changes does not.
+"""
 EDGE = 2
 """Pairs at either end of a stretch that do not count: the motion before and after them is not known."""
 
@@ -96,6 +101,10 @@ class _Trial:
     camera: Camera
     unknowns: Unknowns
     kinematics: list[Kinematics]
+    edge: int = EDGE
+    """Pairs at either end of a stretch that do not count."""
+    order: Integer[np.ndarray, " pairs"] | None = None
+    """Of those that count, in time, as `scan` draws neighbours together; None where they are in order."""
 
     def match(self, unknowns: Unknowns) -> list[Matched]:
         size = replace(self.camera.rectified(), fx=1.0, fy=1.0, cx=0.0, cy=0.0, readout=0.0, depth_scale=1.0)
@@ -108,15 +117,33 @@ class _Trial:
         matched = self.match(self.unknowns)
         self.kinematics = [Kinematics.of(stamps, m) for stamps, m in zip(self.stamps, matched, strict=True)]
 
+    def apart(self, frames: int) -> "_Trial":
+        """The same stretches as several each, of every so many frames, without the ends."""
+        trial, order = _Trial([], [], self.camera, self.unknowns, [], edge=0), []
+        for stretch, stamps, kinematics in zip(self.stretches, self.stamps, self.kinematics, strict=True):
+            count = (len(stamps) - 2 * EDGE) // frames
+            for first in range(EDGE, EDGE + frames):
+                some = first + frames * np.arange(count)
+                trial.stretches.append(stretch.some(some))
+                trial.stamps.append(stamps[some])
+                trial.kinematics.append(kinematics.some(some, stamps))
+            places = np.arange(frames * (count - 1)).reshape(frames, -1)
+            order.append(places.T.ravel() + sum(len(places) for places in order))
+        trial.order = np.concatenate(order)
+        return trial
+
     def score(self, channel: Literal["grey", "depth"], change: Callable[[Unknowns, float], Unknowns]) -> Score:
         """The pairs' residuals of one channel as a function of one number."""
 
+        def joined(parts: list[np.ndarray]) -> np.ndarray:
+            whole = np.concatenate([part[self.edge : len(part) - self.edge] for part in parts])
+            return whole if self.order is None else whole[self.order]
+
         def evaluate(value: float) -> tuple[np.ndarray, np.ndarray]:
             matched = self.match(change(self.unknowns, value))
-            costs = [np.asarray(getattr(m, channel))[EDGE:-EDGE] for m in matched]
-            counted = [np.asarray(m.usable)[EDGE:-EDGE] > 0 for m in matched]
-            joined = np.concatenate(costs)
-            return np.nan_to_num(joined), np.concatenate(counted) & np.isfinite(joined)
+            costs = joined([np.asarray(getattr(m, channel)) for m in matched])
+            counted = joined([np.asarray(m.usable) > 0 for m in matched])
+            return np.nan_to_num(costs), counted & np.isfinite(costs)
 
         return evaluate
 
@@ -198,7 +225,7 @@ def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Lea
     def change(unknowns: Unknowns, value: float) -> Unknowns:
         return unknowns._replace(fx=said * value, fy=said * value * ratio)
 
-    score = trial.score("grey", change)
+    score = trial.apart(APART).score("grey", change)
     grid = np.arange(1 - FOCAL_RANGE, 1 + FOCAL_RANGE + 1e-9, 0.05)
     start = coarse(score, grid) if is_first else float(trial.unknowns.fx) / said
     least = refine(score, start, FOCAL_STEP, 1 - FOCAL_RANGE, 1 + FOCAL_RANGE)
@@ -211,15 +238,15 @@ def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Lea
 
 def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
     del interval, is_first
-    leasts = {}
+    leasts, apart = {}, trial.apart(APART)
     for name in ("cx", "cy"):
         said, now = getattr(trial.camera, name), float(getattr(trial.unknowns, name))
 
         def change(unknowns: Unknowns, value: float, name: str = name) -> Unknowns:
             return unknowns._replace(**{name: value})
 
-        least = refine(trial.score("grey", change), now, CENTRE_STEP, said - CENTRE_RANGE, said + CENTRE_RANGE)
-        trial.unknowns = change(trial.unknowns, least.value)
+        least = refine(apart.score("grey", change), now, CENTRE_STEP, said - CENTRE_RANGE, said + CENTRE_RANGE)
+        trial.unknowns = apart.unknowns = change(trial.unknowns, least.value)
         leasts[name] = least
     return leasts
 

@@ -6,12 +6,13 @@ All that is asked for is a number of one compiled program, so that a search over
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Integer
 
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import fit_objective, levels_of, prepare_target, stack_levels
@@ -22,7 +23,7 @@ from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, moved
 from gavo_jax.objective.estimates import estimate_scales
 from gavo_jax.objective.points import Reference, make_references, settle_reference
-from gavo_jax.se3 import exp, rigid_inverse
+from gavo_jax.se3 import exp, log, rigid_inverse
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -80,6 +81,10 @@ class Stretch(NamedTuple):
         colour, depth = evened(np.array(stamps) - start), evened(np.array(depth_stamps) - start)
         return cls(grey, inverse_depth, jnp.asarray(colour, jnp.float32), jnp.asarray(depth - colour, jnp.float32))
 
+    def some(self, frames: Integer[np.ndarray, " n"]) -> "Stretch":
+        """Some of the frames, as if there were no others."""
+        return Stretch(*(leaf[frames] for leaf in self))
+
 
 MOST_JITTER = 0.3
 """Of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
@@ -135,6 +140,21 @@ class Kinematics(NamedTuple):
             jnp.asarray(acceleration, jnp.float32),
             jnp.asarray(np.concatenate([between, between[-1:]]), jnp.float32),
             jnp.concatenate([matched.target_T_reference, jnp.eye(4)[None]]),
+        )
+
+    def some(self, frames: Integer[np.ndarray, " n"], stamps: np.ndarray) -> "Kinematics":
+        """Of some of the frames: what the camera does at their moments, and what it has done from one to the next."""
+        steps, guesses = np.asarray(self.guesses, np.float64), np.tile(np.eye(4), (len(frames), 1, 1))
+        for place, (first, last) in enumerate(pairwise(frames)):
+            for step in steps[first:last]:
+                guesses[place] = step @ guesses[place]
+        seconds = np.append(np.diff(stamps[frames]), 1.0)[:, None]
+        between = np.asarray(jax.vmap(log)(jnp.asarray(guesses, jnp.float32))) / seconds
+        return Kinematics(
+            self.velocity[frames],
+            self.acceleration[frames],
+            jnp.asarray(between, jnp.float32),
+            jnp.asarray(guesses, jnp.float32),
         )
 
 

@@ -9,7 +9,7 @@ from small import CAMERA
 
 from gavo_jax.calibration.estimate import Found, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.calibration.pairs import evened
+from gavo_jax.calibration.pairs import Kinematics, evened
 from gavo_jax.calibration.scan import coarse, refine
 from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of
@@ -21,6 +21,8 @@ from gavo_jax.se3 import exp
 from gavo_jax.trajectory import Trajectory
 
 READOUT, DELAY = 0.02, 0.01
+WRONG_LENS = 1.04
+"""What the camera says of its focal length, over the true one."""
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A camera that looks along the world's x axis, whose z points up."""
 
@@ -40,10 +42,10 @@ class Shaken:
 
     name, ground_truth = "shaken", None
 
-    def __init__(self, frames: int = 20):
+    def __init__(self, frames: int = 26):
         fine = np.arange(-0.1, frames / 30 + 0.2, 0.005)
         sequence = SyntheticSequence(noise=NONE, camera=replace(CAMERA, readout=READOUT), trajectory=shaken(fine))
-        self.camera = replace(CAMERA, readout=0.0)
+        self.camera = replace(CAMERA, readout=0.0, fx=WRONG_LENS * CAMERA.fx, fy=WRONG_LENS * CAMERA.fy)
         self.timestamps = np.arange(frames) / 30
         at = [int(np.argmin(abs(fine - t))) for t in self.timestamps]
         self.frames = [Frame(sequence[i].grey, sequence[i + round(DELAY / 0.005)].depth, float(fine[i])) for i in at]
@@ -55,12 +57,23 @@ class Shaken:
         return self.frames[index]
 
 
-def test_shutter_and_delay_are_found_from_the_images():
-    estimate = estimate_camera(Shaken(), ("readout", "depth_delay"), rounds=1)  # pyright: ignore
-    readout, delay = estimate.found["readout"], estimate.found["depth_delay"]
+def test_shutter_delay_and_lens_are_found_from_the_images():
+    estimate = estimate_camera(Shaken(), ("readout", "depth_delay", "focal_length"), rounds=1)  # pyright: ignore
+    readout, delay, focal = (estimate.found[name] for name in ("readout", "depth_delay", "fx"))
+    assert focal.value == pytest.approx(CAMERA.fx, rel=0.02), focal
     assert readout.value == pytest.approx(READOUT, abs=0.003), readout
     assert delay.value == pytest.approx(DELAY, abs=0.003), delay
     assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
+
+
+def test_motion_between_frames_further_apart_is_that_of_the_pairs_between():
+    stamps, twist = np.arange(10) / 30, np.array([0.3, 0, -0.1, 0.2, 0.1, 0])
+    step = np.asarray(exp(jnp.asarray(twist / 30, jnp.float32)))
+    whole = Kinematics(*(jnp.tile(jnp.asarray(twist), (10, 1)),) * 3, jnp.tile(jnp.asarray(step), (10, 1, 1)))
+    apart = whole.some(np.array([1, 4, 7]), stamps)
+    np.testing.assert_allclose(apart.guesses[:2], np.tile(step @ step @ step, (2, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(apart.between[:2], np.tile(twist, (2, 1)), atol=1e-5)
+    assert apart.velocity.shape == (3, 6)
 
 
 def test_depth_scale_is_not_made_up():
