@@ -22,8 +22,8 @@ from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS, ROTATION_DRIFT
@@ -129,7 +129,7 @@ def open_clip(text: str) -> FrameSequence:
     """Return the frames of a clip.
 
     Args:
-        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder in TUM layout, one of GAVO_DATA's
+        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder of any layout that `gavo inspect` knows, one of GAVO_DATA's
             folders, or the word synthetic.
 
     Raises:
@@ -147,7 +147,7 @@ def open_clip(text: str) -> FrameSequence:
         if not data:
             raise GavoError(f"{name}: no such folder, and GAVO_DATA does not name the folder of the clips")
         folder = Path(data) / name
-    return TumSequence(folder)[:frames]
+    return open_source(folder)[:frames]
 
 
 class Contender(NamedTuple):

@@ -61,7 +61,9 @@ SAME = (0.01, 0.01)
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
-"""What a body may cause by hiding what the points saw."""
+"""What a body may cause by hiding what the points saw;"""
+MOST = 0.9
+"""of depth so much of what it leaves in view has to agree."""
 
 
 class Candidate(NamedTuple):
@@ -237,7 +239,9 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
     seen = known or float(belief.contradicted) > LEAST
-    if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~EXCUSED:
+    in_view = 1.0 - float(jnp.mean((belief.moving > 0) | belief.hidden))
+    excused = EXCUSED if float(result.explained.depth) > MOST * in_view else bit(AlignmentStatus.HIGH_ERROR)
+    if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
         result = result._replace(status=AlignmentStatus.OK, findings=0)
         attempt = attempt._replace(result=result, usable=True)
     rivals = [other for other in tried if other.rank[0] and not agree(other.attempt.result, attempt.result, SAME)]

@@ -14,7 +14,7 @@ import pytest
 from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
-from gavo_jax.bodies.aligner import SUSPECTED
+from gavo_jax.bodies.aligner import SUSPECTED, Candidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
 from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
@@ -24,7 +24,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
-from gavo_jax.odometry.aligners import blank_of
+from gavo_jax.odometry.aligners import Attempt, blank_of
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.settings import OdometryOptions, Settings
@@ -258,6 +258,17 @@ def test_a_state_keeps_its_shape() -> None:
         for state in (blank_of(odometry.aligner), odometry.progress.tracker)
     ]
     assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize(("explained", "status"), [(0.6, AlignmentStatus.OK), (0.1, AlignmentStatus.DEPTH_MISMATCH)])
+def test_depth_that_disagrees_where_no_body_is_has_no_excuse(explained: float, status: AlignmentStatus) -> None:
+    image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1.0)
+    some = jnp.float32(0.2)
+    belief = Belief(2 * covered - 1, 2 * covered - 1, jnp.float32(0.8), some, covered > 0, some, image)
+    result = no_alignment(AlignmentStatus.DEPTH_MISMATCH)
+    result = result._replace(explained=result.explained._replace(depth=np.float32(explained)))
+    best = Candidate(Attempt(None, result, usable=False), belief)
+    assert _judged(best, [best], known=True).result.status is status
 
 
 def test_what_is_thin_is_no_body() -> None:

@@ -58,6 +58,8 @@ def usual() -> Usual:
         (result_of(error=700.0, x=0.02), 0.0, DT, Status.HIGH_ERROR),
         (result_of(depth=0.7), 0.0, DT, None),
         (result_of(depth=0.5), 0.0, DT, Status.DEPTH_MISMATCH),
+        (result_of(depth=0.5, x=0.05), 1.5, DT, None),
+        (result_of(depth=0.3, x=0.05), 1.5, DT, Status.DEPTH_MISMATCH),
         (result_of(depth=np.nan), 0.0, DT, None),
     ],
 )
