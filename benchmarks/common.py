@@ -129,8 +129,8 @@ def open_clip(text: str) -> FrameSequence:
     """Return the frames of a clip.
 
     Args:
-        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder of any layout that `gavo inspect` knows, one of GAVO_DATA's
-            folders, or the word synthetic.
+        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder of any layout that `gavo inspect` knows,
+            one of GAVO_DATA's folders, or the word synthetic.
 
     Raises:
         GavoError: no such folder, GAVO_DATA not set, or the frames are not a number.

@@ -251,7 +251,7 @@ class Odometry:
         """
         result = attempt.result
         if not attempt.usable:
-            doubted = result.status is AlignmentStatus.DEPTH_MISMATCH and before.held + 1 < MAX_DOUBTED
+            doubted = AlignmentStatus.DEPTH_MISMATCH in result.statuses and before.held + 1 < MAX_DOUBTED
             fit = frame if finding.use is Use.ALL and not doubted else None
             return self._lose(before, fit, frame.timestamp), with_finding(result, finding.status), True
         result = with_finding(result, finding.status)
