@@ -104,6 +104,8 @@ class Progress(NamedTuple):
     """Of the reference."""
     adrift: int = 0
     """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
+    doubted: bool = False
+    """Whether the last frame's depth did not agree with its image."""
 
 
 class Odometry:
@@ -239,6 +241,7 @@ class Odometry:
             reference_timestamp=frame.timestamp,
             world_T_reference=before.world_T_camera,
             held=0,
+            doubted=False,
         )
 
     def _advance(
@@ -250,13 +253,16 @@ class Odometry:
             Where the driver stands now, the result, and whether the pair is lost.
         """
         result = attempt.result
+        doubted = AlignmentStatus.DEPTH_MISMATCH in result.statuses
         if not attempt.usable:
-            doubted = AlignmentStatus.DEPTH_MISMATCH in result.statuses and before.held + 1 < MAX_DOUBTED
-            fit = frame if finding.use is Use.ALL and not doubted else None
-            return self._lose(before, fit, frame.timestamp), with_finding(result, finding.status), True
+            # of another scene, image and depth are unlike: only depth that was wrong before, or alone is, is in doubt
+            doubted &= before.doubted or result.status is AlignmentStatus.DEPTH_MISMATCH
+            fit = frame if finding.use is Use.ALL and not (doubted and before.held + 1 < MAX_DOUBTED) else None
+            after = self._lose(before._replace(doubted=doubted), fit, frame.timestamp)
+            return after, with_finding(result, finding.status), True
         result = with_finding(result, finding.status)
         world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
-        after = before._replace(world_T_camera=world_T_camera, held=before.held + 1)
+        after = before._replace(world_T_camera=world_T_camera, held=before.held + 1, doubted=doubted)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
         if attempt.fit and (finding.use is Use.ALL or overdue):
             after = after._replace(

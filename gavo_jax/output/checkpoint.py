@@ -57,6 +57,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "held": progress.held,
         "segment": progress.segment,
         "adrift": progress.adrift,
+        "doubted": progress.doubted,
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
