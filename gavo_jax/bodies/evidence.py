@@ -17,6 +17,7 @@ from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightness
+from gavo_jax.objective.points import swept
 
 WIDEST = 160
 """Pixels: the finest level searched that is not wider is the one that bodies are seen on."""
@@ -138,12 +139,12 @@ def compare(
     words = look_up(here.image, itself, plane)
     grey, depth = sample_grey(words, itself), sample_depth(words, itself)
     q = jnp.where((depth.valid > 0) & (u < width - 1) & (v < height - 1), depth.value, 0.0)
-    points = _swept(Points(*to_ray(plane, u, v), q), here.sweep, -row_time(v, plane))
+    points = swept(Points(*to_ray(plane, u, v), q), here.sweep, -row_time(v, plane))
 
     def against(image: Target, sweep: Float[Array, " 6"], other_T_here: Float[Array, "4 4"]) -> Residuals:
         first = warp(points, other_T_here, plane)
         x, y = to_ray(plane, first.u, first.v)
-        there = _swept(Points(x, y, first.inverse_depth), sweep, row_time(first.v, plane) * first.inside)
+        there = swept(Points(x, y, first.inverse_depth), sweep, row_time(first.v, plane) * first.inside)
         there = there._replace(q=jnp.where(first.inside > 0, there.q, 0.0))
         seen = warp(there, jnp.eye(4), plane)
         words = look_up(image, seen, plane)
@@ -161,13 +162,3 @@ def compare(
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
     r = r._replace(grey=r.grey_sample.value - brightness.seen(seen_grey))
     return Compared(r, grey, seen_grey, q, (u, v))
-
-
-def _swept(points: Points, sweep: Float[Array, " 6"], share: Float[Array, " n"]) -> Points:
-    """Points moved along a share of a small twist, each along its own."""
-    (v, w), (x, y, q) = (sweep[:3], sweep[3:]), points
-    z = 1.0 + share * (w[0] * y - w[1] * x + v[2] * q)
-    z = jnp.where(z > 0.1, z, 1.0)
-    moved_x = (x + share * (w[1] - w[2] * y + v[0] * q)) / z
-    moved_y = (y + share * (w[2] * x - w[0] + v[1] * q)) / z
-    return Points(moved_x, moved_y, q / z)

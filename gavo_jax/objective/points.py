@@ -99,13 +99,19 @@ def settle_reference(reference: Reference, twist: Float[Array, " 6"]) -> Referen
         reference: As the camera's rolling shutter saw it.
         twist: Motion of the points in the camera during one readout, small.
     """
-    (v, w), (x, y, q), back = (twist[:3], twist[3:]), reference.points, -reference.row_time
-    settled = (
-        x + back * (w[1] - w[2] * y + v[0] * q),
-        y + back * (w[2] * x - w[0] + v[1] * q),
-        1.0 + back * (w[0] * y - w[1] * x + v[2] * q),
+    points = swept(reference.points, twist, -reference.row_time)
+    return reference._replace(points=points, row_time=jnp.zeros_like(reference.row_time))
+
+
+def swept(points: Points, twist: Float[Array, " 6"], share: Float[Array, "*n"]) -> Points:
+    """Points moved along a share of a small twist, each along its own; to first order."""
+    (v, w), (x, y, q) = (twist[:3], twist[3:]), points
+    moved_by = (
+        x + share * (w[1] - w[2] * y + v[0] * q),
+        y + share * (w[2] * x - w[0] + v[1] * q),
+        1.0 + share * (w[0] * y - w[1] * x + v[2] * q),
     )
-    return reference._replace(points=_rays(settled, q), row_time=jnp.zeros_like(reference.row_time))
+    return _rays(moved_by, q)
 
 
 @jax.jit
