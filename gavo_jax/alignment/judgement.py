@@ -87,6 +87,7 @@ def conclude(
         history,
         findings,
         evidence.explained,
+        jnp.asarray(objective.scales.depth, jnp.float32),
     )
 
 

@@ -37,6 +37,8 @@ class Alignment(NamedTuple):
     """Every status that holds, `OK` apart: the bits of an integer; see `statuses`."""
     explained: ExplainedShare = ExplainedShare(np.float32(np.nan), np.float32(np.nan))  # pyright: ignore
     """Share of the grey and of the depth residuals that are not large."""
+    depth_scale: Any = np.float32(np.nan)
+    """Scale of the depth residuals, 1/m."""
 
     @property
     def statuses(self) -> tuple[AlignmentStatus, ...]:

@@ -42,6 +42,13 @@ MOST_HIDDEN = 1.5
 """may explain as much less: over 5 to 13 frames dropped from the TUM clips the share stays above 0.67 of the usual one
 (`benchmarks/faults.py` has the drops), while of a depth of other units it is 0.1 and less.
 """
+MAX_DEPTH_SCALE_RATIO = 5.5
+"""Scale of the depth residuals over its usual value, above which a pair is `DEPTH_MISMATCH`: in a scene of about one
+depth a wrong one lies near the right one. Of a larger motion the root counts. Clean pairs reach 3.9, 4.5 after five
+dropped frames; shifted, old, permuted or upside-down depth has mostly 5 to 14.
+"""
+LEAST_DEPTH_SCALE = 0.004
+"""1/m: a camera at rest has less than a moving one."""
 
 
 class Usual(NamedTuple):
@@ -52,6 +59,8 @@ class Usual(NamedTuple):
     shifts: Float[Array, " n"]
     """How far the image moved, radians."""
     explained_depths: Float[Array, " n"]
+    depth_scales: Float[Array, " n"]
+    """1/m."""
 
     @classmethod
     def unknown(cls) -> "Usual":
@@ -60,7 +69,7 @@ class Usual(NamedTuple):
 
     def after(self, result: Alignment, contrast: Float[Array, ""]) -> "Usual":
         """With one more pair."""
-        figures = (result.error / contrast**2, _shift(result), result.explained.depth)
+        figures = (result.error / contrast**2, _shift(result), result.explained.depth, result.depth_scale)
         return Usual(*(jnp.append(old[1:], new) for old, new in zip(self, figures, strict=True)))
 
 
@@ -93,11 +102,14 @@ def judge_by_history(
         result.error / contrast**2 / larger,
         result.explained.depth * jnp.minimum(larger, MOST_HIDDEN),
     )
+    usual_scale = jnp.maximum(_usual(usual.depth_scales), LEAST_DEPTH_SCALE) * jnp.sqrt(larger)
+    mismatch = explained_depth < MIN_DEPTH_RATIO * _usual(usual.explained_depths)
+    mismatch |= result.depth_scale > MAX_DEPTH_SCALE_RATIO * usual_scale
     findings = result.findings | as_findings(
         {
             AlignmentStatus.IMPLAUSIBLE_MOTION: implausible,
             AlignmentStatus.HIGH_ERROR: error > MAX_ERROR_RATIO * _usual(usual.errors),
-            AlignmentStatus.DEPTH_MISMATCH: explained_depth < MIN_DEPTH_RATIO * _usual(usual.explained_depths),
+            AlignmentStatus.DEPTH_MISMATCH: mismatch,
         }
     )
     return result._replace(findings=findings, status=gravest(findings))

@@ -26,12 +26,12 @@ SETTINGS = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=Odometry
 DT = 1 / 30
 
 
-def result_of(x: float = 0.0, error: float = 10.0, depth: float = 0.95) -> Alignment:
+def result_of(x: float = 0.0, error: float = 10.0, depth: float = 0.95, scale: float = 0.005) -> Alignment:
     """A pair that moved along x, metres."""
     motion = jnp.eye(4).at[0, 3].set(x)
     explained = ExplainedShare(jnp.float32(0.9), jnp.float32(depth))
     alignment = no_alignment(Status.OK)._replace(target_T_reference=motion, error=jnp.float32(error))
-    return alignment._replace(explained=explained, findings=jnp.int32(0))
+    return alignment._replace(explained=explained, findings=jnp.int32(0), depth_scale=jnp.float32(scale))
 
 
 def usual() -> Usual:
@@ -61,6 +61,9 @@ def usual() -> Usual:
         (result_of(depth=0.5, x=0.05), 1.5, DT, None),
         (result_of(depth=0.3, x=0.05), 1.5, DT, Status.DEPTH_MISMATCH),
         (result_of(depth=np.nan), 0.0, DT, None),
+        (result_of(scale=0.02), 0.0, DT, None),
+        (result_of(scale=0.04), 0.0, DT, Status.DEPTH_MISMATCH),
+        (result_of(scale=0.04, x=0.05), 1.5, DT, None),
     ],
 )
 def test_a_pair_is_judged_by_those_before(
