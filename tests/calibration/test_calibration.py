@@ -69,7 +69,8 @@ def test_shutter_delay_and_lens_are_found_from_the_images():
 def test_motion_between_frames_further_apart_is_that_of_the_pairs_between():
     stamps, twist = np.arange(10) / 30, np.array([0.3, 0, -0.1, 0.2, 0.1, 0])
     step = np.asarray(exp(jnp.asarray(twist / 30, jnp.float32)))
-    whole = Kinematics(*(jnp.tile(jnp.asarray(twist), (10, 1)),) * 3, jnp.tile(jnp.asarray(step), (10, 1, 1)))
+    steady = jnp.tile(jnp.asarray(twist), (10, 1))
+    whole = Kinematics(steady, steady, steady, jnp.tile(jnp.asarray(step), (10, 1, 1)))
     apart = whole.some(np.array([1, 4, 7]), stamps)
     np.testing.assert_allclose(apart.guesses[:2], np.tile(step @ step @ step, (2, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(apart.between[:2], np.tile(twist, (2, 1)), atol=1e-5)
