@@ -60,6 +60,7 @@ from gavo_jax.scene_map import build_map as build_map
 from gavo_jax.settings import AlignmentOptions as AlignmentOptions
 from gavo_jax.settings import OdometryOptions as OdometryOptions
 from gavo_jax.settings import Settings as Settings
+from gavo_jax.settings_file import NamedSettings as NamedSettings
 from gavo_jax.settings_file import load_settings as load_settings
 from gavo_jax.settings_file import save_settings as save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton as GaussNewton

@@ -38,8 +38,11 @@ class NamedSettings(NamedTuple):
     """Settings with the names of what they started from."""
 
     method: str
+    """Of the solver."""
     preset: str
+    """Of the settings."""
     settings: Settings
+    """With what the file changes."""
 
 
 def load_settings(path: str | Path, method: str = "ga", preset: str = "default") -> NamedSettings:
