@@ -42,13 +42,15 @@ MOST_HIDDEN = 1.5
 """may explain as much less: over 5 to 13 frames dropped from the TUM clips the share stays above 0.67 of the usual one
 (`benchmarks/faults.py` has the drops), while of a depth of other units it is 0.1 and less.
 """
-MAX_DEPTH_SCALE_RATIO = 5.5
+MAX_DEPTH_SCALE_RATIO = 6.0
 """Scale of the depth residuals over its usual value, above which a pair is `DEPTH_MISMATCH`: in a scene of about one
-depth a wrong one lies near the right one. Of a larger motion the root counts. Clean pairs reach 3.9, 4.5 after five
-dropped frames; shifted, old, permuted or upside-down depth has mostly 5 to 14.
+depth a wrong one lies near the right one. Clean pairs reach 4.6, and 5.5 after five dropped frames; shifted, old,
+permuted or upside-down depth mostly has 7 to 16.
 """
-LEAST_DEPTH_SCALE = 0.004
-"""1/m: a camera at rest has less than a moving one."""
+LEAST_DEPTH_SCALE, STEADY_SHIFT = 0.022, 0.02
+"""1/m, up to which nothing is said; more where the image usually moved by less than so many radians, as a camera at
+rest has much less than one that starts to move.
+"""
 
 
 class Usual(NamedTuple):
@@ -97,14 +99,16 @@ def judge_by_history(
     reachable = jnp.array(MAX_SPEED) * elapsed
     tolerance = jnp.array(TOLERANCE)
     implausible = jnp.any(change > possible + tolerance) | jnp.any(_lengths(log(motion)) > reachable + tolerance)
-    larger = jnp.maximum(_shift(result) / jnp.maximum(_usual(usual.shifts), SMALLEST_SHIFT), 1.0)
+    usual_shift = jnp.maximum(_usual(usual.shifts), SMALLEST_SHIFT)
+    larger = jnp.maximum(_shift(result) / usual_shift, 1.0)
     error, explained_depth = (
         result.error / contrast**2 / larger,
         result.explained.depth * jnp.minimum(larger, MOST_HIDDEN),
     )
-    usual_scale = jnp.maximum(_usual(usual.depth_scales), LEAST_DEPTH_SCALE) * jnp.sqrt(larger)
+    least_scale = LEAST_DEPTH_SCALE * jnp.sqrt(jnp.maximum(STEADY_SHIFT / usual_shift, 1.0))
+    most_scale = jnp.maximum(MAX_DEPTH_SCALE_RATIO * _usual(usual.depth_scales), least_scale)
     mismatch = explained_depth < MIN_DEPTH_RATIO * _usual(usual.explained_depths)
-    mismatch |= result.depth_scale > MAX_DEPTH_SCALE_RATIO * usual_scale
+    mismatch |= result.depth_scale > most_scale
     findings = result.findings | as_findings(
         {
             AlignmentStatus.IMPLAUSIBLE_MOTION: implausible,

@@ -62,8 +62,9 @@ def usual() -> Usual:
         (result_of(depth=0.3, x=0.05), 1.5, DT, Status.DEPTH_MISMATCH),
         (result_of(depth=np.nan), 0.0, DT, None),
         (result_of(scale=0.02), 0.0, DT, None),
-        (result_of(scale=0.04), 0.0, DT, Status.DEPTH_MISMATCH),
+        (result_of(scale=0.05), 0.0, DT, Status.DEPTH_MISMATCH),
         (result_of(scale=0.04, x=0.05), 1.5, DT, None),
+        (result_of(scale=0.05, x=0.05), 1.5, DT, Status.DEPTH_MISMATCH),
     ],
 )
 def test_a_pair_is_judged_by_those_before(
