@@ -239,7 +239,8 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
     seen = known or float(belief.contradicted) > LEAST
-    in_view = 1.0 - float(jnp.mean((belief.moving > 0) | belief.hidden))
+    moving, hidden = jax.device_get((belief.moving, belief.hidden))
+    in_view = 1.0 - np.mean((moving > 0) | hidden)
     excused = EXCUSED if float(result.explained.depth) > MOST * in_view else bit(AlignmentStatus.HIGH_ERROR)
     if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
         result = result._replace(status=AlignmentStatus.OK, findings=0)

@@ -128,7 +128,7 @@ class _Trial:
                 trial.stamps.append(stamps[some])
                 trial.kinematics.append(kinematics.some(some, stamps))
             places = np.arange(frames * (count - 1)).reshape(frames, -1)
-            order.append(places.T.ravel() + sum(len(places) for places in order))
+            order.append(places.T.ravel() + sum(map(len, order)))
         trial.order = np.concatenate(order)
         return trial
 

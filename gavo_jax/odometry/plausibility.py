@@ -39,8 +39,8 @@ MIN_DEPTH_RATIO = 0.65
 """Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`; a motion that is larger by a
 factor of this, or by more,"""
 MOST_HIDDEN = 1.5
-"""may explain as much less: over 5 to 13 frames dropped from the TUM clips the share stays above 0.67 of the usual one
-(`benchmarks/faults.py` has the drops), while of a depth of other units it is 0.1 and less.
+"""may explain as much less: where up to twelve frames are dropped from the TUM clips the share stays at 0.54 of the usual
+one and more, while of a depth of other units it is 0.1 and less.
 """
 MAX_DEPTH_SCALE_RATIO = 6.0
 """Scale of the depth residuals over its usual value, above which a pair is `DEPTH_MISMATCH`: in a scene of about one
@@ -101,10 +101,8 @@ def judge_by_history(
     implausible = jnp.any(change > possible + tolerance) | jnp.any(_lengths(log(motion)) > reachable + tolerance)
     usual_shift = jnp.maximum(_usual(usual.shifts), SMALLEST_SHIFT)
     larger = jnp.maximum(_shift(result) / usual_shift, 1.0)
-    error, explained_depth = (
-        result.error / contrast**2 / larger,
-        result.explained.depth * jnp.minimum(larger, MOST_HIDDEN),
-    )
+    error = result.error / contrast**2 / larger
+    explained_depth = result.explained.depth * jnp.minimum(larger, MOST_HIDDEN)
     least_scale = LEAST_DEPTH_SCALE * jnp.sqrt(jnp.maximum(STEADY_SHIFT / usual_shift, 1.0))
     most_scale = jnp.maximum(MAX_DEPTH_SCALE_RATIO * _usual(usual.depth_scales), least_scale)
     mismatch = explained_depth < MIN_DEPTH_RATIO * _usual(usual.explained_depths)
