@@ -22,10 +22,13 @@ from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.datasets.base import Frame
+from gavo_jax.mapping.motions import exp as exp_on_host
+from gavo_jax.mapping.motions import log as log_on_host
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, moved_on
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit
+from gavo_jax.trajectory import inverse
 
 DOUBTFUL = 0.1
 """Share of what was at rest that moves, from which on a motion may not be the camera's."""
@@ -58,6 +61,8 @@ MOST_ASIDE = 0.6
 """unless so much of the image is suspected: then only what moves does not."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
+GOES_ON = (0.01, 0.01)
+"""Deviation, metres and radians, of a motion that goes on as before."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
@@ -86,10 +91,12 @@ class BodyAware:
     Attributes:
         first: Makes the first attempt at a frame.
         search: What that is; it makes all others.
+        is_eager: Whether it learns what moves from a motion that may be a body's, too.
     """
 
     first: Aligner
     search: Search
+    is_eager: bool = False
 
     @cached_property
     def retina(self) -> Retina:
@@ -136,28 +143,32 @@ class BodyAware:
         arisen = np.mean((found > 0) & ~_near(before))
         if (arisen > SUSPICIOUS and attempt is first) or (not attempt.usable and (np.any(before) or np.any(found))):
             attempt = self._share_out(state, frame, clock, attempt)
-            if not attempt.usable and np.mean(before) > LARGE and scene.carried < MAX_CARRIED:
-                attempt, carried = self._carry_on(state, clock, attempt), int(scene.carried) + 1
+            if not attempt.usable and scene.carried < MAX_CARRIED:
+                attempt, is_carried = self._go_on(state, clock, attempt, covered=float(np.mean(before)))
+                carried = is_carried * (int(scene.carried) + 1)
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
+        dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
+        if dissent > MISTRUSTED:
+            attempt = mistrusted(attempt)
         limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
-        if look.opinion is not None and float(look.opinion.dissent) > limit:
-            attempt = _mistrusted(attempt)
+        is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
         roll = Roll(*map(np.asarray, scene.roll))
         seen = ()
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
         whole = tracker.previous if self.tracks else None
-        trusted = not int(attempt.result.findings) & bit(AlignmentStatus.MOVING_BODY)
-        suspected = suspect(look.belief, found > 0, trusted=trusted)
+        suspected = suspect(look.belief, found > 0, trusted=not is_doubted)
         after = retina.renewed(scene, look)._replace(
             roll=roll, carried=np.asarray(carried, np.int32), suspected=suspected
         )
-        aside = suspected > SUSPECTED  # by a wrong motion the scene seems to move: what was just found is left
+        if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
+            after = after._replace(known=look.belief.carried)
+        aside = suspected > SUSPECTED  # without what was just found, where the motion is in doubt
         if np.any(aside):
             tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else found > 0)
-        return attempt._replace(state=AwareState(tracker, after, whole), bodies=seen)
+        return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion; and
@@ -215,20 +226,43 @@ class BodyAware:
                 break
         return _judged(best, tried, bool(np.any(np.asarray(scene.roll.labels))))
 
+    def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> tuple[Attempt, bool]:
+        """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion
+        or, of an image that is covered for the most part, nothing; and whether it needed that.
+        """
+        result = attempt.result
+        if int(result.findings) == bit(AlignmentStatus.LOW_TEXTURE) and np.all(np.isfinite(result.covariance)):
+            return self._completed(state, clock, attempt), True
+        return (self._carry_on(state, clock, attempt), True) if covered > LARGE else (attempt, False)
+
+    def _completed(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+        """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
+        both, weighted by their covariances.
+        """
+        found = np.asarray(attempt.result.target_T_reference)
+        onward = log_on_host(self.predict(state, float(clock.elapsed)) @ inverse(found))
+        covariance, prior = np.float64(attempt.result.covariance), np.diag(np.repeat(np.square(GOES_ON), 3))
+        share = covariance @ np.linalg.inv(covariance + prior)
+        motion = exp_on_host(share @ onward) @ found
+        return _moved(state, attempt, motion, share @ prior)
+
     def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with the motion that the camera has if it goes on as before."""
         motion = self.predict(state, float(clock.elapsed))
-        xi = np.asarray(log(jnp.asarray(motion, jnp.float32)))
-        result = attempt.result._replace(
-            target_T_reference=motion,
-            xi=xi,
-            covariance=np.diag(np.full(6, UNDETERMINED**2, np.float32)),
-            status=AlignmentStatus.MOVING_BODY,
-            findings=bit(AlignmentStatus.MOVING_BODY),
-        )
-        tracker: TrackerState = attempt.state
-        tracker = tracker._replace(keyframe=tracker.previous, motion=jnp.asarray(xi), usual=state.tracker.usual)
-        return attempt._replace(state=tracker, result=result, usable=True)
+        attempt = _moved(state, attempt, motion, np.diag(np.full(6, UNDETERMINED**2)))
+        findings = bit(AlignmentStatus.MOVING_BODY)
+        return attempt._replace(result=attempt.result._replace(status=AlignmentStatus.MOVING_BODY, findings=findings))
+
+
+def _moved(
+    state: AwareState, attempt: Attempt, motion: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
+) -> Attempt:
+    """An attempt of another motion than the one that was found, which can be used."""
+    xi = log_on_host(motion).astype(np.float32)
+    result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
+    tracker: TrackerState = attempt.state
+    tracker = tracker._replace(keyframe=tracker.previous, motion=jnp.asarray(xi), usual=state.tracker.usual)
+    return attempt._replace(state=tracker, result=result, usable=True)
 
 
 def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
@@ -247,11 +281,11 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
         attempt = attempt._replace(result=result, usable=True)
     rivals = [other for other in tried if other.rank[0] and not agree(other.attempt.result, attempt.result, SAME)]
     if any(float(other.belief.support) > NEARLY_AS_GOOD * float(belief.support) for other in rivals):
-        attempt = _mistrusted(attempt)
+        attempt = mistrusted(attempt)
     return attempt
 
 
-def _mistrusted(attempt: Attempt) -> Attempt:
+def mistrusted(attempt: Attempt) -> Attempt:
     """The attempt with the word that its motion may be a body's."""
     result = attempt.result
     findings = int(result.findings) | bit(AlignmentStatus.MOVING_BODY)

@@ -53,6 +53,8 @@ class Belief(NamedTuple):
     """Which pixels the first of the others does not see, as something stands before them."""
     arisen: Float[Array, ""]
     """Share of the image that moves and was not known to."""
+    carried: Float[Array, "h w"]
+    """What was known before, on the same surfaces, without what this frame says."""
     suspected: Float[Array, "h w"]
     """From 0 to 1: how lately a body was seen on the pixel's surface, before this frame."""
 
@@ -104,6 +106,7 @@ def form_belief(
         jnp.sum(credit * (moving > 0)) / total,
         hidden,
         jnp.mean(arisen),
+        known,
         _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
     )
 

@@ -140,7 +140,7 @@ def _equations(
     compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_here[None], camera, STRIDE)
     r = jax.tree.map(lambda leaf: leaf[0], compared.residuals)
     depth = jnp.where(compared.inverse_depth > 0, 1.0 / jnp.maximum(compared.inverse_depth, 1e-3), jnp.nan)
-    usual = _middle_of_many(jnp.nan_to_num(depth), compared.inverse_depth > 0)
+    usual = middle_of_many(jnp.nan_to_num(depth), compared.inverse_depth > 0)
     area = jnp.nan_to_num(jnp.minimum(depth / jnp.maximum(usual, 1e-3), FARTHER) ** 2)
     counted = credit[::STRIDE, ::STRIDE].reshape(-1) * area * r.inside
     nothing = jnp.zeros_like(r.grey)
@@ -151,12 +151,12 @@ def _equations(
         (r.grey, r.inside, LEAST_GREY, along_grey),
         (r.depth, r.depth_valid, LEAST_DEPTH, along_depth),
     ):
-        scale = jnp.maximum(1.48 * _middle_of_many(jnp.abs(residual), mask * counted > 0), least)
+        scale = jnp.maximum(1.48 * middle_of_many(jnp.abs(residual), mask * counted > 0), least)
         weight = jnp.where(mask > 0, (1.0 + (residual / (BOUND * scale)) ** 2) ** -2 / scale**2, 0.0)
         rows = [*jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0), residual]
         own = [weight * rows[i] * rows[j] for i in range(6) for j in range(i, 7)]
         parts = [parts[0], *(part + one for part, one in zip(parts[1:], own, strict=True))]
-    credit, *sums = _block_sums(jnp.stack(parts), camera)
+    credit, *sums = block_sums(jnp.stack(parts), camera)
     entry = {pair: one for pair, one in zip(((i, j) for i in range(6) for j in range(i, 7)), sums, strict=True)}
     gradient = jnp.stack([entry[i, 6] for i in range(6)], axis=-1)
     hessian = jnp.stack([jnp.stack([entry[min(i, j), max(i, j)] for j in range(6)], -1) for i in range(6)], -2)
@@ -165,7 +165,7 @@ def _equations(
     return Blocks(hessian, gradient, inverse, credit)
 
 
-def _block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
+def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
     """Of values at all pixels asked; what is left over at the right and below is left out."""
     height, width = (-(-size // STRIDE) for size in (camera.height, camera.width))
     rows, columns = _grid(camera)
@@ -183,7 +183,7 @@ def _inverses(matrices: Float[Array, "b 6 6"]) -> Float[Array, "b 6 6"]:
     return jnp.moveaxis(rows[:, 6:], -1, 0)
 
 
-def _middle_of_many(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
+def middle_of_many(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
     """Median of some of many values from 0 on, to a small part of their largest, by bisection: sorting takes longer
     than all else here.
     """

@@ -55,6 +55,8 @@ class AwareState(NamedTuple):
     scene: Scene
     whole: Reference | None = None
     """The last frame's points with those on bodies; kept where bodies are tracked."""
+    is_doubted: Any = np.zeros((), bool)
+    """Whether the last motion may be a body's, by a stricter measure than the status's."""
 
 
 class Look(NamedTuple):

@@ -20,7 +20,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, on_host
-from gavo_jax.bodies.scene import AwareState
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -211,7 +210,7 @@ class _Stack:
 
 def _tracker_of(state: Any) -> TrackerState:
     """The tracker's part of a lane's state, which may know of bodies too."""
-    return state.tracker if isinstance(state, AwareState) else state
+    return state if isinstance(state, TrackerState) else state.tracker
 
 
 def _as_array(leaf: Any) -> jax.Array:

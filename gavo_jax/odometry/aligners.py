@@ -293,5 +293,6 @@ def with_bodies(aligner: Aligner, search: Search) -> Aligner:
     if search.settings.odometry.bodies == "off":
         return aligner
     from gavo_jax.bodies.aligner import BodyAware  # which is made of what is defined here
+    from gavo_jax.bodies.rival import WithRival
 
-    return BodyAware(aligner, search)
+    return WithRival(BodyAware(aligner, search))

@@ -197,7 +197,7 @@ def test_a_body_that_stops_stays_out_of_the_search() -> None:
     sequence, odometry = Carded(stops=3), Odometry(CAMERA, TRACKED)
     for index in range(FRAMES):
         odometry.register(sequence[index], index / 30)
-    state = odometry.progress.tracker
+    state = odometry.progress.tracker.first
     factor = CAMERA.height // Retina(CAMERA, TRACKED).size[0]
     on_card = sequence.mask(FRAMES - 1)[::factor, ::factor]
     suspected = np.asarray(state.scene.suspected) > SUSPECTED
@@ -264,7 +264,7 @@ def test_a_state_keeps_its_shape() -> None:
 def test_depth_that_disagrees_where_no_body_is_has_no_excuse(explained: float, status: AlignmentStatus) -> None:
     image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1.0)
     some = jnp.float32(0.2)
-    belief = Belief(2 * covered - 1, 2 * covered - 1, jnp.float32(0.8), some, covered > 0, some, image)
+    belief = Belief(2 * covered - 1, 2 * covered - 1, jnp.float32(0.8), some, covered > 0, some, image, image)
     result = no_alignment(AlignmentStatus.DEPTH_MISMATCH)
     result = result._replace(explained=result.explained._replace(depth=np.float32(explained)))
     best = Candidate(Attempt(None, result, usable=False), belief)

@@ -19,6 +19,7 @@ from small import Rendered
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.aligner import BodyAware
+from gavo_jax.bodies.rival import WithRival
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -622,7 +623,8 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
 def test_the_wide_search_stands_behind_the_default_one() -> None:
     aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
     assert isinstance(aligner, Recovering) and isinstance(aligner.first, DoubtingDepth)
-    first, alone, second = aligner.first.first, aligner.first.alone, aligner.second()
+    rivalled = aligner.first.first, aligner.first.alone, aligner.second()
+    first, alone, second = (one.first for one in rivalled if isinstance(one, WithRival))
     assert isinstance(first, BodyAware) and isinstance(alone, BodyAware) and isinstance(second, BodyAware)
     search, wide = first.search, second.search
     assert first.first is search and alone.search is search and second.first is wide and wide.key == search.key

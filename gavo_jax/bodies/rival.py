@@ -1,0 +1,244 @@
+"""A second motion kept beside the first until it is clear which one is the camera's.
+
+Where a body covers much of the image from the start, a search ends with the body's motion, or with one that explains
+both to the eye: a turn makes up for a step. One pair of frames can't tell. So what stands before other surfaces is set
+aside, the rest is tracked on its own, and the two motions are compared, frame after frame. What the far part shows on
+its own is the camera's motion if it is well determined and contradicts the other one: a body hides the scene, and not
+the other way round.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from gavo_jax.alignment.judgement import UNDETERMINED
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.bodies.aligner import BodyAware, mistrusted
+from gavo_jax.bodies.evidence import View
+from gavo_jax.bodies.identity import Roll
+from gavo_jax.bodies.scene import AwareState
+from gavo_jax.bodies.surfaces import nearer_part
+from gavo_jax.bodies.votes import vote
+from gavo_jax.datasets.base import Frame
+from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
+from gavo_jax.mapping.motions import log, size
+from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.plausibility import Usual
+from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.trajectory import inverse
+
+TOGETHER = (0.008, np.radians(0.5))
+"""Metres and radians within which the two are the same motion,"""
+APART = (0.025, np.radians(1.0))
+"""and from which on it matters which one is taken."""
+AGREED_AFTER, DROPPED_AFTER = 5, 12
+"""Frames after which a rival is dropped if it is the same motion; if nothing is decided."""
+DROPPED_EARLY, LEAST_DOUBT = 5, 20.0
+"""Frames after which it is dropped if the first one's motion is within its covariance as often as not."""
+REMEMBERED = 3
+"""Frames whose contradictions are averaged, about."""
+LARGEST = 100.0
+"""Of a squared Mahalanobis distance, so that one frame can't decide."""
+CONTRADICTED = 45.0
+"""Mean of these from which on the far part contradicts the first motion;"""
+CLEAR, DOUBTFUL = 0.85, 0.5
+"""as a share of the largest, together with the far part's margin: from the first on the rival is taken, from the second
+on the first one's motion may be a body's."""
+MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
+"""Margins in the whole image and in its far part that decide if they hold for so many frames,"""
+LANDSLIDE = 0.6
+"""and one in the whole image that does at once."""
+EXACT, VAGUE = 0.012, 0.02
+"""Metres: deviation of the rival's translation up to which it can be taken, and from which on it tells nothing."""
+
+
+class Rival(NamedTuple):
+    """Another motion that may be the camera's, since some frame, its anchor."""
+
+    state: AwareState
+    """Of its own search."""
+    anchor: View
+    near: Bool[np.ndarray, "h w"]
+    """What the anchor shows of surfaces that are taken for bodies."""
+    first_T_anchor: Float[np.ndarray, "4 4"]
+    """Motion since the anchor by the first search,"""
+    rival_T_anchor: Float[np.ndarray, "4 4"]
+    """and by the rival's."""
+    age: Any
+    """Frames since the anchor; -1 where there is no rival."""
+    contradiction: Any
+    """Mean of the squared Mahalanobis distances of the last frames."""
+    ahead: Any
+    """Frames for which the margins have held."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is one."""
+        return int(self.age) >= 0
+
+
+class RivalledState(NamedTuple):
+    """State of the first search, and of its rival."""
+
+    first: AwareState
+    rival: Rival
+
+    @property
+    def tracker(self) -> TrackerState:
+        """Of the first search."""
+        return self.first.tracker
+
+
+@dataclass(frozen=True)
+class WithRival:
+    """An aligner that keeps another motion beside its own as long as either may be the camera's.
+
+    Attributes:
+        first: Finds the motion of a frame and its bodies.
+    """
+
+    first: BodyAware
+
+    @cached_property
+    def second(self) -> BodyAware:
+        """Follows the rival, which has to learn as it goes."""
+        return BodyAware(self.first.search, self.first.search, is_eager=True)
+
+    def warm_up(self) -> float:
+        """That of the first one; votes are loaded where they were compiled before, as few runs need them."""
+        seconds, start = self.first.warm_up(), time.perf_counter()
+        state = self.first.blank_state()
+        view = _view(state)
+        inputs = view, view, np.stack([np.eye(4, dtype=np.float32)] * 2), np.zeros(self.first.retina.size, bool)
+        if vote.is_kept(*inputs, self.first.retina.camera):
+            jax.block_until_ready(vote(*inputs, self.first.retina.camera))
+        return seconds + time.perf_counter() - start
+
+    def blank_state(self) -> RivalledState:
+        """The state before the first frame, in the shapes and types of every state."""
+        return self._alone(self.first.blank_state())
+
+    def start(self, frame: Frame) -> RivalledState:
+        """A scene in which nothing is known to move, and a rival if something stands before the rest."""
+        state = self.first.start(frame)
+        return RivalledState(state, self._rival_of(state))
+
+    def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state.first, elapsed)
+
+    def align(self, state: RivalledState, frame: Frame, clock: Clock) -> Attempt:
+        """The first one's attempt, or the rival's once that is clearly the camera's motion."""
+        attempt = self.first.align(state.first, frame, clock)
+        own: AwareState = attempt.state
+        rival = state.rival
+        if not attempt.usable:
+            return attempt._replace(state=RivalledState(own, rival))
+        if not rival.is_there and own.is_doubted:
+            rival = self._rival_of(state.first)
+        if not rival.is_there:
+            return attempt._replace(state=self._alone(own))
+        other = self.second.align(rival.state, frame, clock)
+        if not other.usable:
+            return attempt._replace(state=self._alone(own))
+        return self._decide(attempt, other, rival)
+
+    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival) -> Attempt:
+        """Which of two attempts at a frame stands for it, and whether the rival is kept."""
+        before = np.asarray(rival.first_T_anchor, np.float64)
+        first = np.asarray(attempt.result.target_T_reference) @ before
+        second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
+        age = int(rival.age) + 1
+        new = min(_distance(attempt.result, other.result), LARGEST)
+        contradiction = float(rival.contradiction) + max(1 / age, 1 / REMEMBERED) * (new - float(rival.contradiction))
+        apart, deviation = _between(first, second), float(np.sqrt(np.trace(other.result.covariance[:3, :3])))
+        alone = attempt._replace(state=self._alone(attempt.state))
+        if not deviation < VAGUE or (age >= AGREED_AFTER and not _exceeds(apart, TOGETHER)):
+            return alone
+        ahead = 0
+        if _exceeds(apart, APART):
+            motions = np.stack([first, second]).astype(np.float32)
+            margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
+            whole, far = float(margin.whole), float(margin.far)
+            ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
+            certainty = contradiction / LARGEST + far
+            contradicts = age >= FRAMES and contradiction > CONTRADICTED and certainty > CLEAR
+            if deviation < EXACT and (contradicts or ahead >= FRAMES or whole > LANDSLIDE):
+                result = _returned(other.result, second @ inverse(before))
+                return mistrusted(other._replace(state=self._alone(other.state), result=result))
+            if age >= FRAMES and certainty > DOUBTFUL and contradiction > DOUBTFUL * CONTRADICTED:
+                attempt = mistrusted(attempt)
+        if age > DROPPED_AFTER or (age >= DROPPED_EARLY and contradiction < LEAST_DOUBT):
+            return alone
+        after = Rival(
+            other.state,
+            rival.anchor,
+            rival.near,
+            first.astype(np.float32),
+            second.astype(np.float32),
+            np.int32(age),
+            np.float32(contradiction),
+            np.int32(ahead),
+        )
+        return attempt._replace(state=RivalledState(attempt.state, after))
+
+    def _alone(self, state: AwareState) -> RivalledState:
+        """A state without a rival."""
+        still, nothing = np.eye(4, dtype=np.float32), np.zeros(self.first.retina.size, bool)
+        rival = Rival(state, _view(state), nothing, still, still, np.int32(-1), np.float32(0), np.int32(0))
+        return RivalledState(state, rival)
+
+    def _rival_of(self, state: AwareState) -> Rival:
+        """The motion of what the last frame shows behind all that stands before other surfaces, from here on."""
+        rival, retina = self._alone(state).rival, self.first.retina
+        near = nearer_part((np.asarray(rival.anchor.image.depth) & 65535) * INVERSE_DEPTH_STEP)
+        if not np.any(near):
+            return rival
+        number = np.int32(state.scene.roll.last + 1)
+        roll = Roll.empty(retina.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
+        roll.numbers[0] = number
+        scene = state.scene._replace(
+            known=jnp.asarray(near, jnp.float32),
+            suspected=np.asarray(near, np.float32),
+            roll=roll,
+            carried=np.zeros((), np.int32),
+        )
+        tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
+        seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
+        return rival._replace(state=seen, near=near, age=np.int32(0))
+
+
+def _view(state: AwareState) -> View:
+    """Of the last frame."""
+    return jax.tree.map(lambda leaf: leaf[0], state.scene.views)
+
+
+def _distance(first: Alignment, second: Alignment) -> float:
+    """Squared Mahalanobis distance of two results of independent points."""
+    step = log(np.asarray(first.target_T_reference) @ inverse(np.asarray(second.target_T_reference)))
+    covariance = np.asarray(first.covariance, np.float64) + np.asarray(second.covariance, np.float64)
+    return float(step @ np.linalg.solve(covariance, step))
+
+
+def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
+    length, angle = size(inverse(first) @ second)
+    return float(length), float(angle)
+
+
+def _exceeds(apart: tuple[float, float], limits: tuple[float, float]) -> bool:
+    return apart[0] > limits[0] or apart[1] > limits[1]
+
+
+def _returned(result: Alignment, motion: Float64[np.ndarray, "4 4"]) -> Alignment:
+    """The rival's result with the way from where the first one's camera was believed to be: that is not known well."""
+    return result._replace(
+        target_T_reference=motion,
+        xi=log(motion).astype(np.float32),
+        covariance=np.diag(np.full(6, UNDETERMINED**2, np.float32)),
+    )

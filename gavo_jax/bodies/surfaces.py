@@ -1,0 +1,86 @@
+"""Which surfaces stand before others: what may be a body, told from one depth image.
+
+A body hides the scene and not the other way round. So the surfaces that stand before their neighbours are those that
+may move, whatever the motion.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+FLAT, FLAT_NOISE = 0.02, 0.004
+"""Two neighbours lie on one surface where their inverse depths differ by less than this share and so much, 1/m;"""
+STEP, STEP_NOISE = 0.04, 0.01
+"""one stands before the other where they differ by more than this."""
+WIDEST_SHADOW = 6
+"""Pixels without depth across which two surfaces still are neighbours."""
+BEFORE = 0.75
+"""Share of a surface's border along which it stands before its neighbours, of one that may move,"""
+LEAST_BORDER = 8
+"""pixels of such a border at least,"""
+LEAST_AREA = 0.015
+"""and share of the image."""
+LEAST_NEAR, MOST_NEAR = 0.04, 0.95
+"""Share of the image that may move together; less or more is not worth to ask about."""
+BINS = 64
+
+
+def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels of what may be a body: surfaces that stand before others, or else the nearer part of the image.
+
+    Args:
+        inverse_depth: 1/m; 0 where there is no reading.
+
+    Returns:
+        Nothing where neither is there.
+    """
+    for part in (standing_before(inverse_depth), _nearer_class(inverse_depth)):
+        if LEAST_NEAR < part.mean() < MOST_NEAR:
+            return part
+    return np.zeros(inverse_depth.shape, bool)
+
+
+def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels of surfaces that stand before their neighbours along most of their border."""
+    labels, count = _surfaces(inverse_depth)
+    before, behind = np.zeros(count), np.zeros(count)
+    for q, surface in ((inverse_depth, labels), (inverse_depth.T, labels.T)):
+        for apart in range(1, min(WIDEST_SHADOW, q.shape[1] - 1) + 1):
+            a, b = q[:, :-apart], q[:, apart:]
+            step = np.abs(a - b) > STEP * np.maximum(a, b) + STEP_NOISE
+            meet = step & (a > 0) & (b > 0) & (surface[:, :-apart] != surface[:, apart:])
+            for between in range(1, apart):
+                meet &= q[:, between : between - apart] == 0
+            first, second = surface[:, :-apart][meet], surface[:, apart:][meet]
+            is_nearer = a[meet] > b[meet]
+            before += np.bincount(np.where(is_nearer, first, second), minlength=count)
+            behind += np.bincount(np.where(is_nearer, second, first), minlength=count)
+    area = np.bincount(labels.ravel(), minlength=count) / labels.size
+    chosen = (area > LEAST_AREA) & (before > BEFORE * (before + behind)) & (before >= LEAST_BORDER)
+    return chosen[labels] & (inverse_depth > 0)
+
+
+def _surfaces(q: Float[np.ndarray, "h w"]) -> tuple[Integer[np.ndarray, "h w"], int]:
+    """A number for each pixel's surface, and how many there are; pixels and the ties between them make one image."""
+    height, width = q.shape
+    ties = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
+    ties[::2, ::2] = q > 0
+    ties[::2, 1::2] = _tied(q[:, :-1], q[:, 1:])
+    ties[1::2, ::2] = _tied(q[:-1], q[1:])
+    count, labels = cv2.connectedComponents(ties, connectivity=4)
+    return labels[::2, ::2], count
+
+
+def _tied(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (np.abs(a - b) < FLAT * np.maximum(a, b) + FLAT_NOISE) & (a > 0) & (b > 0)
+
+
+def _nearer_class(q: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The nearer one of two classes of inverse depth, by Otsu's threshold."""
+    known = q[q > 0]
+    if known.size == 0 or known.min() == known.max():
+        return np.zeros(q.shape, bool)
+    low, high = float(known.min()), float(known.max())
+    scaled = np.round((known - low) / (high - low) * (BINS - 1)).astype(np.uint8)
+    threshold, _ = cv2.threshold(scaled, 0, BINS - 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return q > low + (threshold + 0.5) / (BINS - 1) * (high - low)

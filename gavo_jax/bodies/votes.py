@@ -1,0 +1,64 @@
+"""Two motions before the image's area: which of them explains each block better.
+
+A comparison needs one measure. So residuals of both are taken on the pixels that both see, in units of the scale that
+the better one of them leaves.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gavo_jax.bodies.consensus import FARTHER, LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, middle_of_many
+from gavo_jax.bodies.evidence import View, compare
+from gavo_jax.camera import Camera
+from gavo_jax.program_cache import CachedProgram
+
+DECISIVE = 6.0
+"""Difference of two costs from which on a block has its whole vote."""
+FREEDOM = 5.0
+"""Degrees of freedom of the t distribution that a pixel's cost is of (Kerl et al. 2013)."""
+
+
+class Margin(NamedTuple):
+    """By how much the second motion is ahead of the first, from -1 to 1."""
+
+    whole: Float[Array, ""]
+    """In the whole image,"""
+    far: Float[Array, ""]
+    """and in its far part alone."""
+
+
+@partial(CachedProgram, returns=(Margin,))
+def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Array, "h w"], camera: Camera) -> Margin:
+    """Have the blocks of a view choose between two motions into another; a block counts by the area of its surface.
+
+    Args:
+        here: The view.
+        there: The other.
+        motions: there_T_here, twice.
+        near: Which pixels are not of the far part.
+        camera: Of the views' level.
+    """
+    others = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), there)
+    compared = compare(here, others, motions, camera, STRIDE)
+    r, q = compared.residuals, compared.inverse_depth
+    has = q > 0
+    cost = jnp.zeros_like(r.grey)
+    for residual, mask, least in ((r.grey, r.inside, LEAST_GREY), (r.depth, r.depth_valid, LEAST_DEPTH)):
+        both = jnp.all(mask > 0, axis=0) & has
+        better = jnp.where(both, jnp.min(jnp.abs(residual), axis=0), 0.0)
+        scale = jnp.maximum(1.48 * middle_of_many(better, both), least)
+        t = jnp.log1p((residual / scale) ** 2 / FREEDOM)
+        cost += jnp.where(both, 0.5 * (FREEDOM + 1.0) * t, 0.0)
+    depth = jnp.where(has, 1.0 / jnp.maximum(q, 1e-3), 0.0)
+    usual = middle_of_many(depth, has)
+    seen = jnp.all(r.inside > 0, axis=0) & has
+    area = jnp.where(seen, jnp.minimum(depth / jnp.maximum(usual, 1e-3), FARTHER) ** 2, 0.0)
+    far = jnp.where(near[::STRIDE, ::STRIDE].reshape(-1), 0.0, area)
+    first, second, area, far = block_sums(jnp.stack([*cost, area, far]), camera)
+    vote = jnp.clip((first - second) / DECISIVE, -1.0, 1.0)
+    whole, part = (jnp.sum(weight * vote) / jnp.maximum(jnp.sum(weight), 1e-6) for weight in (area, far))
+    return Margin(whole, part)
