@@ -91,7 +91,7 @@ class BodyAware:
     Attributes:
         first: Makes the first attempt at a frame.
         search: What that is; it makes all others.
-        is_eager: Whether it learns what moves from a motion that may be a body's, too.
+        is_eager: Whether it learns what moves from a motion that may be a body's, too, and asks for no other one.
     """
 
     first: Aligner
@@ -141,13 +141,28 @@ class BodyAware:
         attempt, look = self._agreed(state, frame, clock, first)
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
-        if (arisen > SUSPICIOUS and attempt is first) or (not attempt.usable and (np.any(before) or np.any(found))):
+        is_lost = not attempt.usable and (np.any(before) or np.any(found))
+        if not self.is_eager and ((arisen > SUSPICIOUS and attempt is first) or is_lost):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 attempt, is_carried = self._go_on(state, clock, attempt, covered=float(np.mean(before)))
                 carried = is_carried * (int(scene.carried) + 1)
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
+        return self._remember(state, frame, clock, attempt, look, found, carried)
+
+    def _remember(
+        self,
+        state: AwareState,
+        frame: Frame,
+        clock: Clock,
+        attempt: Attempt,
+        look: Look,
+        found: Integer[np.ndarray, "h w"],
+        carried: int,
+    ) -> Attempt:
+        """An attempt as it stands, with its bodies, and all that is known after it; of a motion in doubt nothing new."""
+        scene, retina = state.scene, self.retina
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
         if dissent > MISTRUSTED:
             attempt = mistrusted(attempt)

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
@@ -204,7 +203,7 @@ class WithRival:
         roll = Roll.empty(retina.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
         roll.numbers[0] = number
         scene = state.scene._replace(
-            known=jnp.asarray(near, jnp.float32),
+            known=np.asarray(near, np.float32),  # pyright: ignore[reportArgumentType]
             suspected=np.asarray(near, np.float32),
             roll=roll,
             carried=np.zeros((), np.int32),
@@ -215,8 +214,8 @@ class WithRival:
 
 
 def _view(state: AwareState) -> View:
-    """Of the last frame."""
-    return jax.tree.map(lambda leaf: leaf[0], state.scene.views)
+    """Of the last frame, on the host: to slice a device's array takes a program."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 
 def _distance(first: Alignment, second: Alignment) -> float:

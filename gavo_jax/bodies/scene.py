@@ -153,7 +153,7 @@ class Retina:
 
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
-        return without_points(tracker, self.planes, jnp.asarray(mask), self.levels)
+        return without_points(tracker, self.planes, mask, self.levels)
 
 
 @partial(CachedProgram, static=("levels",), returns=(Look,))
