@@ -135,7 +135,7 @@ class BodyAware:
 
     def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:
         """Align, and look what moves."""
-        scene, retina = state.scene, self.retina
+        scene = state.scene
         before = np.asarray(scene.roll.labels) > 0
         first = self.first.align(state.tracker, frame, clock)
         attempt, look = self._agreed(state, frame, clock, first)
@@ -161,7 +161,7 @@ class BodyAware:
         found: Integer[np.ndarray, "h w"],
         carried: int,
     ) -> Attempt:
-        """An attempt as it stands, with its bodies, and all that is known after it; of a motion in doubt nothing new."""
+        """An attempt with its bodies and all that is known after it; from a motion in doubt nothing is learnt."""
         scene, retina = state.scene, self.retina
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
         if dissent > MISTRUSTED:
