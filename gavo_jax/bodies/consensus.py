@@ -139,9 +139,7 @@ def _equations(
     plane = image_plane(camera)
     compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_here[None], camera, STRIDE)
     r = jax.tree.map(lambda leaf: leaf[0], compared.residuals)
-    depth = jnp.where(compared.inverse_depth > 0, 1.0 / jnp.maximum(compared.inverse_depth, 1e-3), jnp.nan)
-    usual = middle_of_many(jnp.nan_to_num(depth), compared.inverse_depth > 0)
-    area = jnp.nan_to_num(jnp.minimum(depth / jnp.maximum(usual, 1e-3), FARTHER) ** 2)
+    area = surface_area(compared.inverse_depth)
     counted = credit[::STRIDE, ::STRIDE].reshape(-1) * area * r.inside
     nothing = jnp.zeros_like(r.grey)
     along_grey = Slopes(r.grey_sample.along_u, r.grey_sample.along_v, nothing)
@@ -163,6 +161,13 @@ def _equations(
     size = jnp.trace(hessian, axis1=1, axis2=2)[:, None, None]
     inverse = _inverses(hessian + (1e-3 * size + 1.0) * jnp.eye(6))
     return Blocks(hessian, gradient, inverse, credit)
+
+
+def surface_area(inverse_depth: Float[Array, " n"]) -> Float[Array, " n"]:
+    """How large a surface each pixel shows, in those of the usual depth; 0 where there is no reading."""
+    has = inverse_depth > 0
+    depth = jnp.where(has, 1.0 / jnp.maximum(inverse_depth, 1e-3), 0.0)
+    return jnp.minimum(depth / jnp.maximum(middle_of_many(depth, has), 1e-3), FARTHER) ** 2
 
 
 def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+import numpy as np
+from jaxtyping import Array, Float, Float64, UInt32
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import Levels, image_plane
-from gavo_jax.image.sampling import GreySample, Target, look_up, sample_depth, sample_grey
+from gavo_jax.image.sampling import INVERSE_DEPTH_STEP, GreySample, Target, look_up, sample_depth, sample_grey
 from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
@@ -44,6 +45,11 @@ def view_of(packed: Target, levels: Levels, sweep: Float[Array, " 6"]) -> View:
     (row, column), (height, width) = levels.layout.corners[place], levels.sizes[place]
     cut: list[UInt32[Array, "h w"]] = [channel[row : row + height, column : column + width] for channel in packed]
     return View(Target(*cut), sweep)
+
+
+def inverse_depth_of(view: View) -> Float64[np.ndarray, "h w"]:
+    """1/z of a view's pixels, on the host; 0 where there is no reading."""
+    return (np.asarray(view.image.depth) & 65535) * INVERSE_DEPTH_STEP
 
 
 class Evidence(NamedTuple):

@@ -8,12 +8,12 @@ from jaxtyping import Float64, Integer
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.belief import Belief
+from gavo_jax.bodies.evidence import inverse_depth_of
 from gavo_jax.bodies.identity import Roll, identify
 from gavo_jax.bodies.records import Seen
 from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
 from gavo_jax.objective.points import Reference, unsettle_reference
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
@@ -46,7 +46,7 @@ def find_motions(
     before = Roll(*map(np.asarray, state.scene.roll))
     roll = identify(found, before)
     moving = np.asarray(belief.moving)
-    depth = _inverse_depth(attempt, aware.retina)
+    depth = inverse_depth_of(aware.retina.view(attempt.state))
     seen = []
     for place, (number, age) in enumerate(zip(roll.numbers, roll.ages, strict=True)):
         part = (roll.labels == number) & (found > 0)
@@ -81,11 +81,6 @@ def _unsettled(whole: Reference, tracker: TrackerState, retina: Retina) -> Refer
     """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
     twist = tracker.motion * (retina.full.readout / tracker.seconds)
     return unsettle_reference(whole, twist, retina.planes)
-
-
-def _inverse_depth(attempt: Attempt, retina: Retina) -> Float64[np.ndarray, "h w"]:
-    """1/z of the new frame's pixels; 0 where there is no reading."""
-    return (np.asarray(retina.view(attempt.state).image.depth) & 65535) * INVERSE_DEPTH_STEP
 
 
 def _centroid(part: np.ndarray, inverse_depth: Float64[np.ndarray, "h w"], retina: Retina) -> Float64[np.ndarray, " 3"]:

@@ -7,7 +7,6 @@ its own is the camera's motion if it is well determined and contradicts the othe
 the other way round.
 """
 
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,13 +18,12 @@ from jaxtyping import Bool, Float, Float64
 from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.aligner import BodyAware, mistrusted
-from gavo_jax.bodies.evidence import View
+from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.sampling import INVERSE_DEPTH_STEP
 from gavo_jax.mapping.motions import log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
@@ -110,14 +108,8 @@ class WithRival:
         return BodyAware(self.first.search, self.first.search, is_eager=True)
 
     def warm_up(self) -> float:
-        """That of the first one; votes are loaded where they were compiled before, as few runs need them."""
-        seconds, start = self.first.warm_up(), time.perf_counter()
-        state = self.first.blank_state()
-        view = _view(state)
-        inputs = view, view, np.stack([np.eye(4, dtype=np.float32)] * 2), np.zeros(self.first.retina.size, bool)
-        if vote.is_kept(*inputs, self.first.retina.camera):
-            jax.block_until_ready(vote(*inputs, self.first.retina.camera))
-        return seconds + time.perf_counter() - start
+        """That of the first one; votes are compiled, or loaded, when they are needed: few runs do."""
+        return self.first.warm_up()
 
     def blank_state(self) -> RivalledState:
         """The state before the first frame, in the shapes and types of every state."""
@@ -187,18 +179,23 @@ class WithRival:
         )
         return attempt._replace(state=RivalledState(attempt.state, after))
 
+    @cached_property
+    def _nobody(self) -> Rival:
+        """No rival, in the shapes and types of every one."""
+        blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
+        nothing = np.zeros(self.first.retina.size, bool)
+        return Rival(blank, _view(blank), nothing, still, still, np.int32(-1), np.float32(0), np.int32(0))
+
     def _alone(self, state: AwareState) -> RivalledState:
         """A state without a rival."""
-        still, nothing = np.eye(4, dtype=np.float32), np.zeros(self.first.retina.size, bool)
-        rival = Rival(state, _view(state), nothing, still, still, np.int32(-1), np.float32(0), np.int32(0))
-        return RivalledState(state, rival)
+        return RivalledState(state, self._nobody)
 
     def _rival_of(self, state: AwareState) -> Rival:
         """The motion of what the last frame shows behind all that stands before other surfaces, from here on."""
-        rival, retina = self._alone(state).rival, self.first.retina
-        near = nearer_part((np.asarray(rival.anchor.image.depth) & 65535) * INVERSE_DEPTH_STEP)
+        retina, anchor = self.first.retina, _view(state)
+        near = nearer_part(inverse_depth_of(anchor))
         if not np.any(near):
-            return rival
+            return self._nobody
         number = np.int32(state.scene.roll.last + 1)
         roll = Roll.empty(retina.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
         roll.numbers[0] = number
@@ -210,7 +207,7 @@ class WithRival:
         )
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
         seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
-        return rival._replace(state=seen, near=near, age=np.int32(0))
+        return self._nobody._replace(state=seen, anchor=anchor, near=near, age=np.int32(0))
 
 
 def _view(state: AwareState) -> View:

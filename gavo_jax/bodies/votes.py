@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.consensus import FARTHER, LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, middle_of_many
+from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, middle_of_many, surface_area
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.program_cache import CachedProgram
@@ -53,10 +53,8 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
         scale = jnp.maximum(1.48 * middle_of_many(better, both), least)
         t = jnp.log1p((residual / scale) ** 2 / FREEDOM)
         cost += jnp.where(both, 0.5 * (FREEDOM + 1.0) * t, 0.0)
-    depth = jnp.where(has, 1.0 / jnp.maximum(q, 1e-3), 0.0)
-    usual = middle_of_many(depth, has)
     seen = jnp.all(r.inside > 0, axis=0) & has
-    area = jnp.where(seen, jnp.minimum(depth / jnp.maximum(usual, 1e-3), FARTHER) ** 2, 0.0)
+    area = jnp.where(seen, surface_area(q), 0.0)
     far = jnp.where(near[::STRIDE, ::STRIDE].reshape(-1), 0.0, area)
     first, second, area, far = block_sums(jnp.stack([*cost, area, far]), camera)
     vote = jnp.clip((first - second) / DECISIVE, -1.0, 1.0)
