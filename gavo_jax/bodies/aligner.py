@@ -63,6 +63,8 @@ SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
 """Deviation, metres and radians, of a motion that goes on as before."""
+UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
+"""Covariance of a motion that images do not tell."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
@@ -145,8 +147,9 @@ class BodyAware:
         if not self.is_eager and ((arisen > SUSPICIOUS and attempt is first) or is_lost):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
-                attempt, is_carried = self._go_on(state, clock, attempt, covered=float(np.mean(before)))
-                carried = is_carried * (int(scene.carried) + 1)
+                found_none = attempt
+                attempt = self._go_on(state, clock, found_none, covered=float(np.mean(before)))
+                carried = 0 if attempt is found_none else int(scene.carried) + 1
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
         return self._remember(state, frame, clock, attempt, look, found, carried)
@@ -241,14 +244,14 @@ class BodyAware:
                 break
         return _judged(best, tried, bool(np.any(np.asarray(scene.roll.labels))))
 
-    def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> tuple[Attempt, bool]:
+    def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion
-        or, of an image that is covered for the most part, nothing; and whether it needed that.
+        or, of an image that is covered for the most part, nothing; else the attempt as it is.
         """
         result = attempt.result
         if int(result.findings) == bit(AlignmentStatus.LOW_TEXTURE) and np.all(np.isfinite(result.covariance)):
-            return self._completed(state, clock, attempt), True
-        return (self._carry_on(state, clock, attempt), True) if covered > LARGE else (attempt, False)
+            return self._completed(state, clock, attempt)
+        return self._carry_on(state, clock, attempt) if covered > LARGE else attempt
 
     def _completed(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
@@ -264,9 +267,10 @@ class BodyAware:
     def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with the motion that the camera has if it goes on as before."""
         motion = self.predict(state, float(clock.elapsed))
-        attempt = _moved(state, attempt, motion, np.diag(np.full(6, UNDETERMINED**2)))
+        attempt = _moved(state, attempt, motion, UNKNOWN)
         findings = bit(AlignmentStatus.MOVING_BODY)
-        return attempt._replace(result=attempt.result._replace(status=AlignmentStatus.MOVING_BODY, findings=findings))
+        result = attempt.result._replace(status=AlignmentStatus.MOVING_BODY, findings=findings)
+        return attempt._replace(result=result, unknown=1)
 
 
 def _moved(

@@ -159,7 +159,7 @@ def _after(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"
 
 def follow(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Suspicions carried with their surfaces, which may have moved, and spread to what of these was not seen before."""
-    same = _seen_before(e, 2.0 * FAR)
+    same = _seen_before(e, 2.0 * FAR) & (e.measured[0] > 0)
     across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))
 
     def spread(_: int, s: jax.Array) -> jax.Array:

@@ -15,9 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.bodies.aligner import BodyAware, mistrusted
+from gavo_jax.bodies.aligner import UNKNOWN, BodyAware, mistrusted
 from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.scene import AwareState
@@ -38,13 +37,15 @@ AGREED_AFTER, DROPPED_AFTER = 5, 12
 """Frames after which a rival is dropped if it is the same motion; if nothing is decided."""
 DROPPED_EARLY, LEAST_DOUBT = 5, 20.0
 """Frames after which it is dropped if the first one's motion is within its covariance as often as not."""
+DECIDED, FORGOTTEN = -1, 30
+"""No frames: it is clear whose motion the first one's is. And so many after which it counts as clear."""
 REMEMBERED = 3
 """Frames whose contradictions are averaged, about."""
 LARGEST = 100.0
 """Of a squared Mahalanobis distance, so that one frame can't decide."""
-CONTRADICTED = 45.0
+CONTRADICTED = 30.0
 """Mean of these from which on the far part contradicts the first motion;"""
-CLEAR, DOUBTFUL = 0.85, 0.5
+CLEAR, DOUBTFUL = 0.75, 0.5
 """as a share of the largest, together with the far part's margin: from the first on the rival is taken, from the second
 on the first one's motion may be a body's."""
 MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
@@ -85,6 +86,8 @@ class RivalledState(NamedTuple):
 
     first: AwareState
     rival: Rival
+    open_for: Any
+    """Frames for which it has been open whether the first one's motion is the camera's; -1 where it is not."""
 
     @property
     def tracker(self) -> TrackerState:
@@ -113,12 +116,13 @@ class WithRival:
 
     def blank_state(self) -> RivalledState:
         """The state before the first frame, in the shapes and types of every state."""
-        return self._alone(self.first.blank_state())
+        return self._alone(self.first.blank_state(), DECIDED)
 
     def start(self, frame: Frame) -> RivalledState:
         """A scene in which nothing is known to move, and a rival if something stands before the rest."""
         state = self.first.start(frame)
-        return RivalledState(state, self._rival_of(state))
+        rival = self._rival_of(state)
+        return RivalledState(state, rival, np.int32(0 if rival.is_there else DECIDED))
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the first one."""
@@ -128,19 +132,22 @@ class WithRival:
         """The first one's attempt, or the rival's once that is clearly the camera's motion."""
         attempt = self.first.align(state.first, frame, clock)
         own: AwareState = attempt.state
-        rival = state.rival
-        if not attempt.usable:
-            return attempt._replace(state=RivalledState(own, rival))
-        if not rival.is_there and own.is_doubted:
+        rival, open_for = state.rival, int(state.open_for)
+        if not rival.is_there and own.is_doubted and attempt.usable:
             rival = self._rival_of(state.first)
+            open_for = max(open_for, 0) if rival.is_there else open_for
+        open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
+        if not attempt.usable:
+            return attempt._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if not rival.is_there:
-            return attempt._replace(state=self._alone(own))
+            return attempt._replace(state=self._alone(own, open_for))
         other = self.second.align(rival.state, frame, clock)
-        if not other.usable:
-            return attempt._replace(state=self._alone(own))
-        return self._decide(attempt, other, rival)
+        if other.usable:
+            return self._decide(attempt, other, rival, open_for)
+        again = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
+        return attempt._replace(state=RivalledState(own, again, np.int32(open_for)))
 
-    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival) -> Attempt:
+    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:
         """Which of two attempts at a frame stands for it, and whether the rival is kept."""
         before = np.asarray(rival.first_T_anchor, np.float64)
         first = np.asarray(attempt.result.target_T_reference) @ before
@@ -149,9 +156,11 @@ class WithRival:
         new = min(_distance(attempt.result, other.result), LARGEST)
         contradiction = float(rival.contradiction) + max(1 / age, 1 / REMEMBERED) * (new - float(rival.contradiction))
         apart, deviation = _between(first, second), float(np.sqrt(np.trace(other.result.covariance[:3, :3])))
-        alone = attempt._replace(state=self._alone(attempt.state))
-        if not deviation < VAGUE or (age >= AGREED_AFTER and not _exceeds(apart, TOGETHER)):
-            return alone
+        if not deviation < VAGUE:
+            return attempt._replace(state=self._alone(attempt.state, open_for))
+        confirmed = attempt._replace(state=self._alone(attempt.state, DECIDED))
+        if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
+            return confirmed
         ahead = 0
         if _exceeds(apart, APART):
             motions = np.stack([first, second]).astype(np.float32)
@@ -162,11 +171,14 @@ class WithRival:
             contradicts = age >= FRAMES and contradiction > CONTRADICTED and certainty > CLEAR
             if deviation < EXACT and (contradicts or ahead >= FRAMES or whole > LANDSLIDE):
                 result = _returned(other.result, second @ inverse(before))
-                return mistrusted(other._replace(state=self._alone(other.state), result=result))
+                state = self._alone(other.state, DECIDED)
+                return mistrusted(other._replace(state=state, result=result, unknown=max(open_for - age, 0)))
             if age >= FRAMES and certainty > DOUBTFUL and contradiction > DOUBTFUL * CONTRADICTED:
                 attempt = mistrusted(attempt)
-        if age > DROPPED_AFTER or (age >= DROPPED_EARLY and contradiction < LEAST_DOUBT):
-            return alone
+        if age >= DROPPED_EARLY and contradiction < LEAST_DOUBT:
+            return confirmed
+        if age > DROPPED_AFTER:
+            return attempt._replace(state=self._alone(attempt.state, open_for))
         after = Rival(
             other.state,
             rival.anchor,
@@ -177,7 +189,7 @@ class WithRival:
             np.float32(contradiction),
             np.int32(ahead),
         )
-        return attempt._replace(state=RivalledState(attempt.state, after))
+        return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
 
     @cached_property
     def _nobody(self) -> Rival:
@@ -186,9 +198,9 @@ class WithRival:
         nothing = np.zeros(self.first.retina.size, bool)
         return Rival(blank, _view(blank), nothing, still, still, np.int32(-1), np.float32(0), np.int32(0))
 
-    def _alone(self, state: AwareState) -> RivalledState:
+    def _alone(self, state: AwareState, open_for: int) -> RivalledState:
         """A state without a rival."""
-        return RivalledState(state, self._nobody)
+        return RivalledState(state, self._nobody, np.int32(open_for))
 
     def _rival_of(self, state: AwareState) -> Rival:
         """The motion of what the last frame shows behind all that stands before other surfaces, from here on."""
@@ -236,5 +248,5 @@ def _returned(result: Alignment, motion: Float64[np.ndarray, "4 4"]) -> Alignmen
     return result._replace(
         target_T_reference=motion,
         xi=log(motion).astype(np.float32),
-        covariance=np.diag(np.full(6, UNDETERMINED**2, np.float32)),
+        covariance=UNKNOWN,
     )

@@ -20,6 +20,8 @@ LEAST_BORDER = 8
 """pixels of such a border at least,"""
 LEAST_AREA = 0.015
 """and share of the image."""
+MOST_TOGETHER = 0.5
+"""Share of the image up to which smaller surfaces than the largest one count, too."""
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 """Share of the image that may move together; less or more is not worth to ask about."""
 BINS = 64
@@ -57,6 +59,9 @@ def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray,
             behind += np.bincount(np.where(is_nearer, second, first), minlength=count)
     area = np.bincount(labels.ravel(), minlength=count) / labels.size
     chosen = (area > LEAST_AREA) & (before > BEFORE * (before + behind)) & (before >= LEAST_BORDER)
+    largest_first = np.argsort(-np.where(chosen, area, 0.0))
+    together = np.cumsum(np.where(chosen, area, 0.0)[largest_first])
+    chosen[largest_first[1:][together[1:] > MOST_TOGETHER]] = False
     return chosen[labels] & (inverse_depth > 0)
 
 

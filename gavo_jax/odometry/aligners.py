@@ -43,6 +43,8 @@ class Attempt(NamedTuple):
     """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
     bodies: tuple[Seen, ...] = ()
     """What moves on its own, as far as that was asked."""
+    unknown: int = 0
+    """So many of the last motions, this one included, are guesses."""
 
 
 class Aligner(Protocol):

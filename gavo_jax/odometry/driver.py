@@ -53,7 +53,7 @@ class Step:
     """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
     origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
     """Of the pose: from the reference, from a keyframe of the map (then that is the pair's reference), or from nothing
-    (a lost pair)."""
+    (a lost pair, or a motion that is taken to have gone on behind a body)."""
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
 
@@ -106,6 +106,8 @@ class Progress(NamedTuple):
     """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
     doubted: bool = False
     """Whether the last frame's depth did not agree with its image."""
+    unknown: int = 0
+    """So many of the last motions are guesses that frames have been chained by."""
 
 
 class Odometry:
@@ -191,7 +193,7 @@ class Odometry:
             bodies = tuple(
                 in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
             )
-        origin, reference_timestamp = "guessed" if lost else "tracked", before.reference_timestamp
+        origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
             after = after._replace(
@@ -199,6 +201,7 @@ class Odometry:
                 world_T_camera=found.world_T_camera,
                 segment=found.segment,
                 adrift=0,
+                unknown=0,
             )
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
             bodies = ()  # those that were seen moved against the last frame, which is not the reference any more
@@ -242,6 +245,7 @@ class Odometry:
             world_T_reference=before.world_T_camera,
             held=0,
             doubted=False,
+            unknown=0,
         )
 
     def _advance(
@@ -263,6 +267,12 @@ class Odometry:
         result = with_finding(result, finding.status)
         world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1, doubted=doubted)
+        if attempt.unknown:
+            after = after._replace(unknown=before.unknown + attempt.unknown)
+        elif before.unknown:
+            after = after._replace(unknown=0)
+            if before.unknown >= MAX_HELD:  # too many to go on in the same world
+                after = after._replace(segment=before.segment + 1, adrift=1)
         overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
         if attempt.fit and (finding.use is Use.ALL or overdue):
             after = after._replace(

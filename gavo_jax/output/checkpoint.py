@@ -58,6 +58,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "segment": progress.segment,
         "adrift": progress.adrift,
         "doubted": progress.doubted,
+        "unknown": progress.unknown,
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
