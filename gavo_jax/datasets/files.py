@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple, overload
@@ -17,11 +17,9 @@ from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, co
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.images import read_color, read_depth
+from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
-
-TRUTH = "groundtruth.txt"
-"""The true trajectory, in TUM's form, where it lies in a folder."""
 
 SAMPLED = 3
 """Frames, from the first to the last, that show what kind of images a sequence has."""
@@ -234,23 +232,6 @@ def own_camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
 
 
-def truth_in(folder: Path, unit: float = 1.0) -> Trajectory | None:
-    """The true trajectory that lies in a folder, if one does.
-
-    Args:
-        folder: of the frames.
-        unit: seconds of what the frames' stamps count; it holds for the truth's, too, where all are whole numbers.
-
-    Raises:
-        GavoError: it cannot be read.
-    """
-    if not (folder / TRUTH).exists():
-        return None
-    truth = Trajectory.read_tum(folder / TRUTH)
-    whole = np.array_equal(truth.timestamps, np.round(truth.timestamps))
-    return replace(truth, timestamps=unit * truth.timestamps) if whole and unit != 1 else truth
-
-
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
     """What of the colour and depth images makes no frame, a line each."""
     return [
@@ -261,7 +242,7 @@ def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
 
 
 def preset_by_name(folder: Path) -> Calibration:
-    """The preset that a folder's name speaks of.
+    """The preset that a folder's name speaks of, or the trajectory in it.
 
     Raises:
         GavoError: it speaks of none; the message says what would help.
@@ -269,6 +250,8 @@ def preset_by_name(folder: Path) -> Calibration:
     try:
         return load_calibration(preset_for_sequence(folder.resolve().name))
     except GavoError as error:
+        if icl_truth(folder) is not None:
+            return load_calibration("icl")
         raise GavoError(f"{folder}: no camera file in it, and {error}") from None
 
 

@@ -4,11 +4,11 @@ Each class says how its folder is recognised, where the images and poses lie, an
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -24,11 +24,11 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_first,
-    truth_in,
     unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, stamps
+from gavo_jax.datasets.truth import MAX_POSE_BYTES, Seconds, pose_files, pose_of, truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -40,11 +40,6 @@ DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img")
 """In the names of colour images that lie beside depth; the latter where the former say nothing."""
-
-MAX_POSE_BYTES = 4096
-
-SKEWED = 0.01
-"""A pose whose rotation is off one by more is none."""
 
 
 class NumberedFolder(FileSequence):
@@ -139,7 +134,7 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A file for each frame."""
-        return _pose_files(path.glob("frame-*.pose.txt"))
+        return pose_files(images_among(path.glob("frame-*.pose.txt"), (".txt",)))
 
 
 class ScanNet(NumberedFolder):
@@ -175,7 +170,7 @@ class ScanNet(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A file for each frame; those of frames that were not tracked hold infinities."""
-        return _pose_files((path / "pose").glob("*.txt"))
+        return pose_files(images_among((path / "pose").glob("*.txt"), (".txt",)))
 
 
 class Replica(NumberedFolder):
@@ -207,7 +202,7 @@ class Replica(NumberedFolder):
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame."""
         rows = data_rows(path / "traj.txt")
-        return {number: pose for number, (place, row) in enumerate(rows) if (pose := _pose(place, row)) is not None}
+        return {number: pose for number, (place, row) in enumerate(rows) if (pose := pose_of(place, row)) is not None}
 
 
 class PlainFolder(FileSequence):
@@ -247,12 +242,12 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = _plain_files(path)
-        by_stamp = _by_stamp(path, color, depth, reading)
-        entries, left_out = by_stamp or _by_number(path, color, depth, reading)
+        entries, left_out, times, seconds = _by_stamp(path, color, depth, reading) or _by_number(
+            path, color, depth, reading
+        )
         own = partial(cls.calibrate, path, entries[0], reading)
         calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
-        truth = truth_in(path, 1.0 if by_stamp else 1 / (reading.rate or RATE))
-        return cls(root.name, entries, calibration, truth, reading, left_out)
+        return cls(root.name, entries, calibration, truth_in(path, seconds, times), reading, left_out)
 
 
 class Open3DFolder(PlainFolder):
@@ -301,9 +296,18 @@ def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     return next(filter(None, named), []), depth
 
 
-def _by_stamp(
-    path: Path, color: list[Path], depth: list[Path], reading: Reading
-) -> tuple[list[Entry], list[str]] | None:
+class _Paired(NamedTuple):
+    """Frames of a plain folder."""
+
+    entries: list[Entry]
+    left_out: list[str]
+    times: dict[int, float]
+    """Of each depth image, by the number in its name, else by its place, from 1."""
+    seconds: Seconds | None
+    """Times by numbers, where the names are those."""
+
+
+def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired | None:
     """Frames by the stamps that all names are; None where they are none, or the rate is said."""
     found = [None if reading.rate else stamps([file.stem for file in files]) for files in (color, depth)]
     if found[0] is None or found[1] is None:
@@ -317,10 +321,13 @@ def _by_stamp(
         )
     entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
     left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s")
-    return sorted(entries, key=lambda entry: entry.stamp), left_out
+    of_frames = second.copy()
+    of_frames[j] = first[i]
+    times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
+    return _Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
 
 
-def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> tuple[list[Entry], list[str]]:
+def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired:
     """Frames by the numbers in the names."""
     found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
@@ -329,7 +336,8 @@ def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Readin
         raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
     rate = reading.rate or RATE
     entries = [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers]
-    return entries, found.unpaired(len(numbers))
+    times = {n: n / rate for n in found.depth}
+    return _Paired(entries, found.unpaired(len(numbers)), times, lambda counts: counts / rate)
 
 
 def _millimetres(calibration: Calibration) -> Calibration:
@@ -341,37 +349,6 @@ def _check_identity(file: Path) -> None:
     """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
     if not file.is_file():
         return
-    pose = _pose(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+    pose = pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
-
-
-def _pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
-    poses = {}
-    for file in images_among(files, (".txt",)):
-        numbers = re.findall(r"\d+", file.name)
-        fields = [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row]
-        pose = _pose(str(file), fields)
-        if pose is not None and numbers and len(numbers[-1]) <= 18:
-            poses[int(numbers[-1])] = pose
-    return poses
-
-
-def _pose(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
-    """A rigid transform from sixteen numbers, row by row; None where it is not finite: the frame was not tracked.
-
-    Raises:
-        GavoError: no sixteen numbers, or no rigid transform.
-    """
-    try:
-        matrix = np.array([float(field) for field in fields]).reshape(4, 4)
-    except ValueError:
-        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
-    if not np.isfinite(matrix).all():
-        return None
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    rotation = u @ vt
-    if np.abs(rotation - matrix[:3, :3]).max() > SKEWED or np.linalg.det(rotation) < 0:
-        raise GavoError(f"{place}: the pose is no rotation and shift")
-    matrix[:3, :3] = rotation
-    return matrix

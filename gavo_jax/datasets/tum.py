@@ -21,10 +21,10 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_first,
-    truth_in,
     unpaired,
 )
 from gavo_jax.datasets.names import unit_of
+from gavo_jax.datasets.truth import truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import associate
 
@@ -112,7 +112,7 @@ class TumSequence(FileSequence):
             name or resolved.name,
             files,
             reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_first, files)),
-            truth_in(self.folder, unit),
+            truth_in(self.folder, None if unit == 1 else lambda counts: unit * counts),
             reading,
             unpaired((len(color_rows), len(depth_rows)), len(entries), why),
         )

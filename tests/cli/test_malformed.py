@@ -175,6 +175,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("camera_intrinsic.json", json.dumps({"width": 160, "height": 120, "intrinsic_matrix": [1, 2]})),
         ["camera_intrinsic.json", "Open3D"],
     ),
+    "open3d: a log of prose": (
+        "open3d",
+        write("trajectory.log", "left, then right\n"),
+        ["trajectory.log:1", "three whole numbers", "left then right"],
+    ),
+    "tum: icl's truth, twice": (
+        "associations",
+        lambda clip: [write(f"{i}.gt.freiburg", "1 0 0 0 0 0 0 1\n")(clip) for i in "ab"],
+        ["clip: a.gt.freiburg and b.gt.freiburg", "leave one"],
+    ),
     "plain: no camera": ("plain", remove("camera.yaml"), ["clip", "no camera file", "no camera known", "--camera"]),
     "plain: YAML that is none": ("plain", write("camera.yaml", "fx: [1, 2"), ["camera.yaml", "not YAML"]),
     "plain: stamps that never meet": (
