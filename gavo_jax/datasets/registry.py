@@ -15,6 +15,23 @@ from gavo_jax.errors import GavoError, blamed
 PLUGINS = "gavo_jax.datasets"
 """Group of entry points through which other packages bring kinds of sources."""
 
+PACKED = {
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".zip": "unzip",
+    ".7z": "7z x",
+    ".rar": "unrar x",
+    ".gz": "gunzip",
+    ".bz2": "bunzip2",
+    ".xz": "unxz",
+    ".lz4": "unlz4",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+}
+"""Endings of files from which a source is to be unpacked first, and by what."""
+
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+
 SHOWN = 5
 """Names that a message lists."""
 
@@ -126,14 +143,27 @@ def _contents(path: Path) -> str:
     if not path.is_dir():
         if path.is_file() and _kind_of(path.parent) is not None:
             return f"a file of a source, whose folder is to be named: {path.parent}"
-        return f"a file of {path.stat().st_size} bytes, not one of: {known}"
+        return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
+    if len(inside) == 1 and inside[0].is_file() and (words := _inside(inside[0])):
+        return f"{inside[0].name}: {words}"
     if not inside:
         return f"an empty folder, not one of: {known}"
     sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
         return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+
+
+def _inside(file: Path) -> str | None:
+    """How what a file holds becomes a source, where its name tells."""
+    endings = [suffix.lower() for suffix in file.suffixes]
+    if endings[-2:] == [".bag", ".active"]:
+        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+    if endings[-1:] and endings[-1] in FILMS:
+        return "a film: write its frames as images, with those of depth beside them"
+    how = PACKED.get(endings[-1]) if endings else None
+    return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
 
 
 def _listed(names: list[str]) -> str:

@@ -255,7 +255,7 @@ def file_of(name: str, content: bytes) -> Callable[[Path], Path]:
 OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "nowhere": (lambda path: path / "nowhere", ["nowhere", "no such folder or file", "synthetic"]),
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
-    "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a file of 100 bytes", "not one of"]),
+    "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
     "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
     "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),
     "bag: torn": (torn_bag, ["x.bag"]),
