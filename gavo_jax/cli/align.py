@@ -13,8 +13,8 @@ from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
-from gavo_jax.datasets.depth_unit import fault_of_scale
-from gavo_jax.datasets.files import Entry, Reading, open_pair, own_camera_file, preset_by_name, size_of_first
+from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
+from gavo_jax.datasets.files import Entry, Reading, open_pair, own_camera_file, preset_by_name, size_of_most
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
@@ -32,7 +32,7 @@ def align(options: Align) -> int:
     images = [(options.rgb0, options.depth0), (options.rgb1, options.depth1)]
     pair = open_pair(images, calibration, Reading(depth_scale=options.depth_scale))
     (reference, target), camera = pair, pair.camera
-    if not options.force and (fault := fault_of_scale(pair)):
+    if not options.force and (fault := lack_of_depth(pair) or fault_of_scale(pair)):
         raise GavoError(f"{options.depth0}: {fault}, or go on with --force")
     enable_compilation_cache()
     with waiting("compiling and aligning …"):
@@ -73,7 +73,7 @@ def in_words(found: Alignment) -> str:
 
 
 def _calibration(options: Align) -> Calibration:
-    size = partial(size_of_first, [Entry(0.0, options.rgb0, options.depth0)])
+    size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
     if options.camera != "auto":
         return load_calibration(options.camera, size)
     folder = options.rgb0.absolute().parent

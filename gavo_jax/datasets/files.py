@@ -1,6 +1,7 @@
 """Sequences whose frames lie as image files."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -215,7 +216,7 @@ class FileSequence:
         for entry in self.entries:
             for path in (entry.color, entry.depth):
                 if path is not None and not os.path.isfile(path):
-                    raise GavoError(f"{path}: image is missing: restore it, or take its row out of the list")
+                    raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
         self[0]
 
 
@@ -255,20 +256,35 @@ def preset_by_name(folder: Path) -> Calibration:
         raise GavoError(f"{folder}: no camera file in it, and {error}") from None
 
 
-def size_of_first(entries: Sequence[Entry]) -> Size:
-    """Width and height of the first colour image that can be read.
+def size_of_most(entries: Sequence[Entry]) -> Size:
+    """Width and height of most of the few colour images that are looked at, from the first to the last.
 
     Raises:
-        FrameError: why the first cannot, where none of the first few can.
+        FrameError: why the first of them cannot be read, where none can.
     """
     fault: FrameError | None = None
-    for entry in entries[:SAMPLED]:
+    sizes: Counter[Size] = Counter()
+    for at in _samples(len(entries)):
         try:
-            height, width = read_color(entry.color).shape[:2]
-            return width, height
+            height, width = read_color(entries[at].color).shape[:2]
+            sizes[width, height] += 1
         except FrameError as error:
             fault = fault or error
-    raise fault or FrameError("no frames")
+    if not sizes:
+        raise fault or FrameError("no frames")
+    return sizes.most_common(1)[0][0]
+
+
+def _samples(count: int) -> list[int]:
+    """Places of a few frames, from the first to the last."""
+    return sorted({round(share * (count - 1)) for share in np.linspace(0, 1, SAMPLED)}) if count else []
+
+
+def _instead(path: Path) -> str:
+    """What is there in the place of an image, which is no file."""
+    if path.is_symlink():
+        return f"a link to {os.readlink(path)[:200]}, which is missing"
+    return "not a file" if path.exists() else "image is missing"
 
 
 def resolve_folder(folder: Path) -> Path:
@@ -296,8 +312,8 @@ class _Images:
     @cached_property
     def assembler(self) -> FrameAssembler:
         colors, depths = [], []
-        for at in sorted({round(share * (len(self._entries) - 1)) for share in np.linspace(0, 1, SAMPLED)}):
-            entry = self._entries[max(at, 0)]
+        for at in _samples(len(self._entries)):
+            entry = self._entries[at]
             try:
                 colors.append(read_color(entry.color))
                 if entry.depth is not None:

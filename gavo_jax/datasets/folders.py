@@ -4,7 +4,7 @@ Each class says how its folder is recognised, where the images and poses lie, an
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from gavo_jax.datasets.files import (
     own_camera_file,
     preset_by_name,
     resolve_folder,
-    size_of_first,
+    size_of_most,
     unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
@@ -60,7 +60,7 @@ class NumberedFolder(FileSequence):
         raise NotImplementedError
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera that the folder, or the dataset, brings.
 
         Raises:
@@ -88,8 +88,8 @@ class NumberedFolder(FileSequence):
             counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
             raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
         entries = [Entry(number / rate, found.color[number], found.depth[number]) for number in numbers]
-        own = partial(cls.calibrate, path, entries[0], reading)
-        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
+        own = partial(cls.calibrate, path, entries, reading)
+        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
         poses = cls.poses(path)
         known = [number for number in numbers if number in poses]
         truth = None
@@ -123,13 +123,13 @@ class SevenScenes(NumberedFolder):
         return _found(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file beside the frames, or a scan's info.txt, else the dataset's."""
         infos = (path / name for name in ("info.txt", "_info.txt"))
         file = own_camera_file(path) or next((file for file in infos if file.is_file()), None)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
-        return _millimetres(load_calibration(file, partial(size_of_first, [first]), MILLIMETRES))
+        return _millimetres(load_calibration(file, partial(size_of_most, entries), MILLIMETRES))
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -153,15 +153,15 @@ class ScanNet(NumberedFolder):
         return _found((path / "color").glob("*"), (path / "depth").glob("*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The files of both cameras, as far as they are two; the scans say that nothing is to be turned or shifted."""
         color, depth = (path / "intrinsic" / f"intrinsic_{name}.txt" for name in ("color", "depth"))
-        found = _millimetres(load_calibration(color, partial(size_of_first, [first]), MILLIMETRES))
-        if not depth.is_file() or first.depth is None:
+        found = _millimetres(load_calibration(color, partial(size_of_most, entries), MILLIMETRES))
+        if not depth.is_file() or entries[0].depth is None:
             return found
         for name in ("color", "depth"):
             _check_identity(path / "intrinsic" / f"extrinsic_{name}.txt")
-        height, width = read_depth(first.depth).shape
+        height, width = read_depth(entries[0].depth).shape
         other = load_calibration(depth, (width, height), MILLIMETRES).color
         if other == found.color:
             return found
@@ -191,12 +191,12 @@ class Replica(NumberedFolder):
         return _found(results.glob("frame*"), results.glob("depth*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """cam_params.json of the room or of all rooms, else the one that they were rendered with."""
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one that Replica was rendered with")
-        return load_calibration(file, partial(size_of_first, [first]), cls.CAMERA.depth_scale)
+        return load_calibration(file, partial(size_of_most, entries), cls.CAMERA.depth_scale)
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -222,7 +222,7 @@ class PlainFolder(FileSequence):
         return bool(color and depth)
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file in the folder, or in the one above, else the preset that the folder's name speaks of.
 
         Raises:
@@ -231,7 +231,7 @@ class PlainFolder(FileSequence):
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             return preset_by_name(path)
-        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
@@ -245,8 +245,8 @@ class PlainFolder(FileSequence):
         entries, left_out, times, seconds = _by_stamp(path, color, depth, reading) or _by_number(
             path, color, depth, reading
         )
-        own = partial(cls.calibrate, path, entries[0], reading)
-        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
+        own = partial(cls.calibrate, path, entries, reading)
+        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
         return cls(root.name, entries, calibration, truth_in(path, seconds, times), reading, left_out)
 
 
@@ -261,11 +261,11 @@ class Open3DFolder(PlainFolder):
         return cls._intrinsics(path) is not None and super().recognises(path)
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The intrinsics' file; depth is in millimetres unless said otherwise."""
         file = cls._intrinsics(path)
         assert file is not None
-        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
     def _intrinsics(cls, path: Path) -> Path | None:
@@ -281,14 +281,27 @@ def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
+def missing_images(path: Path) -> str | None:
+    """Which kind of images a folder lacks that has folders for both."""
+    folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
+    kinds = (("colour", COLOR_FOLDERS, COLOR_SUFFIXES), ("depth", DEPTH_FOLDERS, DEPTH_SUFFIXES))
+    found = [next((folders[name] for name in names if name in folders), None) for _, names, _ in kinds]
+    for (kind, _, suffixes), folder in zip(kinds, found, strict=True):
+        if all(found) and folder is not None and not images_among(folder.glob("*"), (*suffixes, ".npy")):
+            inside = ", ".join(child.name[:60] for child in sorted(folder.glob("*"))[:2]) or "empty"
+            return f"no {kind} images in {folder.name} ({inside}): those end in {', '.join(suffixes)}"
+    return None
+
+
 def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth files, each in the order of their names."""
     folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
     for color in COLOR_FOLDERS:
         for depth in DEPTH_FOLDERS:
             if color in folders and depth in folders:
-                files = (folders[color].glob("*"), folders[depth].glob("*"))
-                return images_among(files[0], COLOR_SUFFIXES), images_among(files[1], DEPTH_SUFFIXES)
+                files = list(folders[color].glob("*"))
+                some = images_among(files, COLOR_SUFFIXES) or images_among(files, (".npy",))
+                return some, images_among(folders[depth].glob("*"), DEPTH_SUFFIXES)
     files = list(path.glob("*"))
     depth = [file for file in images_among(files, DEPTH_SUFFIXES) if "depth" in file.name.lower()]
     others = [file for file in images_among(files, COLOR_SUFFIXES) if "depth" not in file.name.lower()]

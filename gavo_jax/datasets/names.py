@@ -26,8 +26,11 @@ DEVICE_INTERVALS = (2e-3, 1.0)
 MILLISECONDS, JITTER = (5, 200), 2
 """Steps between whole numbers that may be milliseconds, if they differ, and by no more than so much."""
 
-MOST_DIGITS = 18
-"""What is longer is no number of a frame."""
+MOST_DIGITS = 15
+"""What is longer is no number of a frame: floats do not tell it from its neighbours."""
+
+FEWEST = 10
+"""Images of each kind, numbered without a gap, of which it is told that the two count from different numbers."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)(?:[.,_-](\d{3,9}))?$"
@@ -69,7 +72,25 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     if found and not usable:
         odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
-    return max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
+    chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
+    _check_start(chosen)
+    return chosen
+
+
+def _check_start(found: Found) -> None:
+    """Refuse as many images of both kinds, each without a gap, that begin with other numbers.
+
+    Whether one number or one place in the order is one frame is open then.
+    """
+    color, depth = found
+    if len(color) != len(depth) or len(color) < FEWEST or color.keys() == depth.keys():
+        return
+    (a, b), (c, d) = ((min(images), max(images)) for images in found)
+    if b - a + 1 == d - c + 1 == len(color):
+        raise GavoError(
+            f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
+            "number, or leave those without a partner out"
+        )
 
 
 def _numbers(file: Path) -> list[int]:
@@ -131,7 +152,7 @@ def _counts(names: Sequence[str]) -> list[float] | None:
 
 def unit_of(counts: Sequence[float]) -> float | None:
     """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
-    if not counts:
+    if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
     of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
     usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]

@@ -8,7 +8,7 @@ from typing import Protocol
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes, missing_images
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -141,8 +141,8 @@ def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
-        if path.is_file() and _kind_of(path.parent) is not None:
-            return f"a file of a source, whose folder is to be named: {path.parent}"
+        if path.is_file() and (source := _source_around(path)):
+            return f"a file of a source, whose folder is to be named: {source}"
         return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
     if len(inside) == 1 and inside[0].is_file() and (words := _inside(inside[0])):
@@ -152,7 +152,16 @@ def _contents(path: Path) -> str:
     sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
         return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
+    if (words := missing_images(path)) is not None:
+        return words
+    if source := _source_around(path):
+        return f"a folder of a source, whose folder is to be named: {source}"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+
+
+def _source_around(path: Path) -> Path | None:
+    """The folder of the source that a file or folder is a part of."""
+    return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
 
 
 def _inside(file: Path) -> str | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 
 TRUTH = "groundtruth.txt"
@@ -101,23 +101,23 @@ def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
         GavoError: malformed; the message names file and line. Or its frames are not those of `times`.
     """
     blocks, poses = _blocks(path), {}
-    for number, (place, fields) in blocks.items():
+    for frame, (place, fields) in blocks.items():
         if (pose := pose_of(place, fields)) is not None:
-            poses[number] = pose
+            poses[frame] = pose
     numbers = sorted(times)
     both = (0, 1) if numbers[0] else (1, 0)
-    ahead = max(both, key=lambda ahead: len(blocks.keys() & {number + ahead for number in numbers}))
-    named = {number + ahead: times[number] for number in numbers}
+    ahead = max(both, key=lambda ahead: len(blocks.keys() & {n + ahead for n in numbers}))
+    named = {n + ahead: times[n] for n in numbers}
     if not blocks.keys() & named.keys():
         if len(blocks) != len(numbers):
             raise GavoError(f"{path}: none of its frames ({min(blocks)} to {max(blocks)}) is there")
-        named = {ours: times[number] for ours, number in zip(sorted(blocks), numbers, strict=True)}
-    known = [number for number in sorted(poses) if number in named]
+        named = {ours: times[n] for ours, n in zip(sorted(blocks), numbers, strict=True)}
+    known = [frame for frame in sorted(poses) if frame in named]
     if not known:
         return None
-    stamps = np.array([named[number] for number in known])
+    stamps = np.array([named[frame] for frame in known])
     order = np.argsort(stamps, kind="stable")
-    return Trajectory(stamps[order], np.stack([poses[number] for number in known])[order])
+    return Trajectory(stamps[order], np.stack([poses[frame] for frame in known])[order])
 
 
 def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
@@ -130,10 +130,10 @@ def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
             raise GavoError(f"{place}: expected three whole numbers before each matrix, found {' '.join(head)[:60]!r}")
         if len(matrix) != 4 or any(len(fields) != 4 for _, fields in matrix):
             raise GavoError(f"{place}: expected four rows of four numbers after it")
-        number = int(head[2])
-        if number in blocks:
-            raise GavoError(f"{place}: frame {number} is there twice")
-        blocks[number] = place, [field for _, fields in matrix for field in fields]
+        frame = int(head[2])
+        if frame in blocks:
+            raise GavoError(f"{place}: frame {frame} is there twice")
+        blocks[frame] = place, [field for _, fields in matrix for field in fields]
     return blocks
 
 
@@ -155,7 +155,7 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
         GavoError: no sixteen numbers, or no rigid transform.
     """
     try:
-        matrix = np.array([float(field) for field in fields]).reshape(4, 4)
+        matrix = np.array([number(field) for field in fields]).reshape(4, 4)
     except ValueError:
         raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
     if not np.isfinite(matrix).all():

@@ -246,6 +246,64 @@ def test_a_camera_that_is_named_goes_before_the_folders_own(folder):
     assert open_source(folder, Reading(camera=mine, depth_scale=2000)).camera.depth_scale == 2000
 
 
+@pytest.mark.parametrize("name", ["plain", "replica", "seven_scenes"])
+def test_one_image_of_another_size_is_not_the_size_of_all(folder, name):
+    """Whose camera file does not say it, or does: the odd image is named."""
+    wrote(folder, name)
+    first = {"plain": "rgb/0.png", "replica": "results/frame000000.jpg", "seven_scenes": "frame-000000.color.png"}[name]
+    image(folder / first, GREYS[0][:60])
+    if name == "plain":
+        (folder / "camera.yaml").unlink()
+        (folder / "camera.txt").write_text("131 131 79.5 59.5")
+        (folder / "camera.txt").rename(folder / "intrinsics.txt")
+    with pytest.raises(GavoError, match=rf"{first}: is 160x60 pixels, the camera's images are 160x120"):
+        open_part(str(folder))
+
+
+@pytest.mark.parametrize("raw_value", [0, 65535])
+def test_a_source_without_any_depth_is_refused(folder, raw_value):
+    wrote(folder, "plain")
+    for i in range(4):
+        (folder / f"depth/{i}.tiff").unlink()
+        image(folder / f"depth/{i}.png", np.full((120, 160), raw_value, np.uint16))
+    with pytest.raises(GavoError, match=r"clip: no reading in the depth of the 4 frames .*--force"):
+        open_part(str(folder))
+    assert len(open_part(str(folder), force=True)) == 4
+    image(folder / "depth/3.png", np.full((120, 160), 1500, np.uint16))
+    assert len(open_part(str(folder))) == 4  # a sensor may start late
+
+
+def test_colour_may_be_arrays(folder):
+    for i in range(3):
+        image(folder / f"rgb/{i}.npy", np.dstack([GREYS[i]] * 3))
+        image(folder / f"depth/{i}.npy", METRES[i].astype(np.float32))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_array_equal(sequence[2].grey, GREYS[2])
+
+
+def test_what_lacks_images_says_which(folder):
+    wrote(folder, "plain")
+    for i in range(4):
+        (folder / f"rgb/{i}.png").rename(folder / f"rgb/{i}.raw")
+    with pytest.raises(GavoError, match=r"clip: no colour images in rgb \(0\.raw, 1\.raw.*\): those end in \.png, "):
+        open_source(folder)
+    shutil.rmtree(folder / "depth")
+    (folder / "depth").mkdir()
+    for i in range(4):
+        (folder / f"rgb/{i}.raw").rename(folder / f"rgb/{i}.png")
+    with pytest.raises(GavoError, match=r"clip: no depth images in depth \(empty\): those end in \.png, "):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("inside", ["rgb", "rgb/0.png", "camera.yaml"])
+def test_a_part_of_a_source_names_its_folder(folder, inside):
+    wrote(folder, "plain")
+    with pytest.raises(
+        GavoError, match=rf"{inside}: a (file|folder) of a source, whose folder is to be named: {folder}$"
+    ):
+        open_source(folder / inside)
+
+
 REFUSED = {
     "an empty folder": (lambda f: shutil.rmtree(f / "rgb") or shutil.rmtree(f / "depth"), "plain", "camera.yaml"),
     "no camera": (lambda f: (f / "camera.yaml").unlink(), "plain", "--camera"),
