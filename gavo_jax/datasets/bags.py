@@ -77,8 +77,11 @@ class _Topic(NamedTuple):
 
 
 def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
-    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival."""
-    if all(topic.stamps.any() for topic in topics):
+    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival.
+
+    Stamps that stand still are none.
+    """
+    if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
         return tuple(topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
     return tuple(topic._replace(stamps=topic.received * 1e-9) for topic in topics)
 
@@ -303,6 +306,8 @@ class _Bag:
         except ImportError:
             raise GavoError(f"{path}: recordings of ROS need the extra [bag]: pip install 'gavo-jax[bag]'") from None
         self.path = path
+        if path.is_file() and path.suffix not in SUFFIXES:
+            raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
@@ -369,6 +374,10 @@ class _Bag:
                 what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
                 raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
             found += best
+        if found[0] == found[1]:
+            raise GavoError(
+                f"{self.path}: {found[0]}: chosen as colour and as depth alike: there are images on {_named(depth)}"
+            )
         return found[0], found[1]
 
     def calibration(self, color: str, depth: str) -> Calibration:

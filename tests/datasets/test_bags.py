@@ -310,6 +310,41 @@ def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     np.testing.assert_allclose(open_source(tmp_path / "zero", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
 
 
+def test_stamps_that_stand_still_stand_for_none(tmp_path):
+    recorder = Recorder(tmp_path / "still", "mcap")
+    for received in (5.0, 5.1, 5.2):
+        recorder.image(COLOR, 77.0, BGRS[0], "bgr8", received)
+        recorder.image(DEPTH, 77.0, MILLIMETRES[0], "16UC1", received)
+    recorder.close()
+    np.testing.assert_allclose(open_source(tmp_path / "still", Reading(camera=CAMERA)).timestamps, [5.0, 5.1, 5.2])
+
+
+@pytest.mark.parametrize(
+    "reading", [Reading(color_topic=DEPTH), Reading(depth_topic=COLOR), Reading(color_topic=COLOR, depth_topic=COLOR)]
+)
+def test_one_topic_is_not_both(bags, reading):
+    with pytest.raises(
+        GavoError, match=r"image_raw: chosen as colour and as depth alike: there are images on /camera/al"
+    ):
+        open_source(bags["mcap", "raw", "u16"], reading)
+
+
+def test_a_film_in_messages_is_called_one(tmp_path):
+    recorder = Recorder(tmp_path / "film", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.compressed(f"{COLOR}/compressed", stamp, b"\0\0\0\1" + bytes(90), "h264")
+        recorder.image(DEPTH, stamp, MILLIMETRES[0], "16UC1")
+    recorder.close()
+    with pytest.raises(FrameError, match=r"color/image_raw/compressed at 1\.0+: a film \('h264'\), .*JPEG or PNG"):
+        open_source(tmp_path / "film", Reading(camera=CAMERA)).check()
+
+
+def test_an_ending_in_capitals_is_to_be_written_small(tmp_path, bags):
+    (tmp_path / "WALK.BAG").write_bytes(bags["ros1", "raw", "u16"].read_bytes())
+    with pytest.raises(GavoError, match=r"WALK\.BAG: the library reads it only as \.bag: rename it"):
+        open_source(tmp_path / "WALK.BAG")
+
+
 def test_a_message_without_a_stamp_is_left_out(tmp_path):
     recorder = Recorder(tmp_path / "one", "mcap")
     for stamp in (5.0, 0.0, 5.1):
