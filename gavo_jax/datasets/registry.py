@@ -141,7 +141,7 @@ def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
-        if path.is_file() and (source := _source_around(path)):
+        if path.is_file() and (source := source_around(path)):
             return f"a file of a source, whose folder is to be named: {source}"
         return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
@@ -154,13 +154,17 @@ def _contents(path: Path) -> str:
         return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
     if (words := missing_images(path)) is not None:
         return words
-    if source := _source_around(path):
+    if source := source_around(path):
         return f"a folder of a source, whose folder is to be named: {source}"
     return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
 
 
-def _source_around(path: Path) -> Path | None:
-    """The folder of the source that a file or folder is a part of."""
+def source_around(path: Path) -> Path | None:
+    """The folder of the source that a file or folder is a part of; None where it is of none.
+
+    Raises:
+        GavoError: a package's kind cannot be loaded, or fails.
+    """
     return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
 
 
