@@ -202,6 +202,8 @@ class Replica(NumberedFolder):
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame."""
         rows = data_rows(path / "traj.txt")
+        if not rows:
+            raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
         return {number: pose for number, (place, row) in enumerate(rows) if (pose := pose_of(place, row)) is not None}
 
 

@@ -46,10 +46,15 @@ class Found(NamedTuple):
 
     color: dict[int, Path]
     depth: dict[int, Path]
+    others: tuple[Path, ...] = ()
+    """Without a number."""
 
     def unpaired(self, frames: int) -> list[str]:
         """What makes no frame, a line each."""
-        return unpaired((len(self.color), len(self.depth)), frames, "of the same number")
+        lines = unpaired((len(self.color), len(self.depth)), frames, "of the same number")
+        if self.others:
+            lines.append(f"{len(self.others)} images: no number in their names, as {self.others[0].name}")
+        return lines
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
@@ -66,15 +71,16 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
         GavoError: no number does, or it goes another way than the names; the message names a file.
     """
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
+    others = tuple(file for file in (*color, *depth) if not _numbers(file))
     places = range(1, 1 + min((len(_numbers(file)) for files in both for file in files), default=0))
     found = [Found(*({_numbers(file)[-place]: file for file in files} for files in both)) for place in places]
-    usable = [one for one in found if all(map(_is_in_order, one, both))]
+    usable = [one for one in found if all(map(_is_in_order, one[:2], both))]
     if found and not usable:
         odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
     chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
     _check_start(chosen)
-    return chosen
+    return chosen._replace(others=others)
 
 
 def _check_start(found: Found) -> None:
@@ -82,10 +88,10 @@ def _check_start(found: Found) -> None:
 
     Whether one number or one place in the order is one frame is open then.
     """
-    color, depth = found
+    color, depth, _ = found
     if len(color) != len(depth) or len(color) < FEWEST or color.keys() == depth.keys():
         return
-    (a, b), (c, d) = ((min(images), max(images)) for images in found)
+    (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
     if b - a + 1 == d - c + 1 == len(color):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "

@@ -8,7 +8,16 @@ from typing import Protocol
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes, missing_images
+from gavo_jax.datasets.folders import (
+    COLOR_FOLDERS,
+    DEPTH_FOLDERS,
+    Open3DFolder,
+    PlainFolder,
+    Replica,
+    ScanNet,
+    SevenScenes,
+    missing_images,
+)
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -156,7 +165,10 @@ def _contents(path: Path) -> str:
         return words
     if source := source_around(path):
         return f"a folder of a source, whose folder is to be named: {source}"
-    return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+    here = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+    if not any(child.is_dir() for child in inside):
+        return here
+    return f"{here}; colour is looked for in {', '.join(COLOR_FOLDERS)}, depth in {', '.join(DEPTH_FOLDERS)}"
 
 
 def source_around(path: Path) -> Path | None:

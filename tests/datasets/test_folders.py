@@ -155,6 +155,30 @@ def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
         open_source(folder)
 
 
+def test_images_without_a_number_are_left_out_by_name(folder):
+    wrote(folder, "seven_scenes")
+    (folder / "frame-000001.color.png").rename(folder / "frame-abc.color.png")
+    sequence = open_source(folder)
+    assert isinstance(sequence, SevenScenes)
+    assert sequence.left_out == (
+        "1 depth images: no colour image of the same number",
+        "1 images: no number in their names, as frame-abc.color.png",
+    )
+    wrote(folder, "plain")
+    image(folder / "depth/legend.png", DEPTHS[0])
+    image(folder / "depth/scale.png", DEPTHS[0])
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder)
+    assert sequence.left_out == ("2 images: no number in their names, as legend.png",)
+
+
+def test_folders_of_other_names_say_which_are_known(folder):
+    wrote(folder, "plain")
+    (folder / "rgb").rename(folder / "left")
+    with pytest.raises(GavoError, match=r"left/: .*; colour is looked for in color, colour, rgb, .* depth in depth, "):
+        open_source(folder)
+
+
 def test_a_published_camera_stands_in_for_a_file(folder):
     wrote(folder, "seven_scenes")
     (folder / "camera-intrinsics.txt").unlink()
@@ -317,6 +341,7 @@ REFUSED = {
         "seven_scenes",
         "no rotation",
     ),
+    "no pose": (lambda f: (f / "traj.txt").write_text("# none\n"), "replica", "traj.txt: holds no trajectory"),
     "half a pose": (lambda f: (f / "traj.txt").write_text("1 0 0 0 1\n"), "replica", "traj.txt:1: "),
     "a matrix of text": (lambda f: (f / "camera-intrinsics.txt").write_text("x"), "seven_scenes", "intrinsics.txt: "),
     "no number in common": (

@@ -100,7 +100,7 @@ def test_names_that_leave_the_order_open_are_refused(names, fault):
 
 def test_numbers_that_no_float_tells_apart_are_none():
     found = by_number(paths(*(f"9{i:017}.png" for i in range(3))), paths(*(f"9{i:017}.png" for i in range(3))))
-    assert found == Found({}, {})
+    assert found[:2] == Found({}, {})[:2] and len(found.others) == 6
 
 
 @pytest.mark.parametrize(("first", "refused"), [((0, 1), True), ((1, 0), True), ((5, 9), True), ((3, 3), False)])
