@@ -73,14 +73,14 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
     others = tuple(file for file in (*color, *depth) if not _numbers(file))
     places = range(1, 1 + min((len(_numbers(file)) for files in both for file in files), default=0))
-    found = [Found(*({_numbers(file)[-place]: file for file in files} for files in both)) for place in places]
+    found = [Found(_at(place, both[0]), _at(place, both[1]), others) for place in places]
     usable = [one for one in found if all(map(_is_in_order, one[:2], both))]
     if found and not usable:
         odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
-    chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
+    chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}, others))
     _check_start(chosen)
-    return chosen._replace(others=others)
+    return chosen
 
 
 def _check_start(found: Found) -> None:
@@ -97,6 +97,11 @@ def _check_start(found: Found) -> None:
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
             "number, or leave those without a partner out"
         )
+
+
+def _at(place: int, files: Sequence[Path]) -> dict[int, Path]:
+    """Files by the number at a place of their names, from the end."""
+    return {_numbers(file)[-place]: file for file in files}
 
 
 def _numbers(file: Path) -> list[int]:

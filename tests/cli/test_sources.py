@@ -90,6 +90,13 @@ def test_a_pair_is_aligned_whatever_is_wrong_with_the_rest_of_its_source(gavo, c
     assert is_refused(gavo("align", clip / "none.png", *names[1:]), "none.png: no such file")
 
 
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_run(gavo, clip):
+    Path("map.ply").mkdir()
+    Path("camera.toml").mkdir()
+    assert is_refused(gavo("run", clip, *FAST, "--map", "map.ply", "--output", "out"), "map.ply: a folder")
+    assert is_refused(gavo("calibrate", clip), "camera.toml: a folder") and not Path("out").exists()
+
+
 def test_inspect_says_what_a_source_is(gavo, clip):
     done = gavo("inspect", clip)
     assert done.status == 0 and not done.err
