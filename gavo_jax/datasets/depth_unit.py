@@ -135,14 +135,20 @@ def lack_of_depth(sequence: FrameSequence) -> str | None:
     """Why a sequence is of no use, where not one of a few frames, its first, its middle and its last, has a reading."""
     read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
     places = sorted({*range(min(LOOKED_AT, len(sequence))), len(sequence) // 2, len(sequence) - 1})
-    looked = 0
+    looked = recorded = 0
     for index in places:
         try:
-            if without_invalid(read(index)).any():
+            recorded += bool(without_invalid(read(index)).any())
+            if recorded and sequence[index].depth.any():
                 return None
             looked += 1
         except FrameError:
             continue
+    if recorded:
+        return (
+            f"of the depth of the {looked} frames that were looked at no reading falls into the colour image: is "
+            "colour_T_depth turned round, or not in metres?"
+        )
     if not looked:
         return None
     return f"no reading in the depth of the {looked} frames that were looked at: 0, 65535, negative and NaN are none"

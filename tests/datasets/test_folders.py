@@ -297,6 +297,20 @@ def test_a_source_without_any_depth_is_refused(folder, raw_value):
     assert len(open_part(str(folder))) == 4  # a sensor may start late
 
 
+@pytest.mark.parametrize("turn", [[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])
+def test_depth_that_falls_nowhere_into_the_image_is_refused(folder, turn):
+    """By a shift in another unit, or a camera that looks the other way."""
+    wrote(folder, "plain")
+    pose = np.diag([*turn, 1.0])
+    pose[0, 3] = 9.0 if turn[0] > 0 else 0.03
+    mine = "\n".join(f"{k} = {getattr(CAMERA, k)}" for k in ("fx", "fy", "cx", "cy", "width", "height"))
+    (folder / "camera.yaml").unlink()
+    (folder / "camera.toml").write_text(f"{mine}\ncolour_T_depth = {pose.tolist()}\n[depth]\n{mine}\n")
+    with pytest.raises(GavoError, match=r"clip: of the depth of the 4 frames .* colour_T_depth .*--force"):
+        open_part(str(folder))
+    assert len(open_part(str(folder), force=True)) == 4
+
+
 def test_colour_may_be_arrays(folder):
     for i in range(3):
         image(folder / f"rgb/{i}.npy", np.dstack([GREYS[i]] * 3))
