@@ -210,7 +210,7 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarr
 NAMES_OF_SEQUENCES = {
     r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)": r"fr\1",
     r"(?<![a-z])rgbd_bonn_": "bonn",
-    r"(?<![a-z])(?:icl(?![a-z])|living_?room_?traj|office_?room_?traj)": "icl",
+    r"(?<![a-z])(?:icl(?![a-z])|living_?room_?traj|office_?room_?traj|traj[0-3]_frei)": "icl",
 }
 """Preset by a pattern in a folder's name."""
 

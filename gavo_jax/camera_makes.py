@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gavo_jax.errors import GavoError, parse_toml, shown
+from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 Table = dict[str, Any]
 
@@ -94,7 +94,9 @@ def _of_known_make(path: Path, values: Any) -> Table:
             except KeyError as error:
                 raise GavoError(f"{path}: {read.__doc__ or ''} Its entry {error} is missing") from None
             except (TypeError, ValueError, IndexError, AttributeError):
-                raise GavoError(f"{path}: {read.__doc__ or ''} Entries are missing or of another kind") from None
+                raise GavoError(
+                    f"{path}: {read.__doc__ or ''} Entries are missing, or an entry is of another kind"
+                ) from None
     return values
 
 
@@ -109,6 +111,8 @@ def of_matrix(place: str, numbers: list[Any]) -> Table:
         GavoError: they are no camera matrix.
         ValueError: they are not nine.
     """
+    if all(isinstance(row, list) for row in numbers):
+        numbers = [value for row in numbers for value in row]
     fx, skew, cx, below, fy, cy, left, right, one = numbers
     if not any(isinstance(number, str) for number in numbers):
         if not any(numbers):
@@ -159,16 +163,20 @@ def camera_info_distortion(model: str, numbers: list[Any]) -> Table:
 
 def _read_kalibr(path: Path, values: Table) -> Table:
     """Looks like Kalibr's camera chain."""
-    color = _kalibr_camera(values["cam0"])
+    color = _kalibr_camera(path, values["cam0"])
     if "cam1" not in values:
         return color
     depth_T_color = np.array(values["cam1"]["T_cn_cnm1"], float)
-    return {**color, "depth": _kalibr_camera(values["cam1"]), "colour_T_depth": np.linalg.inv(depth_T_color).tolist()}
+    return {
+        **color,
+        "depth": _kalibr_camera(path, values["cam1"]),
+        "colour_T_depth": np.linalg.inv(depth_T_color).tolist(),
+    }
 
 
-def _kalibr_camera(values: Table) -> Table:
+def _kalibr_camera(path: Path, values: Table) -> Table:
     if values["camera_model"] != "pinhole":
-        raise ValueError
+        raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: pinhole is the only one that is read")
     (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
     lens = camera_info_distortion(values.get("distortion_model", "none"), list(values.get("distortion_coeffs") or []))
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, **lens}
@@ -326,9 +334,11 @@ def _parse_numbers(path: Path, text: str) -> Table:
     """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`; `#` comments."""
     if "m_calibrationColorIntrinsic" in text:
         return _parse_sens(path, text)
-    lines = [re.split(r"[\s,]+", line.split("#")[0].strip()) for line in text.splitlines()]
+    lines = [re.split(r"[\s,]+", line.split("#")[0].strip(" \t[],")) for line in text.splitlines()]
     try:
-        rows = [[float(field) for field in line] for line in lines if line != [""]]
+        rows = [[number(field) for field in line] for line in lines if line != [""]]
+        if len(rows) == 1 and len(rows[0]) == 9 and not any(rows[0][at] for at in (1, 3, 6, 7)):
+            return of_matrix(str(path), rows[0])
         if len(rows) == 1 and len(rows[0]) >= 4:
             fx, fy, cx, cy, *distortion = rows[0]
             lens = {"distortion": distortion} if distortion else {}

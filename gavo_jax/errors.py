@@ -55,6 +55,17 @@ def shown(value: Any) -> str:
         return f"a {type(value).__name__} of too many digits"
 
 
+def number(text: str) -> float:
+    """Return the number that a field of a text file is, as people and programs write them.
+
+    Raises:
+        ValueError: it is none; Python alone would take 1_000, and the digits of other scripts.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"not a number: {text[:MAX_SHOWN]!r}")
+    return float(text)
+
+
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return the text of a UTF-8 file.
 

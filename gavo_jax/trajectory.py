@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, read_text, rows_of, write_bytes
+from gavo_jax.errors import GavoError, number, read_text, rows_of, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -281,7 +281,7 @@ def _parse_tum_row(place: str, fields: list[str]) -> list[float]:
     if len(fields) != 8:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
     try:
-        values = [float(field) for field in fields]
+        values = [number(field) for field in fields]
     except ValueError:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found text") from None
     if not all(map(math.isfinite, values)):

@@ -8,13 +8,19 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gavo_jax.camera import Camera
 
 COLOR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 KINDS = ("ros1", "sqlite", "mcap")
+COMPRESSIONS = [
+    *(("ros1", name) for name in ("LZ4", "BZ2")),
+    *(("sqlite", name) for name in ("FILE", "MESSAGE")),
+    *(("mcap", name) for name in ("FILE", "MESSAGE", "STORAGE")),
+]
+"""Kinds, with what compresses their files: chunks of ROS 1, and of ROS 2 the file, each message or MCAP's chunks."""
 
 
 class Shot(NamedTuple):
@@ -29,7 +35,7 @@ class Shot(NamedTuple):
 class Recorder:
     """Writes messages of ROS 1 or ROS 2 by the same calls."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, kind: str, compression: str | None = None) -> None:
         self.is_1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is_1 else Stores.ROS2_HUMBLE)
         self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -38,6 +44,10 @@ class Recorder:
         else:
             plugin = StoragePlugin.SQLITE3 if kind == "sqlite" else StoragePlugin.MCAP
             self.writer = rosbag2.Writer(path, version=8, storage_plugin=plugin)
+        if compression and self.is_1:
+            self.writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+        elif compression:
+            self.writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         self.writer.open()
         self.connections: dict[str, Any] = {}
         self.count = 0
@@ -145,10 +155,12 @@ def jpeg(recorder: Recorder, shot: Shot, depth_stamp: float) -> None:
 STYLES: dict[str, Callable[[Recorder, Shot, float], None]] = {"raw": raw, "compressed": compressed, "jpeg": jpeg}
 
 
-def record(path: Path, kind: str, style: str, shots: Iterable[Shot], camera: Camera | None) -> Path:
+def record(
+    path: Path, kind: str, style: str, shots: Iterable[Shot], camera: Camera | None, compression: str | None = None
+) -> Path:
     """Write a recording and return its path: a file for ROS 1, else a folder."""
     path = path.with_suffix(".bag") if kind == "ros1" else path
-    recorder = Recorder(path, kind)
+    recorder = Recorder(path, kind, compression)
     for shot in shots:
         if camera is not None:
             for topic in (COLOR, DEPTH):

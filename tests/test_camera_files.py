@@ -167,6 +167,8 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
         ("\n".join(" ".join(map(str, row)) for row in np.block([[MATRIX, np.zeros((3, 1))], [np.eye(4)[3:]]])), NONE),
         ("500 0 0\n0 510 0\n319.5 239.5 1\n", NONE),
         ("500 510 319.5 239.5\n", NONE),
+        ("500 0 319.5 0 510 239.5 0 0 1\n", NONE),
+        ("[[500, 0, 319.5],\n [0, 510, 239.5],\n [0, 0, 1]]\n", NONE),
         ("# fx fy cx cy\n500, 510, 319.5, 239.5, 0.1, -0.2, 0.001, -0.002\n", BROWN),
     ],
 )
@@ -175,6 +177,16 @@ def test_numbers_alone_need_the_images_size(tmp_path, text, camera):
     assert load_calibration(tmp_path / "intrinsics.txt", (640, 480)).color == camera
     with pytest.raises(GavoError, match=r"intrinsics\.txt: width: missing"):
         load_calibration(tmp_path / "intrinsics.txt")
+
+
+@pytest.mark.parametrize("make", ["ros", "open3d"])
+def test_a_matrix_may_be_a_list_of_rows(tmp_path, make):
+    path = tmp_path / ("a.yaml" if make == "ros" else "a.json")
+    if make == "ros":
+        path.write_text(ros1("plumb_bob", RADTAN).replace(str(ROWS), str(MATRIX.tolist())))
+    else:
+        path.write_text(json.dumps({**OPEN3D, "intrinsic_matrix": MATRIX.tolist()}))
+    assert load_camera(path).matrix.tolist() == MATRIX.tolist()
 
 
 def test_the_depth_scale_of_a_file_goes_before_that_of_a_kind_of_source(tmp_path):
@@ -218,7 +230,12 @@ FAULTS = {
     "ros other model.yaml": (ros1("thin_plate", RADTAN), "model"),
     "ros short matrix.yaml": (ros1("plumb_bob", RADTAN).replace("500.0, 0.0, ", ""), "ROS camera_info"),
     "ros no size.yaml": (ros1("plumb_bob", RADTAN).replace("image_width", "w"), "width"),
-    "kalibr omni.yaml": (kalibr("radtan", RADTAN).replace("pinhole", "omni"), "Kalibr"),
+    "kalibr omni.yaml": (
+        kalibr("radtan", RADTAN).replace("pinhole", "omni"),
+        "camera_model 'omni': pinhole is the only one that is read",
+    ),
+    "kalibr fov.yaml": (kalibr("fov", RADTAN), "model: 'fov' is none of pinhole"),
+    "ros of text.yaml": (ros1("plumb_bob", RADTAN).replace(str(ROWS), "wide"), "an entry is of another kind"),
     "kalibr no size.yaml": (kalibr("radtan", RADTAN).replace("resolution", "size"), "Kalibr"),
     "open3d short.json": (json.dumps({**OPEN3D, "intrinsic_matrix": [1, 2]}), "Open3D"),
     "open3d list.json": ("[1, 2]", "not a camera file"),
@@ -253,6 +270,7 @@ FAULTS = {
     "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: turn fx"),
     "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
+    "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a matrix"),
     "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
     "text.txt": ("hello\n", "neither a matrix"),
 }

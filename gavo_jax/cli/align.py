@@ -1,5 +1,7 @@
 """`gavo align`: one pair of images, the motion between them as JSON."""
 
+import contextlib
+import itertools
 import json
 import sys
 from functools import partial
@@ -13,8 +15,17 @@ from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache
-from gavo_jax.datasets.depth_unit import fault_of_scale
-from gavo_jax.datasets.files import Entry, Reading, open_pair, own_camera_file, preset_by_name, size_of_first
+from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
+from gavo_jax.datasets.files import (
+    Entry,
+    FileSequence,
+    Reading,
+    open_pair,
+    own_camera_file,
+    preset_by_name,
+    size_of_most,
+)
+from gavo_jax.datasets.registry import open_source, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
@@ -27,12 +38,15 @@ def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance` and `status` of one pair."""
     check_seed(options.seed)
     check_positive("--depth-scale", options.depth_scale, 1e6)
-    calibration = _calibration(options)
     settings = choose_settings(options).settings
     images = [(options.rgb0, options.depth0), (options.rgb1, options.depth1)]
-    pair = open_pair(images, calibration, Reading(depth_scale=options.depth_scale))
+    for path in itertools.chain.from_iterable(images):
+        if not path.is_file():
+            raise GavoError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    calibration, depth_scale = _cameras(options)
+    pair = open_pair(images, calibration, Reading(depth_scale=depth_scale))
     (reference, target), camera = pair, pair.camera
-    if not options.force and (fault := fault_of_scale(pair)):
+    if not options.force and (fault := lack_of_depth(pair) or fault_of_scale(pair)):
         raise GavoError(f"{options.depth0}: {fault}, or go on with --force")
     enable_compilation_cache()
     with waiting("compiling and aligning …"):
@@ -72,10 +86,22 @@ def in_words(found: Alignment) -> str:
     )
 
 
-def _calibration(options: Align) -> Calibration:
-    size = partial(size_of_first, [Entry(0.0, options.rgb0, options.depth0)])
+def _cameras(options: Align) -> tuple[Calibration, float | None]:
+    """The cameras, and units per metre if they are known: those of the source that the images are of, if of one.
+
+    Raises:
+        GavoError: there is no camera, or it cannot be read.
+    """
+    source = source_around(options.rgb0)
+    if source is not None:
+        with contextlib.suppress(GavoError):  # what is wrong with its other frames is nothing to this pair
+            sequence = open_source(source, Reading(options.camera, options.depth_scale))
+            if isinstance(sequence, FileSequence):
+                return sequence.calibration, sequence.depth_unit.file
+    size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
     if options.camera != "auto":
-        return load_calibration(options.camera, size)
+        return load_calibration(options.camera, size), options.depth_scale
     folder = options.rgb0.absolute().parent
     file = own_camera_file(folder) or own_camera_file(folder.parent)
-    return preset_by_name(folder.parent) if file is None else load_calibration(file, size)
+    found = preset_by_name(folder.parent) if file is None else load_calibration(file, size)
+    return found, options.depth_scale

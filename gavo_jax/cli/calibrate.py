@@ -24,6 +24,8 @@ def calibrate(options: Calibrate) -> int:
         raise GavoError(f"{output}: a camera file ends in .toml")
     if not output.absolute().parent.is_dir():
         raise GavoError(f"{output}: no such folder: {output.parent}")
+    if output.is_dir():
+        raise GavoError(f"{output}: a folder: name a file for the camera")
     wanted: list[Wanted] = [*ALWAYS]
     if options.focal_length:
         wanted.append("focal_length")

@@ -15,13 +15,15 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
     """Refuse a map that cannot be made or written; return what it is to be.
 
     Raises:
-        GavoError: an unknown ending, no such folder, an absurd voxel, or Open3D cannot be imported.
+        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, or Open3D cannot be imported.
     """
     if path is None:
         return shape or "cloud"
     shape = check_map(path, shape)
     if not path.absolute().parent.is_dir():
         raise GavoError(f"{path}: no such folder: {path.parent}")
+    if path.is_dir():
+        raise GavoError(f"{path}: a folder: name a file for the map")
     check_voxel(voxel)
     import_open3d()
     return shape

@@ -141,7 +141,7 @@ class Align(Search):
     depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
     """Depth image of the target frame."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """As in `gavo run`; auto takes the camera file beside RGB0 or one folder up, else goes by that folder's name."""
+    """As in `gavo run`; auto: the camera of the source that RGB0 is of, else the file beside it or one folder up."""
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """As in `gavo run`."""
     force: bool = False

@@ -43,6 +43,9 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
 """In the folder of a ROS 2 bag."""
 
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""First bytes of what is compressed so."""
+
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
 
@@ -74,8 +77,11 @@ class _Topic(NamedTuple):
 
 
 def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
-    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival."""
-    if all(topic.stamps.any() for topic in topics):
+    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival.
+
+    Stamps that stand still are none.
+    """
+    if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
         return tuple(topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
     return tuple(topic._replace(stamps=topic.received * 1e-9) for topic in topics)
 
@@ -300,10 +306,15 @@ class _Bag:
         except ImportError:
             raise GavoError(f"{path}: recordings of ROS need the extra [bag]: pip install 'gavo-jax[bag]'") from None
         self.path = path
-        with blamed(f"{path}: not a bag that can be read"):
+        if path.is_file() and path.suffix not in SUFFIXES:
+            raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
+        try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
             _own_files(self._reader)
+        except Exception as error:  # of many kinds: the library's own, of databases, of packers, of YAML
+            words = " ".join(str(error).split())[:200] or type(error).__name__
+            raise GavoError(f"{path}: not a bag that can be read: {words}: {_mending(path)}") from None
         weakref.finalize(self, _close, self._reader)
         self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
 
@@ -311,6 +322,10 @@ class _Bag:
         """Topic, content and type of messages, in the order in which they were received, from a time (ns) on."""
         connections = [connection for connection in self._reader.connections if connection.topic in names]
         for connection, _, raw in self._reader.messages(connections, start=start):
+            if self._reader.is2 and bytes(raw[:4]) == ZSTD:
+                raise GavoError(
+                    f"{self.path}: its messages are compressed (zstd), as its {METADATA} says: name the folder of both"
+                )
             yield connection.topic, bytes(raw), connection.msgtype
 
     def deserialize(self, raw: bytes, kind: str) -> Any:
@@ -359,6 +374,10 @@ class _Bag:
                 what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
                 raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
             found += best
+        if found[0] == found[1]:
+            raise GavoError(
+                f"{self.path}: {found[0]}: chosen as colour and as depth alike: there are images on {_named(depth)}"
+            )
         return found[0], found[1]
 
     def calibration(self, color: str, depth: str) -> Calibration:
@@ -438,6 +457,14 @@ def _own_files(reader: Any) -> None:
         if isinstance(file := getattr(part, "bio", None), io.BufferedReader):
             part.bio = _File(io.FileIO(file.name))
             file.close()
+
+
+def _mending(path: Path) -> str:
+    """What may help with a recording that is torn."""
+    files = [path] if path.is_file() else list(path.iterdir())
+    kinds = {file.suffix.lower() for file in files}
+    tool = "mcap recover" if ".mcap" in kinds else "rosbag reindex" if ".bag" in kinds else "ros2 bag reindex"
+    return f"get it anew, or mend it with {tool}"
 
 
 def _close(reader: Any) -> None:

@@ -131,6 +131,29 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
     )
 
 
+def lack_of_depth(sequence: FrameSequence) -> str | None:
+    """Why a sequence is of no use, where not one of a few frames, its first, its middle and its last, has a reading."""
+    read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
+    places = sorted({*range(min(LOOKED_AT, len(sequence))), len(sequence) // 2, len(sequence) - 1})
+    looked = recorded = 0
+    for index in places:
+        try:
+            recorded += bool(without_invalid(read(index)).any())
+            if recorded and sequence[index].depth.any():
+                return None
+            looked += 1
+        except FrameError:
+            continue
+    if recorded:
+        return (
+            f"of the depth of the {looked} frames that were looked at no reading falls into the colour image: is "
+            "colour_T_depth turned round, or not in metres?"
+        )
+    if not looked:
+        return None
+    return f"no reading in the depth of the {looked} frames that were looked at: 0, 65535, negative and NaN are none"
+
+
 def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
     """What the first frames' depth says, as it is stored where the sequence tells, and the units per metre it has."""
     read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)

@@ -1,9 +1,10 @@
 """Sequences whose frames lie as image files."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple, overload
@@ -17,11 +18,9 @@ from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, co
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.images import read_color, read_depth
+from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
-
-TRUTH = "groundtruth.txt"
-"""The true trajectory, in TUM's form, where it lies in a folder."""
 
 SAMPLED = 3
 """Frames, from the first to the last, that show what kind of images a sequence has."""
@@ -217,7 +216,7 @@ class FileSequence:
         for entry in self.entries:
             for path in (entry.color, entry.depth):
                 if path is not None and not os.path.isfile(path):
-                    raise GavoError(f"{path}: image is missing: restore it, or take its row out of the list")
+                    raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
         self[0]
 
 
@@ -234,23 +233,6 @@ def own_camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
 
 
-def truth_in(folder: Path, unit: float = 1.0) -> Trajectory | None:
-    """The true trajectory that lies in a folder, if one does.
-
-    Args:
-        folder: of the frames.
-        unit: seconds of what the frames' stamps count; it holds for the truth's, too, where all are whole numbers.
-
-    Raises:
-        GavoError: it cannot be read.
-    """
-    if not (folder / TRUTH).exists():
-        return None
-    truth = Trajectory.read_tum(folder / TRUTH)
-    whole = np.array_equal(truth.timestamps, np.round(truth.timestamps))
-    return replace(truth, timestamps=unit * truth.timestamps) if whole and unit != 1 else truth
-
-
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
     """What of the colour and depth images makes no frame, a line each."""
     return [
@@ -261,7 +243,7 @@ def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
 
 
 def preset_by_name(folder: Path) -> Calibration:
-    """The preset that a folder's name speaks of.
+    """The preset that a folder's name speaks of, or the trajectory in it.
 
     Raises:
         GavoError: it speaks of none; the message says what would help.
@@ -269,23 +251,40 @@ def preset_by_name(folder: Path) -> Calibration:
     try:
         return load_calibration(preset_for_sequence(folder.resolve().name))
     except GavoError as error:
+        if icl_truth(folder) is not None:
+            return load_calibration("icl")
         raise GavoError(f"{folder}: no camera file in it, and {error}") from None
 
 
-def size_of_first(entries: Sequence[Entry]) -> Size:
-    """Width and height of the first colour image that can be read.
+def size_of_most(entries: Sequence[Entry]) -> Size:
+    """Width and height of most of the few colour images that are looked at, from the first to the last.
 
     Raises:
-        FrameError: why the first cannot, where none of the first few can.
+        FrameError: why the first of them cannot be read, where none can.
     """
     fault: FrameError | None = None
-    for entry in entries[:SAMPLED]:
+    sizes: Counter[Size] = Counter()
+    for at in _samples(len(entries)):
         try:
-            height, width = read_color(entry.color).shape[:2]
-            return width, height
+            height, width = read_color(entries[at].color).shape[:2]
+            sizes[width, height] += 1
         except FrameError as error:
             fault = fault or error
-    raise fault or FrameError("no frames")
+    if not sizes:
+        raise fault or FrameError("no frames")
+    return sizes.most_common(1)[0][0]
+
+
+def _samples(count: int) -> list[int]:
+    """Places of a few frames, from the first to the last."""
+    return sorted({round(share * (count - 1)) for share in np.linspace(0, 1, SAMPLED)}) if count else []
+
+
+def _instead(path: Path) -> str:
+    """What is there in the place of an image, which is no file."""
+    if path.is_symlink():
+        return f"a link to {os.readlink(path)[:200]}, which is missing"
+    return "not a file" if path.exists() else "image is missing"
 
 
 def resolve_folder(folder: Path) -> Path:
@@ -313,8 +312,8 @@ class _Images:
     @cached_property
     def assembler(self) -> FrameAssembler:
         colors, depths = [], []
-        for at in sorted({round(share * (len(self._entries) - 1)) for share in np.linspace(0, 1, SAMPLED)}):
-            entry = self._entries[max(at, 0)]
+        for at in _samples(len(self._entries)):
+            entry = self._entries[at]
             try:
                 colors.append(read_color(entry.color))
                 if entry.depth is not None:

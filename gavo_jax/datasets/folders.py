@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -23,12 +23,12 @@ from gavo_jax.datasets.files import (
     own_camera_file,
     preset_by_name,
     resolve_folder,
-    size_of_first,
-    truth_in,
+    size_of_most,
     unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, stamps
+from gavo_jax.datasets.truth import MAX_POSE_BYTES, Seconds, pose_files, pose_of, truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -40,11 +40,6 @@ DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img")
 """In the names of colour images that lie beside depth; the latter where the former say nothing."""
-
-MAX_POSE_BYTES = 4096
-
-SKEWED = 0.01
-"""A pose whose rotation is off one by more is none."""
 
 
 class NumberedFolder(FileSequence):
@@ -65,7 +60,7 @@ class NumberedFolder(FileSequence):
         raise NotImplementedError
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera that the folder, or the dataset, brings.
 
         Raises:
@@ -93,8 +88,8 @@ class NumberedFolder(FileSequence):
             counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
             raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
         entries = [Entry(number / rate, found.color[number], found.depth[number]) for number in numbers]
-        own = partial(cls.calibrate, path, entries[0], reading)
-        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
+        own = partial(cls.calibrate, path, entries, reading)
+        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
         poses = cls.poses(path)
         known = [number for number in numbers if number in poses]
         truth = None
@@ -128,18 +123,18 @@ class SevenScenes(NumberedFolder):
         return _found(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file beside the frames, or a scan's info.txt, else the dataset's."""
         infos = (path / name for name in ("info.txt", "_info.txt"))
         file = own_camera_file(path) or next((file for file in infos if file.is_file()), None)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
-        return _millimetres(load_calibration(file, partial(size_of_first, [first]), MILLIMETRES))
+        return _millimetres(load_calibration(file, partial(size_of_most, entries), MILLIMETRES))
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A file for each frame."""
-        return _pose_files(path.glob("frame-*.pose.txt"))
+        return pose_files(images_among(path.glob("frame-*.pose.txt"), (".txt",)))
 
 
 class ScanNet(NumberedFolder):
@@ -158,15 +153,15 @@ class ScanNet(NumberedFolder):
         return _found((path / "color").glob("*"), (path / "depth").glob("*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The files of both cameras, as far as they are two; the scans say that nothing is to be turned or shifted."""
         color, depth = (path / "intrinsic" / f"intrinsic_{name}.txt" for name in ("color", "depth"))
-        found = _millimetres(load_calibration(color, partial(size_of_first, [first]), MILLIMETRES))
-        if not depth.is_file() or first.depth is None:
+        found = _millimetres(load_calibration(color, partial(size_of_most, entries), MILLIMETRES))
+        if not depth.is_file() or entries[0].depth is None:
             return found
         for name in ("color", "depth"):
             _check_identity(path / "intrinsic" / f"extrinsic_{name}.txt")
-        height, width = read_depth(first.depth).shape
+        height, width = read_depth(entries[0].depth).shape
         other = load_calibration(depth, (width, height), MILLIMETRES).color
         if other == found.color:
             return found
@@ -175,7 +170,7 @@ class ScanNet(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A file for each frame; those of frames that were not tracked hold infinities."""
-        return _pose_files((path / "pose").glob("*.txt"))
+        return pose_files(images_among((path / "pose").glob("*.txt"), (".txt",)))
 
 
 class Replica(NumberedFolder):
@@ -196,18 +191,20 @@ class Replica(NumberedFolder):
         return _found(results.glob("frame*"), results.glob("depth*"))
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """cam_params.json of the room or of all rooms, else the one that they were rendered with."""
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one that Replica was rendered with")
-        return load_calibration(file, partial(size_of_first, [first]), cls.CAMERA.depth_scale)
+        return load_calibration(file, partial(size_of_most, entries), cls.CAMERA.depth_scale)
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame."""
         rows = data_rows(path / "traj.txt")
-        return {number: pose for number, (place, row) in enumerate(rows) if (pose := _pose(place, row)) is not None}
+        if not rows:
+            raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
+        return {number: pose for number, (place, row) in enumerate(rows) if (pose := pose_of(place, row)) is not None}
 
 
 class PlainFolder(FileSequence):
@@ -227,7 +224,7 @@ class PlainFolder(FileSequence):
         return bool(color and depth)
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file in the folder, or in the one above, else the preset that the folder's name speaks of.
 
         Raises:
@@ -236,7 +233,7 @@ class PlainFolder(FileSequence):
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             return preset_by_name(path)
-        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
@@ -247,12 +244,12 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = _plain_files(path)
-        by_stamp = _by_stamp(path, color, depth, reading)
-        entries, left_out = by_stamp or _by_number(path, color, depth, reading)
-        own = partial(cls.calibrate, path, entries[0], reading)
-        calibration = reading.calibration(own, partial(size_of_first, entries), MILLIMETRES)
-        truth = truth_in(path, 1.0 if by_stamp else 1 / (reading.rate or RATE))
-        return cls(root.name, entries, calibration, truth, reading, left_out)
+        entries, left_out, times, seconds = _by_stamp(path, color, depth, reading) or _by_number(
+            path, color, depth, reading
+        )
+        own = partial(cls.calibrate, path, entries, reading)
+        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
+        return cls(root.name, entries, calibration, truth_in(path, seconds, times), reading, left_out)
 
 
 class Open3DFolder(PlainFolder):
@@ -266,11 +263,11 @@ class Open3DFolder(PlainFolder):
         return cls._intrinsics(path) is not None and super().recognises(path)
 
     @classmethod
-    def calibrate(cls, path: Path, first: Entry, reading: Reading) -> Calibration:
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The intrinsics' file; depth is in millimetres unless said otherwise."""
         file = cls._intrinsics(path)
         assert file is not None
-        return load_calibration(file, partial(size_of_first, [first]), MILLIMETRES)
+        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
     def _intrinsics(cls, path: Path) -> Path | None:
@@ -286,14 +283,27 @@ def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
+def missing_images(path: Path) -> str | None:
+    """Which kind of images a folder lacks that has folders for both."""
+    folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
+    kinds = (("colour", COLOR_FOLDERS, COLOR_SUFFIXES), ("depth", DEPTH_FOLDERS, DEPTH_SUFFIXES))
+    found = [next((folders[name] for name in names if name in folders), None) for _, names, _ in kinds]
+    for (kind, _, suffixes), folder in zip(kinds, found, strict=True):
+        if all(found) and folder is not None and not images_among(folder.glob("*"), (*suffixes, ".npy")):
+            inside = ", ".join(child.name[:60] for child in sorted(folder.glob("*"))[:2]) or "empty"
+            return f"no {kind} images in {folder.name} ({inside}): those end in {', '.join(suffixes)}"
+    return None
+
+
 def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth files, each in the order of their names."""
     folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
     for color in COLOR_FOLDERS:
         for depth in DEPTH_FOLDERS:
             if color in folders and depth in folders:
-                files = (folders[color].glob("*"), folders[depth].glob("*"))
-                return images_among(files[0], COLOR_SUFFIXES), images_among(files[1], DEPTH_SUFFIXES)
+                files = list(folders[color].glob("*"))
+                some = images_among(files, COLOR_SUFFIXES) or images_among(files, (".npy",))
+                return some, images_among(folders[depth].glob("*"), DEPTH_SUFFIXES)
     files = list(path.glob("*"))
     depth = [file for file in images_among(files, DEPTH_SUFFIXES) if "depth" in file.name.lower()]
     others = [file for file in images_among(files, COLOR_SUFFIXES) if "depth" not in file.name.lower()]
@@ -301,9 +311,18 @@ def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     return next(filter(None, named), []), depth
 
 
-def _by_stamp(
-    path: Path, color: list[Path], depth: list[Path], reading: Reading
-) -> tuple[list[Entry], list[str]] | None:
+class _Paired(NamedTuple):
+    """Frames of a plain folder."""
+
+    entries: list[Entry]
+    left_out: list[str]
+    times: dict[int, float]
+    """Of each depth image, by the number in its name, else by its place, from 1."""
+    seconds: Seconds | None
+    """Times by numbers, where the names are those."""
+
+
+def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired | None:
     """Frames by the stamps that all names are; None where they are none, or the rate is said."""
     found = [None if reading.rate else stamps([file.stem for file in files]) for files in (color, depth)]
     if found[0] is None or found[1] is None:
@@ -317,10 +336,13 @@ def _by_stamp(
         )
     entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
     left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s")
-    return sorted(entries, key=lambda entry: entry.stamp), left_out
+    of_frames = second.copy()
+    of_frames[j] = first[i]
+    times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
+    return _Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
 
 
-def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> tuple[list[Entry], list[str]]:
+def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired:
     """Frames by the numbers in the names."""
     found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
@@ -329,7 +351,8 @@ def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Readin
         raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
     rate = reading.rate or RATE
     entries = [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers]
-    return entries, found.unpaired(len(numbers))
+    times = {n: n / rate for n in found.depth}
+    return _Paired(entries, found.unpaired(len(numbers)), times, lambda counts: counts / rate)
 
 
 def _millimetres(calibration: Calibration) -> Calibration:
@@ -341,37 +364,6 @@ def _check_identity(file: Path) -> None:
     """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
     if not file.is_file():
         return
-    pose = _pose(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+    pose = pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
-
-
-def _pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
-    poses = {}
-    for file in images_among(files, (".txt",)):
-        numbers = re.findall(r"\d+", file.name)
-        fields = [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row]
-        pose = _pose(str(file), fields)
-        if pose is not None and numbers and len(numbers[-1]) <= 18:
-            poses[int(numbers[-1])] = pose
-    return poses
-
-
-def _pose(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
-    """A rigid transform from sixteen numbers, row by row; None where it is not finite: the frame was not tracked.
-
-    Raises:
-        GavoError: no sixteen numbers, or no rigid transform.
-    """
-    try:
-        matrix = np.array([float(field) for field in fields]).reshape(4, 4)
-    except ValueError:
-        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
-    if not np.isfinite(matrix).all():
-        return None
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    rotation = u @ vt
-    if np.abs(rotation - matrix[:3, :3]).max() > SKEWED or np.linalg.det(rotation) < 0:
-        raise GavoError(f"{place}: the pose is no rotation and shift")
-    matrix[:3, :3] = rotation
-    return matrix

@@ -2,12 +2,14 @@
 
 import contextlib
 import io
+import os
 import struct
 import tempfile
+import threading
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -25,11 +27,17 @@ MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
 
 PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01", b"\x93NUMPY"
 
+EXR_WARNING = "Exception raised reading pixel data"
+"""In what OpenEXR prints of a torn file."""
+
 NO_READING = 65535
 """Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
 
 WHITES = (255, 1023, 4095, 16383, 65535)
 """Full scales of sensors: what 16-bit intensities are measured against."""
+
+_ASIDE = threading.Lock()
+"""Held by whoever has standard error of the process put aside."""
 
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -185,6 +193,33 @@ def _quiet() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
+@contextlib.contextmanager
+def without_words_on(name: str) -> Iterator[None]:
+    """Leave out the lines that OpenEXR prints while it reads a file; what others print in that time comes after it."""
+    with _ASIDE, tempfile.TemporaryFile() as said_2, contextlib.ExitStack() as later:
+        with contextlib.suppress(OSError):  # there may be no standard error
+            kept = os.dup(2)
+            os.dup2(said_2.fileno(), 2)
+            later.callback(_restore, kept, said_2, name.encode())
+        said_1 = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(said_1):
+                yield
+        finally:
+            if others := [line for line in said_1.getvalue().splitlines(True) if EXR_WARNING not in line]:
+                print(*others, sep="", end="")
+
+
+def _restore(kept: int, said: IO[bytes], name: bytes) -> None:
+    """Put standard error in its place again, and pass on what was said that does not name a file."""
+    os.dup2(kept, 2)
+    os.close(kept)
+    said.seek(0)
+    for line in said:
+        if name not in line:
+            os.write(2, line)
+
+
 def _check_png(data: bytes, name: str) -> None:
     """Refuse a PNG that is too large, or whose chunks are not all whole: OpenCV decodes part of a torn one silently."""
     at = len(PNG_SIGNATURE)
@@ -234,13 +269,14 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
         raise FrameError(
             f"{name}: OpenEXR images need the extra [exr] (pip install 'gavo-jax[exr]'), or TIFF or .npy instead"
         ) from None
-    try:
-        with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library reads nothing but files
-            file.write(data)
-            file.flush()
-            channels = OpenEXR.File(file.name).channels()
-    except Exception as error:  # of several kinds, which the library does not document
-        raise FrameError(f"{name}: torn or damaged OpenEXR image: {' '.join(str(error).split())[:100]}") from None
+    with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library reads nothing but files
+        file.write(data)
+        file.flush()
+        try:
+            with without_words_on(file.name):
+                channels = OpenEXR.File(file.name).channels()
+        except Exception:  # of several kinds, which the library does not document, with words about its own parts
+            raise FrameError(f"{name}: torn or damaged OpenEXR image: get the file anew") from None
     return _depth_channel(channels, name)
 
 

@@ -42,6 +42,9 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16")
 
+FILM = re.compile(r"(?i)\b(?:[hx]\.?26[45]|hevc|avc|vp[89]|av1|theora)\b")
+"""In the format of compressed images that are no images of their own."""
+
 DEPTH_HEADER = 12
 """Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
 
@@ -67,6 +70,10 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
         FrameError: an encoding that is not known, or too few bytes; `name` stands in it.
     """
     if kind == COMPRESSED:
+        if FILM.search(message.format):
+            raise FrameError(
+                f"{name}: a film ({message.format[:40]!r}), of which one image needs others: record JPEG or PNG"
+            )
         return decode_color(bytes(message.data), name)
     pixels = _pixels(message, name)
     conversion = LAYOUTS[message.encoding][2]

@@ -26,8 +26,11 @@ DEVICE_INTERVALS = (2e-3, 1.0)
 MILLISECONDS, JITTER = (5, 200), 2
 """Steps between whole numbers that may be milliseconds, if they differ, and by no more than so much."""
 
-MOST_DIGITS = 18
-"""What is longer is no number of a frame."""
+MOST_DIGITS = 15
+"""What is longer is no number of a frame: floats do not tell it from its neighbours."""
+
+FEWEST = 10
+"""Images of each kind, numbered without a gap, of which it is told that the two count from different numbers."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)(?:[.,_-](\d{3,9}))?$"
@@ -43,10 +46,15 @@ class Found(NamedTuple):
 
     color: dict[int, Path]
     depth: dict[int, Path]
+    others: tuple[Path, ...] = ()
+    """Without a number."""
 
     def unpaired(self, frames: int) -> list[str]:
         """What makes no frame, a line each."""
-        return unpaired((len(self.color), len(self.depth)), frames, "of the same number")
+        lines = unpaired((len(self.color), len(self.depth)), frames, "of the same number")
+        if self.others:
+            lines.append(f"{len(self.others)} images: no number in their names, as {self.others[0].name}")
+        return lines
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
@@ -63,13 +71,37 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
         GavoError: no number does, or it goes another way than the names; the message names a file.
     """
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
+    others = tuple(file for file in (*color, *depth) if not _numbers(file))
     places = range(1, 1 + min((len(_numbers(file)) for files in both for file in files), default=0))
-    found = [Found(*({_numbers(file)[-place]: file for file in files} for files in both)) for place in places]
-    usable = [one for one in found if all(map(_is_in_order, one, both))]
+    found = [Found(_at(place, both[0]), _at(place, both[1]), others) for place in places]
+    usable = [one for one in found if all(map(_is_in_order, one[:2], both))]
     if found and not usable:
         odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
-    return max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}))
+    chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}, others))
+    _check_start(chosen)
+    return chosen
+
+
+def _check_start(found: Found) -> None:
+    """Refuse as many images of both kinds, each without a gap, that begin with other numbers.
+
+    Whether one number or one place in the order is one frame is open then.
+    """
+    color, depth, _ = found
+    if len(color) != len(depth) or len(color) < FEWEST or color.keys() == depth.keys():
+        return
+    (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
+    if b - a + 1 == d - c + 1 == len(color):
+        raise GavoError(
+            f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
+            "number, or leave those without a partner out"
+        )
+
+
+def _at(place: int, files: Sequence[Path]) -> dict[int, Path]:
+    """Files by the number at a place of their names, from the end."""
+    return {_numbers(file)[-place]: file for file in files}
 
 
 def _numbers(file: Path) -> list[int]:
@@ -131,7 +163,7 @@ def _counts(names: Sequence[str]) -> list[float] | None:
 
 def unit_of(counts: Sequence[float]) -> float | None:
     """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
-    if not counts:
+    if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
     of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
     usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]

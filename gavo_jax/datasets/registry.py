@@ -8,12 +8,38 @@ from typing import Protocol
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.folders import (
+    COLOR_FOLDERS,
+    DEPTH_FOLDERS,
+    Open3DFolder,
+    PlainFolder,
+    Replica,
+    ScanNet,
+    SevenScenes,
+    missing_images,
+)
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
 PLUGINS = "gavo_jax.datasets"
 """Group of entry points through which other packages bring kinds of sources."""
+
+PACKED = {
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".zip": "unzip",
+    ".7z": "7z x",
+    ".rar": "unrar x",
+    ".gz": "gunzip",
+    ".bz2": "bunzip2",
+    ".xz": "unxz",
+    ".lz4": "unlz4",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+}
+"""Endings of files from which a source is to be unpacked first, and by what."""
+
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 SHOWN = 5
 """Names that a message lists."""
@@ -124,16 +150,45 @@ def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
-        if path.is_file() and _kind_of(path.parent) is not None:
-            return f"a file of a source, whose folder is to be named: {path.parent}"
-        return f"a file of {path.stat().st_size} bytes, not one of: {known}"
+        if path.is_file() and (source := source_around(path)):
+            return f"a file of a source, whose folder is to be named: {source}"
+        return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
+    if len(inside) == 1 and inside[0].is_file() and (words := _inside(inside[0])):
+        return f"{inside[0].name}: {words}"
     if not inside:
         return f"an empty folder, not one of: {known}"
     sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
         return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
-    return f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+    if (words := missing_images(path)) is not None:
+        return words
+    if source := source_around(path):
+        return f"a folder of a source, whose folder is to be named: {source}"
+    here = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+    if not any(child.is_dir() for child in inside):
+        return here
+    return f"{here}; colour is looked for in {', '.join(COLOR_FOLDERS)}, depth in {', '.join(DEPTH_FOLDERS)}"
+
+
+def source_around(path: Path) -> Path | None:
+    """The folder of the source that a file or folder is a part of; None where it is of none.
+
+    Raises:
+        GavoError: a package's kind cannot be loaded, or fails.
+    """
+    return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
+
+
+def _inside(file: Path) -> str | None:
+    """How what a file holds becomes a source, where its name tells."""
+    endings = [suffix.lower() for suffix in file.suffixes]
+    if endings[-2:] == [".bag", ".active"]:
+        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+    if endings[-1:] and endings[-1] in FILMS:
+        return "a film: write its frames as images, with those of depth beside them"
+    how = PACKED.get(endings[-1]) if endings else None
+    return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
 
 
 def _listed(names: list[str]) -> str:

@@ -20,12 +20,12 @@ from gavo_jax.datasets.files import (
     own_camera_file,
     preset_by_name,
     resolve_folder,
-    size_of_first,
-    truth_in,
+    size_of_most,
     unpaired,
 )
 from gavo_jax.datasets.names import unit_of
-from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.datasets.truth import truth_in
+from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import associate
 
 MAX_DIFFERENCE = 0.02
@@ -111,8 +111,8 @@ class TumSequence(FileSequence):
         super().__init__(
             name or resolved.name,
             files,
-            reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_first, files)),
-            truth_in(self.folder, unit),
+            reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_most, files)),
+            truth_in(self.folder, None if unit == 1 else lambda counts: unit * counts),
             reading,
             unpaired((len(color_rows), len(depth_rows)), len(entries), why),
         )
@@ -139,7 +139,7 @@ class TumSequence(FileSequence):
 def _own_calibration(folder: Path, entries: list[Entry]) -> Calibration:
     """The camera file in the folder, else the preset that its name speaks of."""
     file = own_camera_file(folder)
-    return preset_by_name(folder) if file is None else load_calibration(file, partial(size_of_first, entries))
+    return preset_by_name(folder) if file is None else load_calibration(file, partial(size_of_most, entries))
 
 
 class _Row(NamedTuple):
@@ -213,7 +213,7 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
     rows: list[_Row] = []
     for place, fields in data_rows(path, MAX_LIST_BYTES):
         if len(fields) != 2:
-            raise GavoError(f"{place}: expected `timestamp path`, found {len(fields)} fields")
+            raise GavoError(f"{place}: expected `timestamp path`, of no blanks, found {len(fields)} fields")
         rows.append(_row(root, path, place, *fields))
     return _in_time(path, rows)
 
@@ -221,12 +221,14 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
 def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
     """Check a stamp and a path, which stays below `root`."""
     try:
-        stamp = float(time)
+        stamp = number(time)
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):
         raise GavoError(f"{place}: not a time stamp: {time[:60]!r}")
     try:
+        if "\\" in image and not (root / image).exists():
+            image = image.replace("\\", "/")  # as Windows has it
         resolved = (root / image).resolve()
         if len(image) > MAX_PATH:
             raise ValueError("too long")

@@ -175,6 +175,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("camera_intrinsic.json", json.dumps({"width": 160, "height": 120, "intrinsic_matrix": [1, 2]})),
         ["camera_intrinsic.json", "Open3D"],
     ),
+    "open3d: a log of prose": (
+        "open3d",
+        write("trajectory.log", "left, then right\n"),
+        ["trajectory.log:1", "three whole numbers", "left then right"],
+    ),
+    "tum: icl's truth, twice": (
+        "associations",
+        lambda clip: [write(f"{i}.gt.freiburg", "1 0 0 0 0 0 0 1\n")(clip) for i in "ab"],
+        ["clip: a.gt.freiburg and b.gt.freiburg", "leave one"],
+    ),
     "plain: no camera": ("plain", remove("camera.yaml"), ["clip", "no camera file", "no camera known", "--camera"]),
     "plain: YAML that is none": ("plain", write("camera.yaml", "fx: [1, 2"), ["camera.yaml", "not YAML"]),
     "plain: stamps that never meet": (
@@ -185,6 +195,46 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
             for file in list((clip / part).iterdir())
         ],
         ["clip", "within 0.02 s", "--rate"],
+    ),
+    "plain: colour of another ending": (
+        "plain",
+        lambda clip: [file.rename(file.with_suffix(".raw")) for file in list((clip / "rgb").iterdir())],
+        ["clip: no colour images in rgb (0.raw, 1.raw)", "end in .png"],
+    ),
+    "plain: folders of other names": (
+        "plain",
+        lambda clip: (clip / "depth").rename(clip / "range"),
+        ["clip: a folder of camera.yaml, range/, rgb/", "depth in depth, depths"],
+    ),
+    "plain: numbers longer than any float": (
+        "plain",
+        lambda clip: [
+            file.rename(file.with_name(f"9{int(file.stem):017}{file.suffix}"))
+            for part in ("rgb", "depth")
+            for file in list((clip / part).iterdir())
+        ],
+        ["clip: no frame", "same number"],
+    ),
+    "replica: no pose": ("replica", write("traj.txt", ""), ["traj.txt", "holds no trajectory"]),
+    "scannet: a pose on its side": (
+        "scannet",
+        lambda clip: np.savetxt(clip / "pose/1.txt", np.eye(4) + np.eye(4, k=-3)),
+        ["pose/1.txt", "no rotation and shift"],
+    ),
+    "tum: names with blanks": (
+        "tum",
+        edit("rgb.txt", "rgb/", "my rgb/"),
+        ["rgb.txt:2", "expected `timestamp path`, of no blanks", "3 fields"],
+    ),
+    "tum: a folder for an image": (
+        "tum",
+        lambda clip: [remove(f"rgb/{FIRST}")(clip), (clip / f"rgb/{FIRST}").mkdir()],
+        [FIRST, "not a file", "restore"],
+    ),
+    "kalibr: another kind of camera": (
+        "plain",
+        write("camera.yaml", "cam0:\n  camera_model: omni\n"),
+        ["camera.yaml: camera_model 'omni': pinhole"],
     ),
     "plain: only colour": ("plain", remove("depth"), ["clip", "a folder of", "not one of"]),
     "nothing at all": (
@@ -245,11 +295,13 @@ def file_of(name: str, content: bytes) -> Callable[[Path], Path]:
 OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "nowhere": (lambda path: path / "nowhere", ["nowhere", "no such folder or file", "synthetic"]),
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
-    "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a file of 100 bytes", "not one of"]),
+    "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
     "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
     "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),
     "bag: torn": (torn_bag, ["x.bag"]),
     "bag: no images": (no_images, ["x.bag", "holds no images", "sensor_msgs"]),
+    "bag: never closed": (file_of("x.bag.active", b"#ROSBAG V2.0\n"), ["x.bag.active", "never closed", "reindex"]),
+    "an archive": (file_of("clip.tgz", b"\x1f\x8b"), ["clip.tgz", "packed", "tar -xf"]),
     "mcap: text": (file_of("x.mcap", b"hello"), ["x.mcap", "not a bag"]),
     "db3: text": (file_of("x.db3", b"hello" * 300), ["x.db3", "not a bag"]),
     "mcap: several colours": (two_colours, ["/left, /right", "--colour-topic"]),

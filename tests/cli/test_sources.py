@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import Done, runner
-from layouts import CAMERA, LAYOUTS, image
+from layouts import CAMERA, LAYOUTS, POSES, image
 from recordings import COLOR, DEPTH, KINDS, Shot, record
 
 from gavo_jax.cli.options import Source
@@ -54,6 +54,47 @@ def test_run_needs_nothing_but_the_folder_and_says_which_camera(gavo, tmp_path, 
         f"clip: {LAYOUTS[name][0]}, 4 frames of 160x120; camera fx 131 fy 131 cx 79.5 cy 59.5 (clip/"
     )
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost_pairs"] == 0
+
+
+FIRST_AND_THIRD = {
+    "tum": ("rgb/{}.png", "depth/{}.png", "0.000000", "0.066667"),
+    "seven_scenes": ("frame-{}.color.png", "frame-{}.depth.png", "000000", "000002"),
+    "scannet": ("color/{}.jpg", "depth/{}.png", "0", "2"),
+    "replica": ("results/frame{}.jpg", "results/depth{}.png", "000000", "000002"),
+    "open3d": ("color/{}.jpg", "depth/{}.png", "000001", "000003"),
+    "plain": ("rgb/{}.png", "depth/{}.tiff", "0", "2"),
+    "one_folder": ("color_{}.png", "depth_{}.npy", "000", "002"),
+}
+
+
+@pytest.mark.parametrize("layout", FIRST_AND_THIRD)
+def test_a_pair_of_a_source_has_its_camera_and_its_unit(gavo, tmp_path, layout):
+    clip = tmp_path / "clip"
+    clip.mkdir() if layout != "tum" else None
+    LAYOUTS[layout][1](clip)
+    color, depth, *names = FIRST_AND_THIRD[layout]
+    done = gavo("align", *(clip / form.format(name) for name in names for form in (color, depth)), *FAST)
+    assert done.status == 0, done.err
+    answer = json.loads(done.out)
+    units = {"tum": 5000, "replica": 6553.5, "plain": 1, "one_folder": 1}.get(layout, 1000)
+    assert answer["depth_units_per_metre"] == units and str(clip) in answer["camera_from"]
+    target_T_reference = np.linalg.inv(POSES[2]) @ POSES[0]
+    np.testing.assert_allclose(np.array(answer["target_T_reference"])[:3, 3], target_T_reference[:3, 3], atol=2e-3)
+
+
+def test_a_pair_is_aligned_whatever_is_wrong_with_the_rest_of_its_source(gavo, clip):
+    names = [clip / f"{part}/{stamp}.png" for stamp in ("0.000000", "0.033333") for part in ("rgb", "depth")]
+    (clip / "groundtruth.txt").write_text("nonsense\n")
+    assert gavo("align", *names, *FAST).status == 0
+    assert is_refused(gavo("align", names[0], clip, *names[2:]), f"{clip}: not a file")
+    assert is_refused(gavo("align", clip / "none.png", *names[1:]), "none.png: no such file")
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_run(gavo, clip):
+    Path("map.ply").mkdir()
+    Path("camera.toml").mkdir()
+    assert is_refused(gavo("run", clip, *FAST, "--map", "map.ply", "--output", "out"), "map.ply: a folder")
+    assert is_refused(gavo("calibrate", clip), "camera.toml: a folder") and not Path("out").exists()
 
 
 def test_inspect_says_what_a_source_is(gavo, clip):

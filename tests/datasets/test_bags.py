@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from layouts import CAMERA, GREYS, METRES
-from recordings import COLOR, DEPTH, KINDS, STYLES, Recorder, Shot, record
+from recordings import COLOR, COMPRESSIONS, DEPTH, KINDS, STYLES, Recorder, Shot, record
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets import bags as bags_module
@@ -310,6 +310,41 @@ def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     np.testing.assert_allclose(open_source(tmp_path / "zero", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
 
 
+def test_stamps_that_stand_still_stand_for_none(tmp_path):
+    recorder = Recorder(tmp_path / "still", "mcap")
+    for received in (5.0, 5.1, 5.2):
+        recorder.image(COLOR, 77.0, BGRS[0], "bgr8", received)
+        recorder.image(DEPTH, 77.0, MILLIMETRES[0], "16UC1", received)
+    recorder.close()
+    np.testing.assert_allclose(open_source(tmp_path / "still", Reading(camera=CAMERA)).timestamps, [5.0, 5.1, 5.2])
+
+
+@pytest.mark.parametrize(
+    "reading", [Reading(color_topic=DEPTH), Reading(depth_topic=COLOR), Reading(color_topic=COLOR, depth_topic=COLOR)]
+)
+def test_one_topic_is_not_both(bags, reading):
+    with pytest.raises(
+        GavoError, match=r"image_raw: chosen as colour and as depth alike: there are images on /camera/al"
+    ):
+        open_source(bags["mcap", "raw", "u16"], reading)
+
+
+def test_a_film_in_messages_is_called_one(tmp_path):
+    recorder = Recorder(tmp_path / "film", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.compressed(f"{COLOR}/compressed", stamp, b"\0\0\0\1" + bytes(90), "h264")
+        recorder.image(DEPTH, stamp, MILLIMETRES[0], "16UC1")
+    recorder.close()
+    with pytest.raises(FrameError, match=r"color/image_raw/compressed at 1\.0+: a film \('h264'\), .*JPEG or PNG"):
+        open_source(tmp_path / "film", Reading(camera=CAMERA)).check()
+
+
+def test_an_ending_in_capitals_is_to_be_written_small(tmp_path, bags):
+    (tmp_path / "WALK.BAG").write_bytes(bags["ros1", "raw", "u16"].read_bytes())
+    with pytest.raises(GavoError, match=r"WALK\.BAG: the library reads it only as \.bag: rename it"):
+        open_source(tmp_path / "WALK.BAG")
+
+
 def test_a_message_without_a_stamp_is_left_out(tmp_path):
     recorder = Recorder(tmp_path / "one", "mcap")
     for stamp in (5.0, 0.0, 5.1):
@@ -332,6 +367,74 @@ def test_a_torn_or_empty_recording_is_refused_in_one_line(tmp_path, kind):
     (tmp_path / "metadata.yaml").write_text("hello")
     with pytest.raises(GavoError):
         open_source(tmp_path)
+
+
+@pytest.mark.parametrize(("kind", "compression"), COMPRESSIONS)
+def test_compressed_recordings_are_read_as_others(tmp_path, bags, kind, compression):
+    path = record(tmp_path / "small", kind, "raw", shots(), CAMERA, compression)
+    for ours, theirs in zip(open_source(path), open_source(bags[kind, "raw", "u16"]), strict=True):
+        np.testing.assert_array_equal(ours.grey, theirs.grey)
+        np.testing.assert_array_equal(ours.depth, theirs.depth)
+        assert ours.timestamp == theirs.timestamp
+
+
+@pytest.mark.parametrize(("kind", "compression"), COMPRESSIONS)
+def test_a_damaged_compressed_recording_is_one_line(tmp_path, kind, compression):
+    path = record(tmp_path / "small", kind, "raw", shots(), CAMERA, compression)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix != ".yaml")
+    whole = file.read_bytes()
+    middle = len(whole) // 2
+    for content in (whole[:middle], whole[:middle] + bytes(middle // 2) + whole[middle + middle // 2 :], b""):
+        file.write_bytes(content)
+        with pytest.raises(GavoError, match=f"^{path}: ") as caught:
+            list(open_source(path))
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+def test_what_is_compressed_says_how_it_is_to_be_named(tmp_path, kind):
+    path = record(tmp_path / "messages", kind, "raw", shots(), CAMERA, "MESSAGE")
+    file = next(one for one in path.iterdir() if one.suffix != ".yaml")
+    with pytest.raises(GavoError, match=r"its messages are compressed \(zstd\).*metadata\.yaml.*name the folder"):
+        open_source(file)
+    path = record(tmp_path / "file", kind, "raw", shots(), CAMERA, "FILE")
+    file = next(one for one in path.iterdir() if one.suffix != ".yaml")
+    with pytest.raises(GavoError, match=f"a file of a source, whose folder is to be named: {path}"):
+        open_source(file)
+    (path / "metadata.yaml").unlink()
+    for place in (file, path):
+        with pytest.raises(GavoError, match=rf"{file.name}: packed: unpack it first \(zstd -d\)"):
+            open_source(place)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("walk.bag.active", ".*never closed.*rosbag reindex"),
+        ("walk.zip", r"packed: unpack it first \(unzip\)"),
+        ("walk.tgz", r"packed: unpack it first \(tar -xf\)"),
+        ("walk.tar.gz", r"packed: unpack it first \(tar -xf\)"),
+        ("walk.bag.gz", r"packed: unpack it first \(gunzip\)"),
+        ("walk.mp4", "a film.*frames as images"),
+        ("walk.svo", "a file of 5 bytes, not one of"),
+    ],
+)
+def test_files_that_hold_a_source_say_how_to_get_it_out(tmp_path, name, words):
+    (tmp_path / name).write_bytes(b"hello")
+    with pytest.raises(GavoError, match=f"{name}: {words}"):
+        open_source(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("kind", "tool"), [("ros1", "rosbag reindex"), ("sqlite", "ros2 bag reindex"), ("mcap", "mcap recover")]
+)
+def test_a_torn_recording_names_what_mends_it(tmp_path, kind, tool):
+    path = record(tmp_path / "torn", kind, "raw", shots(), CAMERA)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix != ".yaml")
+    file.write_bytes(file.read_bytes()[:-5000])
+    for place in {path, file}:
+        with pytest.raises(GavoError, match=f"not a bag that can be read: .*{tool}"):
+            open_source(place)
 
 
 def test_without_the_library_it_is_said_what_to_install(bags, monkeypatch):

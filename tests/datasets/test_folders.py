@@ -155,6 +155,30 @@ def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
         open_source(folder)
 
 
+def test_images_without_a_number_are_left_out_by_name(folder):
+    wrote(folder, "seven_scenes")
+    (folder / "frame-000001.color.png").rename(folder / "frame-abc.color.png")
+    sequence = open_source(folder)
+    assert isinstance(sequence, SevenScenes)
+    assert sequence.left_out == (
+        "1 depth images: no colour image of the same number",
+        "1 images: no number in their names, as frame-abc.color.png",
+    )
+    wrote(folder, "plain")
+    image(folder / "depth/legend.png", DEPTHS[0])
+    image(folder / "depth/scale.png", DEPTHS[0])
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder)
+    assert sequence.left_out == ("2 images: no number in their names, as legend.png",)
+
+
+def test_folders_of_other_names_say_which_are_known(folder):
+    wrote(folder, "plain")
+    (folder / "rgb").rename(folder / "left")
+    with pytest.raises(GavoError, match=r"left/: .*; colour is looked for in color, colour, rgb, .* depth in depth, "):
+        open_source(folder)
+
+
 def test_a_published_camera_stands_in_for_a_file(folder):
     wrote(folder, "seven_scenes")
     (folder / "camera-intrinsics.txt").unlink()
@@ -246,6 +270,78 @@ def test_a_camera_that_is_named_goes_before_the_folders_own(folder):
     assert open_source(folder, Reading(camera=mine, depth_scale=2000)).camera.depth_scale == 2000
 
 
+@pytest.mark.parametrize("name", ["plain", "replica", "seven_scenes"])
+def test_one_image_of_another_size_is_not_the_size_of_all(folder, name):
+    """Whose camera file does not say it, or does: the odd image is named."""
+    wrote(folder, name)
+    first = {"plain": "rgb/0.png", "replica": "results/frame000000.jpg", "seven_scenes": "frame-000000.color.png"}[name]
+    image(folder / first, GREYS[0][:60])
+    if name == "plain":
+        (folder / "camera.yaml").unlink()
+        (folder / "camera.txt").write_text("131 131 79.5 59.5")
+        (folder / "camera.txt").rename(folder / "intrinsics.txt")
+    with pytest.raises(GavoError, match=rf"{first}: is 160x60 pixels, the camera's images are 160x120"):
+        open_part(str(folder))
+
+
+@pytest.mark.parametrize("raw_value", [0, 65535])
+def test_a_source_without_any_depth_is_refused(folder, raw_value):
+    wrote(folder, "plain")
+    for i in range(4):
+        (folder / f"depth/{i}.tiff").unlink()
+        image(folder / f"depth/{i}.png", np.full((120, 160), raw_value, np.uint16))
+    with pytest.raises(GavoError, match=r"clip: no reading in the depth of the 4 frames .*--force"):
+        open_part(str(folder))
+    assert len(open_part(str(folder), force=True)) == 4
+    image(folder / "depth/3.png", np.full((120, 160), 1500, np.uint16))
+    assert len(open_part(str(folder))) == 4  # a sensor may start late
+
+
+@pytest.mark.parametrize("turn", [[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])
+def test_depth_that_falls_nowhere_into_the_image_is_refused(folder, turn):
+    """By a shift in another unit, or a camera that looks the other way."""
+    wrote(folder, "plain")
+    pose = np.diag([*turn, 1.0])
+    pose[0, 3] = 9.0 if turn[0] > 0 else 0.03
+    mine = "\n".join(f"{k} = {getattr(CAMERA, k)}" for k in ("fx", "fy", "cx", "cy", "width", "height"))
+    (folder / "camera.yaml").unlink()
+    (folder / "camera.toml").write_text(f"{mine}\ncolour_T_depth = {pose.tolist()}\n[depth]\n{mine}\n")
+    with pytest.raises(GavoError, match=r"clip: of the depth of the 4 frames .* colour_T_depth .*--force"):
+        open_part(str(folder))
+    assert len(open_part(str(folder), force=True)) == 4
+
+
+def test_colour_may_be_arrays(folder):
+    for i in range(3):
+        image(folder / f"rgb/{i}.npy", np.dstack([GREYS[i]] * 3))
+        image(folder / f"depth/{i}.npy", METRES[i].astype(np.float32))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_array_equal(sequence[2].grey, GREYS[2])
+
+
+def test_what_lacks_images_says_which(folder):
+    wrote(folder, "plain")
+    for i in range(4):
+        (folder / f"rgb/{i}.png").rename(folder / f"rgb/{i}.raw")
+    with pytest.raises(GavoError, match=r"clip: no colour images in rgb \(0\.raw, 1\.raw.*\): those end in \.png, "):
+        open_source(folder)
+    shutil.rmtree(folder / "depth")
+    (folder / "depth").mkdir()
+    for i in range(4):
+        (folder / f"rgb/{i}.raw").rename(folder / f"rgb/{i}.png")
+    with pytest.raises(GavoError, match=r"clip: no depth images in depth \(empty\): those end in \.png, "):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("inside", ["rgb", "rgb/0.png", "camera.yaml"])
+def test_a_part_of_a_source_names_its_folder(folder, inside):
+    wrote(folder, "plain")
+    with pytest.raises(
+        GavoError, match=rf"{inside}: a (file|folder) of a source, whose folder is to be named: {folder}$"
+    ):
+        open_source(folder / inside)
+
+
 REFUSED = {
     "an empty folder": (lambda f: shutil.rmtree(f / "rgb") or shutil.rmtree(f / "depth"), "plain", "camera.yaml"),
     "no camera": (lambda f: (f / "camera.yaml").unlink(), "plain", "--camera"),
@@ -259,6 +355,7 @@ REFUSED = {
         "seven_scenes",
         "no rotation",
     ),
+    "no pose": (lambda f: (f / "traj.txt").write_text("# none\n"), "replica", "traj.txt: holds no trajectory"),
     "half a pose": (lambda f: (f / "traj.txt").write_text("1 0 0 0 1\n"), "replica", "traj.txt:1: "),
     "a matrix of text": (lambda f: (f / "camera-intrinsics.txt").write_text("x"), "seven_scenes", "intrinsics.txt: "),
     "no number in common": (

@@ -1,5 +1,6 @@
 """Image files of every kind: what they become, and what is refused in one line."""
 
+import os
 import struct
 import sys
 from dataclasses import replace
@@ -15,7 +16,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
-from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid
+from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid, without_words_on
 from gavo_jax.errors import GavoError
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
@@ -250,6 +251,33 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, capfd, name, conte
     message = str(caught.value)
     assert message.startswith(str(tmp_path / name)) and len(message.splitlines()) == 1 and len(message) < 400
     assert capfd.readouterr() == ("", "")
+
+
+TORN = (".png", ".jpg", ".tiff", ".webp", ".jp2", ".bmp", ".ppm", ".npy", ".exr")
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.6, 0.97])
+@pytest.mark.parametrize("ending", TORN)
+def test_a_torn_image_is_one_line_and_its_library_says_nothing(tmp_path, capfd, ending, keep):
+    """Neither on standard error nor, as OpenEXR does, on standard output, where a program reads JSON."""
+    path = tmp_path / f"image{ending}"
+    reads_depth = ending in (".npy", ".exr")
+    write(path, METRES if reads_depth else BGR)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(keep * len(whole))])
+    capfd.readouterr()
+    with pytest.raises(FrameError) as caught:
+        (read_depth if reads_depth else read_color)(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and str(tmp_path) in message and "/tmp" not in message.replace(str(path), "")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_say_while_a_library_is_kept_quiet_is_not_lost(capfd):
+    with without_words_on("/x.exr"):
+        os.write(2, b"/x.exr: torn\nmine\n")
+        print("Warning: Exception raised reading pixel data\nmine, too")
+    assert capfd.readouterr() == ("mine, too\n", "mine\n")
 
 
 def test_arrays_of_other_things_are_refused(tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.datasets.names import by_number, images_among, stamps
+from gavo_jax.datasets.names import Found, by_number, images_among, stamps
 from gavo_jax.errors import GavoError
 
 STEP = 33.333e-3
@@ -52,6 +52,8 @@ def test_stamps_of_every_unit_have_the_cameras_rate(name):
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
         ["20249901123059", "20249901123060"],
         ["a", "b"],
+        [f"9{i:017}" for i in range(4)],
+        [f"9{i:030}" for i in range(4)],
     ],
 )
 def test_what_is_no_stamp_is_not_taken_for_one(names):
@@ -94,6 +96,24 @@ def test_the_number_that_tells_frames_apart_counts(color, depth):
 def test_names_that_leave_the_order_open_are_refused(names, fault):
     with pytest.raises(GavoError, match=fault):
         by_number(paths(*names), paths("1.png", "2.png"))
+
+
+def test_numbers_that_no_float_tells_apart_are_none():
+    found = by_number(paths(*(f"9{i:017}.png" for i in range(3))), paths(*(f"9{i:017}.png" for i in range(3))))
+    assert found[:2] == Found({}, {})[:2] and len(found.others) == 6
+
+
+@pytest.mark.parametrize(("first", "refused"), [((0, 1), True), ((1, 0), True), ((5, 9), True), ((3, 3), False)])
+def test_colour_and_depth_that_count_from_other_numbers_are_refused(first, refused):
+    """As many of both, without a gap: the same frames under other numbers, or one late by some?"""
+    color, depth = (paths(*(f"{start + i:03}.png" for i in range(12))) for start in first)
+    if not refused:
+        assert len(by_number(color, depth).color) == 12
+        return
+    words = rf"colour images are {first[0]} to {first[0] + 11}, depth images {first[1]} to {first[1] + 11}: give"
+    with pytest.raises(GavoError, match=words):
+        by_number(color, depth)
+    assert by_number(color[:-1], depth) and by_number(color[:5] + color[6:], depth)
 
 
 def test_hidden_files_and_others_are_no_images():

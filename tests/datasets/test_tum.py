@@ -228,7 +228,11 @@ def test_undistortion_belongs_to_the_sequence(folder):
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "rgb.txt: not a text"),
         (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2.png\nnot a line at all"), "depth.txt:5: "),
         (lambda f: edit(f / "depth.txt", "depth/2.png", ""), "depth.txt:4: "),
+        (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2 b.png"), "depth.txt:4: expected `timestamp path`, of"),
         (lambda f: edit(f / "rgb.txt", "100.000000", "nan"), "rgb.txt:2: not a time stamp"),
+        (lambda f: edit(f / "rgb.txt", "100.000000", "1_00"), "rgb.txt:2: not a time stamp: '1_00'"),
+        (lambda f: edit(f / "rgb.txt", "100.000000", "\u0661\u0662"), "rgb.txt:2: not a time stamp"),
+        (lambda f: edit(f / "groundtruth.txt", "100.000000", "1_00"), "groundtruth.txt:2: expected 8 numbers"),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "../clip2/3.png"), "rgb.txt:5: path leaves"),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "/etc/passwd"), "rgb.txt:5: path leaves"),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "rgb/\0.png"), "rgb.txt:5: not a usable path"),
@@ -263,6 +267,32 @@ def test_a_folder_reached_through_a_link_is_fine(folder):
 def test_an_unknown_camera_is_refused(folder, camera):
     with pytest.raises(GavoError, match=camera):
         TumSequence(folder, camera)
+
+
+def test_paths_of_windows_lead_to_the_images(folder):
+    for name in ("rgb", "depth"):
+        edit(folder / f"{name}.txt", f"{name}/", f"{name}\\")
+    sequence = TumSequence(folder, CAMERA)
+    sequence.check()
+    np.testing.assert_array_equal(sequence[3].depth, depth_image(3))
+    edit(folder / "rgb.txt", "rgb\\3.png", "..\\..\\3.png")
+    with pytest.raises(GavoError, match=r"rgb\.txt:5: path leaves"):
+        TumSequence(folder, CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("put", "words"),
+    [
+        (lambda path: path.mkdir(), "not a file: restore it, or leave its frame out"),
+        (lambda path: path.symlink_to("elsewhere.png"), r"a link to elsewhere\.png, which is missing: restore"),
+        (lambda path: None, "image is missing: restore it, or leave its frame out"),
+    ],
+)
+def test_what_is_there_instead_of_an_image_is_said(folder, put, words):
+    (folder / "rgb/4.png").unlink()
+    put(folder / "rgb/4.png")
+    with pytest.raises(GavoError, match=rf"rgb/4\.png: {words}"):
+        TumSequence(folder, CAMERA).check()
 
 
 def test_a_missing_image_of_the_chosen_range_is_refused_before_the_run(folder):

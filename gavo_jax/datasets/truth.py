@@ -1,0 +1,169 @@
+"""The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.errors import GavoError, data_rows, number
+from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
+
+TRUTH = "groundtruth.txt"
+"""In TUM's form."""
+
+LOG = "trajectory.log"
+"""In Redwood's form, which Open3D writes, too."""
+
+ICL = "*.gt.freiburg"
+"""In TUM's form, of ICL-NUIM: the numbers of frames for stamps, and y points up."""
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+"""Between ICL-NUIM's world and cameras, whose y points up as the negative fy of its page says, and those of its images,
+whose rows run from the top as everywhere. Both sides of a pose turn over, so that it stays a rotation and a shift."""
+
+SKEWED = 0.01
+"""A pose whose rotation is off one by more is none."""
+
+MAX_POSE_BYTES = 4096
+
+MAX_NUMBER = 10**18
+"""Of a frame."""
+
+Seconds = Callable[[np.ndarray], np.ndarray]
+"""Times of frames by their numbers."""
+
+
+def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] | None = None) -> Trajectory | None:
+    """The true trajectory that lies in a folder, if one does.
+
+    Args:
+        folder: of the frames.
+        seconds: times of frames by their numbers, where they have no stamps: a truth of whole numbers counts them, too.
+        depth: time of each depth image by its number, where one may be in Redwood's form.
+
+    Raises:
+        GavoError: it cannot be read.
+    """
+    if (folder / TRUTH).exists():
+        truth = Trajectory.read_tum(folder / TRUTH)
+        return replace(truth, timestamps=seconds(truth.timestamps)) if seconds and _are_whole(truth) else truth
+    if (file := icl_truth(folder)) is not None:
+        return _read_icl(file, seconds)
+    return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
+
+
+def icl_truth(folder: Path) -> Path | None:
+    """The file of ICL-NUIM's trajectory in a folder.
+
+    Raises:
+        GavoError: there are several.
+    """
+    files = sorted(file for file in folder.glob(ICL) if not file.name.startswith("."))
+    if len(files) > 1:
+        raise GavoError(f"{folder}: {files[0].name} and {files[1].name}: leave one of them there")
+    return files[0] if files else None
+
+
+def _read_icl(path: Path, seconds: Seconds | None) -> Trajectory:
+    truth = Trajectory.read_tum(path)
+    if not _are_whole(truth):
+        raise GavoError(
+            f"{path}: expected the numbers of frames in its first column: name it {TRUTH} if they are stamps"
+        )
+    if seconds is None:
+        raise GavoError(
+            f"{path}: counts frames, and the images have stamps: give the poses theirs, in a file named {TRUTH}"
+        )
+    return replace(truth, timestamps=seconds(truth.timestamps), world_T_camera=MIRROR @ truth.world_T_camera @ MIRROR)
+
+
+def _are_whole(truth: Trajectory) -> bool:
+    return np.array_equal(truth.timestamps, np.round(truth.timestamps))
+
+
+def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
+    """Read a trajectory of blocks of five lines: three numbers, of which the third is the frame's, and a 4×4 matrix.
+
+    The third number counts depth images from 1. Where the images' own numbers count from 0 it is one ahead; and where
+    it fits neither way, but there are as many poses as images, it is that of a piece of a longer recording.
+
+    Args:
+        path: the file.
+        times: of depth images by their numbers, seconds.
+
+    Returns:
+        Poses that are finite; None where none is.
+
+    Raises:
+        GavoError: malformed; the message names file and line. Or its frames are not those of `times`.
+    """
+    blocks, poses = _blocks(path), {}
+    for frame, (place, fields) in blocks.items():
+        if (pose := pose_of(place, fields)) is not None:
+            poses[frame] = pose
+    numbers = sorted(times)
+    both = (0, 1) if numbers[0] else (1, 0)
+    ahead = max(both, key=lambda ahead: len(blocks.keys() & {n + ahead for n in numbers}))
+    named = {n + ahead: times[n] for n in numbers}
+    if not blocks.keys() & named.keys():
+        if len(blocks) != len(numbers):
+            raise GavoError(f"{path}: none of its frames ({min(blocks)} to {max(blocks)}) is there")
+        named = {ours: times[n] for ours, n in zip(sorted(blocks), numbers, strict=True)}
+    known = [frame for frame in sorted(poses) if frame in named]
+    if not known:
+        return None
+    stamps = np.array([named[frame] for frame in known])
+    order = np.argsort(stamps, kind="stable")
+    return Trajectory(stamps[order], np.stack([poses[frame] for frame in known])[order])
+
+
+def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
+    """Sixteen fields, with their place, by the third number of each block."""
+    rows, blocks = data_rows(path), {}
+    if not rows:
+        raise GavoError(f"{path}: holds no trajectory (no rows)")
+    for (place, head), *matrix in (rows[at : at + 5] for at in range(0, len(rows), 5)):
+        if len(head) != 3 or not all(re.fullmatch(r"-?\d{1,18}", field) for field in head):
+            raise GavoError(f"{place}: expected three whole numbers before each matrix, found {' '.join(head)[:60]!r}")
+        if len(matrix) != 4 or any(len(fields) != 4 for _, fields in matrix):
+            raise GavoError(f"{place}: expected four rows of four numbers after it")
+        frame = int(head[2])
+        if frame in blocks:
+            raise GavoError(f"{place}: frame {frame} is there twice")
+        blocks[frame] = place, [field for _, fields in matrix for field in fields]
+    return blocks
+
+
+def pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Poses by the last number in the names of their files."""
+    poses = {}
+    for file in files:
+        numbers = re.findall(r"\d+", file.name)
+        pose = pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+        if pose is not None and numbers and int(numbers[-1]) < MAX_NUMBER:
+            poses[int(numbers[-1])] = pose
+    return poses
+
+
+def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
+    """A rigid transform from sixteen numbers, row by row; None where it is not finite: the frame was not tracked.
+
+    Raises:
+        GavoError: no sixteen numbers, or no rigid transform.
+    """
+    try:
+        matrix = np.array([number(field) for field in fields]).reshape(4, 4)
+    except ValueError:
+        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
+    if not np.isfinite(matrix).all():
+        return None
+    if np.abs(matrix[:3, 3]).max() < MAX_MAGNITUDE and np.allclose(matrix[3], [0, 0, 0, 1], atol=SKEWED):
+        u, _, vt = np.linalg.svd(matrix[:3, :3])
+        rotation = u @ vt
+        if np.abs(rotation - matrix[:3, :3]).max() <= SKEWED and np.linalg.det(rotation) > 0:
+            matrix[:3, :3], matrix[3] = rotation, (0, 0, 0, 1)
+            return matrix
+    raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")

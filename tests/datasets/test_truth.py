@@ -1,0 +1,192 @@
+"""The true trajectory that lies beside the frames, in every form that a dataset has it."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, image, raw
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.registry import open_source
+from gavo_jax.datasets.truth import MIRROR
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import Trajectory
+
+STAMPS = np.arange(4) / 30
+
+
+def log(poses: np.ndarray, numbers: Iterable[int]) -> str:
+    """Redwood's form; `numbers` are the third ones, which count from 1."""
+    blocks = []
+    for number, pose in zip(numbers, poses, strict=True):
+        rows = "\n".join(" ".join(f"{value:.10f}" for value in row) for row in pose)
+        blocks.append(f"{number - 1}\t{number - 1}\t{number}\n{rows}\n")
+    return "".join(blocks)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "clip").mkdir()
+    LAYOUTS["open3d"][1](tmp_path / "clip")
+    return tmp_path / "clip"
+
+
+def truth_of(folder: Path, **reading: object) -> Trajectory:
+    sequence = open_source(folder, Reading(**reading))  # pyright: ignore[reportArgumentType]
+    assert sequence.ground_truth is not None
+    return sequence.ground_truth
+
+
+def renumber(folder: Path, first: int) -> None:
+    for part in ("color", "depth"):
+        files = sorted((folder / part).iterdir())
+        for number, file in enumerate(files, first):
+            file.rename(file.with_name(f"new{number:05}{file.suffix}"))
+
+
+@pytest.mark.parametrize("first", [0, 1, 7])
+def test_a_log_counts_from_one_whatever_the_images_do(folder, first):
+    """Redwood's images are numbered from 1, Open3D's from 0; of a piece of a longer recording the log is one, too."""
+    renumber(folder, first)
+    (folder / "trajectory.log").write_text(log(POSES, range(1, 5)))
+    for rate in (30.0, 7.0):
+        truth = truth_of(folder, rate=rate)
+        np.testing.assert_array_equal(truth.timestamps, (first + np.arange(4)) / rate)
+        np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-8)
+
+
+@pytest.mark.parametrize(("first", "numbers"), [(0, [2, 4]), (1, [2, 4]), (100, [102, 104]), (101, [102, 104])])
+def test_a_log_of_some_frames_says_which(folder, first, numbers):
+    renumber(folder, first)
+    (folder / "trajectory.log").write_text(log(POSES[[1, 3]], numbers))
+    expected = np.array(numbers) - (first % 2 == 0)
+    np.testing.assert_allclose(truth_of(folder).timestamps, expected / 30)
+
+
+def test_a_log_counts_the_depth_images_where_names_are_stamps(tmp_path):
+    """As Redwood has it: fewer colour images, and a number before the microseconds."""
+    stamps = np.array([0.0, 0.033333, 0.066666, 0.099999])
+    for i, stamp in enumerate(stamps):
+        image(tmp_path / f"depth/{i + 1:07}-{round(1e6 * stamp):012}.png", raw(METRES[i], 1000))
+        if i != 1:
+            image(tmp_path / f"image/{i:07}-{round(1e6 * (stamp + 0.004)):012}.jpg", GREYS[i])
+    (tmp_path / "trajectory.log").write_text(log(POSES, range(1, 5)))
+    truth = truth_of(tmp_path, camera=CAMERA)
+    np.testing.assert_allclose(truth.timestamps, stamps + [0.004, 0, 0.004, 0.004], atol=1e-9)
+    np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-8)
+
+
+def test_frames_of_a_log_that_were_lost_have_no_pose(folder):
+    poses = POSES.copy()
+    poses[2] = np.nan
+    (folder / "trajectory.log").write_text(log(poses, range(1, 5)))
+    np.testing.assert_allclose(truth_of(folder).timestamps, (1 + np.array([0, 1, 3])) / 30)
+
+
+def icl(folder: Path, name: str = "livingRoom2.gt.freiburg", first: int = 2) -> None:
+    """ICL-NUIM's: frames and poses by number, the first without a pose; its world's and its cameras' y points up."""
+    rows = []
+    for i, (grey, depth) in enumerate(zip(GREYS, DEPTHS, strict=True), 1):
+        image(folder / f"rgb/{i}.png", grey)
+        image(folder / f"depth/{i}.png", depth)
+        rows.append(f"{i} depth/{i}.png {i} rgb/{i}.png\n")
+    (folder / "associations.txt").write_text("".join(rows))
+    up = Trajectory(np.arange(first, 5), (MIRROR @ POSES @ MIRROR)[first - 1 :])
+    up.write_tum(folder / name)
+    (folder / name).write_text("\n".join((folder / name).read_text().splitlines()[1:]) + "\n\n")
+
+
+@pytest.mark.parametrize("layout", ["associations", "folders"])
+@pytest.mark.parametrize("rate", [None, 5.0])
+def test_the_trajectories_of_icl_are_mirrored(tmp_path, layout, rate):
+    icl(tmp_path)
+    if layout == "folders":
+        (tmp_path / "associations.txt").unlink()
+    truth = truth_of(tmp_path, camera=CAMERA, rate=rate)
+    np.testing.assert_allclose(truth.timestamps, np.arange(2, 5) / (rate or 30))
+    np.testing.assert_allclose(truth.world_T_camera, POSES[1:], atol=1e-8)
+
+
+@pytest.mark.parametrize("folder", ["any", "traj0_frei_png", "living_room_traj2_frei_png"])
+def test_the_trajectory_or_the_name_says_that_the_camera_is_icl(tmp_path, folder):
+    for i in range(2):
+        image(tmp_path / folder / f"rgb/{i}.png", np.zeros((480, 640), np.uint8))
+        image(tmp_path / folder / f"depth/{i}.png", np.full((480, 640), 9000, np.uint16))
+    if folder == "any":
+        (tmp_path / folder / "traj0.gt.freiburg").write_text("1 0 0 0 0 0 0 1\n")
+    assert open_source(tmp_path / folder).camera == Camera.preset("icl")
+
+
+def test_the_numbers_of_frames_are_the_times_of_frames_to_the_last_bit(folder):
+    """Else a pose lies beside its frame, and at a low rate no other is near enough."""
+    for i in range(1, 5):
+        (folder / f"depth/{i:06}.png").rename(folder / f"depth/{i + 2:06}.png")
+        (folder / f"color/{i:06}.jpg").rename(folder / f"color/{i + 2:06}.jpg")
+    rows = [f"{i} 0 0 {i} 0 0 0 1\n" for i in range(10)]
+    (folder / "groundtruth.txt").write_text("".join(rows))
+    for rate in (3.0, 7.0, 0.3):
+        sequence = open_source(folder, Reading(rate=rate))
+        assert sequence.ground_truth is not None
+        assert sequence.ground_truth.interpolate(sequence.timestamps)[1].all()
+
+
+FAULTS = {
+    "empty log": ("trajectory.log", "", "holds no trajectory"),
+    "log of prose": ("trajectory.log", "this is no log\n", "trajectory.log:1: expected three whole numbers"),
+    "a log of two numbers": ("trajectory.log", "0 1\n", "trajectory.log:1: expected three whole numbers"),
+    "torn log": ("trajectory.log", log(POSES, range(1, 5))[:-90], "trajectory.log:16: expected four rows"),
+    "log of short rows": (
+        "trajectory.log",
+        log(POSES, range(1, 5)).replace(f"{POSES[1][0][3]:.10f}", ""),
+        "trajectory.log:6: expected",
+    ),
+    "log of the inverse of size": ("trajectory.log", log(3 * POSES, range(1, 5)), "trajectory.log:1: the pose is no"),
+    "log on its side": (
+        "trajectory.log",
+        log(np.swapaxes(POSES, 1, 2), range(1, 5)),
+        "trajectory.log:1: the pose is no",
+    ),
+    "log in millimetres of a light year": (
+        "trajectory.log",
+        "0 0 1\n1 0 0 1e30\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
+        "trajectory.log:1: ",
+    ),
+    "a number twice": ("trajectory.log", log(POSES, [1, 2, 2, 3]), "trajectory.log:11: frame 2 is there twice"),
+    "another's numbers": ("trajectory.log", log(POSES[:2], [70, 80]), "trajectory.log: none of its frames"),
+    "icl of prose": ("x.gt.freiburg", "x y\n", "x.gt.freiburg:1: expected 8 numbers"),
+    "icl of stamps": ("x.gt.freiburg", "0.5 0 0 0 0 0 0 1\n", "x.gt.freiburg: expected the numbers of frames"),
+    "icl, empty": ("x.gt.freiburg", "", "x.gt.freiburg: holds no trajectory"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_faulty_truth_is_refused_in_one_line(folder, name):
+    file, text, fault = FAULTS[name]
+    (folder / file).write_text(text)
+    with pytest.raises(GavoError) as caught:
+        open_source(folder)
+    assert str(folder) in str(caught.value) and fault in str(caught.value), caught.value
+
+
+def test_two_trajectories_of_icl_are_refused(tmp_path):
+    icl(tmp_path)
+    icl(tmp_path, "livingRoom3.gt.freiburg")
+    with pytest.raises(GavoError, match=r"livingRoom2\.gt\.freiburg and livingRoom3\.gt\.freiburg: leave one"):
+        open_source(tmp_path, Reading(camera=CAMERA))
+
+
+@pytest.mark.parametrize("layout", ["seven_scenes", "scannet", "replica"])
+@pytest.mark.parametrize("fault", ["on its side", "far away"])
+def test_what_is_no_pose_is_refused_in_every_dataset(tmp_path, layout, fault):
+    LAYOUTS[layout][1](tmp_path)
+    pose = POSES[1].copy()
+    pose[:3, 3] = (1, 2, 3) if fault == "on its side" else (0, 0, 1e12)
+    pose = pose.T if fault == "on its side" else pose
+    if layout == "replica":
+        np.savetxt(tmp_path / "traj.txt", np.stack([POSES[0], pose]).reshape(-1, 16))
+    else:
+        np.savetxt(tmp_path / ("frame-000001.pose.txt" if layout == "seven_scenes" else "pose/1.txt"), pose)
+    with pytest.raises(GavoError, match=r"(traj\.txt:2|pose\.txt|pose/1\.txt): the pose is no rotation and shift"):
+        open_source(tmp_path)
