@@ -153,7 +153,9 @@ def _print(title: str, rows: list[list[Any]], seeds: int) -> None:
 
 def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder: Path) -> list[Picture]:
     """Write the figures, where matplotlib is installed."""
-    pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    estimates = {entry.method: entry.trajectory for entry in typical}
+    ours = [name for name in estimates if name not in PEERS]
+    pictures = draw(folder, estimates, sequence.ground_truth, ours)
     drifts = _drifts(entries)
     if plots.available() and drifts:
         figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
