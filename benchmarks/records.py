@@ -19,12 +19,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks" / "records"
 PAGES = ("README.md", "benchmarks/RESULTS.md", "docs/*.md")
 """Files with places for tables, from the repository's root."""
 UNKNOWN = "–"
+ALLOWED = next(
+    requirement.specifier
+    for line in tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    if (requirement := Requirement(line)).name == "jax"
+)
+"""The versions of JAX that the package allows."""
 
 
 class Table(NamedTuple):
@@ -155,6 +162,30 @@ def markdown(table: Table) -> str:
     return "\n".join(lines)
 
 
+def jax_of(record: Record) -> str | None:
+    """The JAX that a record was measured with; None where it says none."""
+    found = re.search(r"\bJAX ([\w.]+)", record.versions)
+    return found[1].rstrip(".") if found else None
+
+
+def ruled_out(record: Record) -> str | None:
+    """A sentence where a record comes from a JAX that the package does not allow."""
+    version = jax_of(record)
+    if version is None or ALLOWED.contains(version, prereleases=True):
+        return None
+    return f"JAX {version} is ruled out: it can compute wrong numbers on a CPU. These figures await a new measurement."
+
+
+def sources_of_summary(records: Records) -> str:
+    """Which JAX the columns of README's table are of."""
+    columns = {"Drift": "drift", "found": "basin", "time": "throughput"}
+    by_version: dict[str, list[str]] = {}
+    for column, benchmark in columns.items():
+        by_version.setdefault(jax_of(records.of(benchmark)[0]) or UNKNOWN, []).append(column)
+    parts = [f"{' and '.join(names)} are of JAX {version}" for version, names in by_version.items()]
+    return "; ".join(parts).replace("time are", "*time* is").replace("found are", "*found* are") + "."
+
+
 def section(records: Sequence[Record]) -> str:
     """The tables of a benchmark's records, each with where it comes from."""
     parts = []
@@ -162,6 +193,8 @@ def section(records: Sequence[Record]) -> str:
         for table in record.tables:
             parts.append(f"**{table.title}**\n\n{markdown(table)}" if table.title else markdown(table))
         parts.append(f"*`{record.command}`. {record.date}; {record.machine}; {record.versions}.*")
+        if remark := ruled_out(record):
+            parts.append(remark)
         parts += (*record.told, *record.notes)
     return "\n\n".join(parts)
 
@@ -180,7 +213,8 @@ def fill(text: str, records: Records) -> str:
         start, kind, name, end = place.groups()
         if kind == "records" and not records.of(name):
             raise ValueError(f"no record of {name!r}")
-        inside = markdown(summary(records)) if kind == "summary" else section(records.of(name))
+        quoted = f"{markdown(summary(records))}\n\n{sources_of_summary(records)}"
+        inside = quoted if kind == "summary" else section(records.of(name))
         return f"{start}\n\n{inside}\n\n{end}"
 
     return PLACE.sub(insert, text)

@@ -224,4 +224,7 @@ def preset_for_sequence(name: str) -> str:
     for pattern, preset in NAMES_OF_SEQUENCES.items():
         if match := re.search(pattern, name.lower()):
             return match.expand(preset)
-    raise GavoError(f"no camera known for sequence {name!r}: say which with --camera {', '.join(PRESETS)} or a file")
+    raise GavoError(
+        f"no camera known for sequence {name!r}: put a camera.toml into it, or say which (--camera, camera=): "
+        f"{', '.join(PRESETS)} or a file"
+    )

@@ -40,8 +40,10 @@ def calibrate(options: Calibrate) -> int:
     if options.json:
         print(json.dumps(describe(_facts(estimate)), indent=2, allow_nan=False))
         return 0
-    rows = [(name, *_cells(found), found.why) for name, found in estimate.found.items()]
-    print_table(f"camera of {sequence.name}, by {estimate.pairs} pairs of frames", ("", "", "±", "unit", "by"), rows)
+    rows = [(name, *_cells(found)) for name, found in estimate.found.items()]
+    print_table(f"camera of {sequence.name}, by {estimate.pairs} pairs of frames", ("", "", "±", "unit"), rows)
+    for name, found in estimate.found.items():
+        say(f"{name}: {found.why}")
     say(f"camera file: {output}")
     return 0
 

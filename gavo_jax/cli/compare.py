@@ -21,6 +21,7 @@ from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import (
     ABSOLUTE_ERROR,
     DRIFT,
+    DRIFT_PER_FRAME,
     FINAL_DISTANCE,
     FRAMES_PER_SECOND,
     MILLISECONDS,
@@ -30,7 +31,7 @@ from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
 from gavo_jax.output.report import REPORT, Picture, Table, write_report
-from gavo_jax.output.screen import number, print_table, say, waiting
+from gavo_jax.output.screen import known_columns, number, print_table, say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
@@ -40,25 +41,31 @@ COMPARISON = "comparison.json"
 COLUMNS = (
     ("m/s", DRIFT, 4),
     ("deg/s", ROTATION_DRIFT, 3),
+    ("m/frame", DRIFT_PER_FRAME, 5),
     ("ATE m", ABSOLUTE_ERROR, 4),
     ("end m", FINAL_DISTANCE, 4),
     ("lost", "lost_pairs", 0),
     ("ms/pair", MILLISECONDS, 1),
     ("frames/s", FRAMES_PER_SECOND, 1),
 )
-"""Columns of the table: heading, key in comparison.json, decimals."""
+"""Columns of the table: heading, key in comparison.json, decimals. The errors per frame stand in for the drift."""
 HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
 TABLE_CAPTION = (
     "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
-    "evaluate_rpe.py, fixed delta). ATE: root mean square distance of associated positions after the best rigid "
-    "alignment. End: distance from the true position at the end, both relative to the first pose. "
-    "ms/pair: from two decoded images to their motion on the host, median. frames/s: from files to poses, decoding "
-    "included."
+    "evaluate_rpe.py, fixed delta). m/frame: the same from frame to frame, in place of the drift. ATE: root "
+    "mean square distance of associated positions after the best rigid alignment. End: distance from the true position "
+    "at the end, both relative to the first pose. ms/pair: median, from two decoded images to the motion on the host. "
+    "frames/s: from files to poses, decoding included."
 )
-LEGEND = (
-    "m/s, deg/s: drift (relative pose error over 1 s). ATE: after alignment. end: off at the last frame.",
-    "ms/pair: from two decoded images to their motion. frames/s: from files to poses, decoding included.",
-)
+MEANINGS = {
+    "m/s": "m/s, deg/s: drift, the relative pose error over 1 s",
+    "m/frame": "m/frame: relative pose error from frame to frame",
+    "ATE m": "ATE: absolute error after alignment",
+    "end m": "end: off at the last frame",
+    "ms/pair": "ms/pair: from two decoded images to their motion",
+    "frames/s": "frames/s: from files to poses, decoding included",
+}
+"""What the columns that are shown are."""
 
 
 class Entry(NamedTuple):
@@ -134,7 +141,7 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     write_report(
         folder / REPORT,
         f"gavo compare: {title}",
-        [Table(TABLE_CAPTION, HEADINGS, rows)],
+        [Table(TABLE_CAPTION, *known_columns(HEADINGS, rows))],
         pictures,
         {"options": options, "camera": sequence.camera},
         _versions(entries),
@@ -146,14 +153,18 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
 def _print(title: str, rows: list[list[Any]], seeds: int) -> None:
     """Print the table; what tells seeds apart only where there are several."""
     shown = len(HEADINGS) if seeds > 1 else 1 + len(COLUMNS)
-    print_table(title, HEADINGS[:shown], [row[:shown] for row in rows])
-    for line in LEGEND:
-        say(line)
+    columns, cells = known_columns(HEADINGS[:shown], [row[:shown] for row in rows])
+    print_table(title, columns, cells)
+    for heading, meaning in MEANINGS.items():
+        if heading in columns:
+            say(f"{meaning}.")
 
 
 def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder: Path) -> list[Picture]:
     """Write the figures, where matplotlib is installed."""
-    pictures = draw(folder, {entry.method: entry.trajectory for entry in typical}, sequence.ground_truth)
+    estimates = {entry.method: entry.trajectory for entry in typical}
+    ours = [name for name in estimates if name not in PEERS]
+    pictures = draw(folder, estimates, sequence.ground_truth, ours)
     drifts = _drifts(entries)
     if plots.available() and drifts:
         figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
@@ -223,6 +234,11 @@ def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
     return {method: np.array(values) for method, values in runs.items()}
 
 
+def _shown(metrics: dict[str, Any], key: str) -> float | None:
+    """A figure as the table has it: errors per frame only where there is no drift over a second."""
+    return None if key == DRIFT_PER_FRAME and metrics[DRIFT] is not None else metrics[key]
+
+
 def _versions(entries: list[Entry]) -> dict[str, str]:
     return {name: version for entry in entries for name, version in entry.metrics["versions"].items()}
 
@@ -232,7 +248,7 @@ def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
     for run in typical:
         drifts = [entry.metrics[DRIFT] for entry in entries if entry.method == run.method]
         known = [drift for drift in drifts if drift is not None]
-        cells = [number(run.metrics[key], digits) for _, key, digits in COLUMNS]
+        cells = [number(_shown(run.metrics, key), digits) for _, key, digits in COLUMNS]
         span = [number(extreme(known, default=None)) for extreme in (min, max)]
         rows.append([run.method, *cells, len(drifts), *span])
     return rows

@@ -60,7 +60,7 @@ def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
 def _print(options: Evaluate, series: dict[str, ErrorSeries]) -> None:
     """Print a row for each kind of error, and below what each is."""
     span = _span(options.delta, options.unit)
-    names = (f"RPE translation [m / {span}]", f"RPE rotation [deg / {span}]", "ATE [m]", "distance error [m]")
+    names = (f"RPE translation, m/{span}", f"RPE rotation, deg/{span}", "ATE, m", "distance error, m")
     rows = [
         (name, *(number(value, 6) for value in (e.rmse, e.mean, e.median, e.max)), len(e.values))
         for name, e in zip(names, series.values(), strict=True)

@@ -25,16 +25,33 @@ from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.report import REPORT as PAGE
 from gavo_jax.output.report import Picture, write_report
 from gavo_jax.output.report import Table as ReportTable
-from gavo_jax.output.screen import markdown_table, number, pair_progress, print_table, say
+from gavo_jax.output.screen import known_columns, markdown_table, number, pair_progress, print_table, say
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"
-SUMMARY_COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s", "lost", "ms/frame", "together")
-COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
-DEFINITION = (
-    "Drift: relative pose error over 1 s, RMSE (m/s, deg/s): median over the runs, its quartiles, and what a "
-    "publication prints. Time a frame, decoding included: median; together: runs that shared the machine and its time."
+SUMMARY_COLUMNS = (
+    "method",
+    "runs",
+    "m/s",
+    "from",
+    "to",
+    "printed",
+    "deg/s",
+    "m/frame",
+    "lost",
+    "ms/frame",
+    "together",
 )
+COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
+MEANINGS = {
+    "m/s": "m/s, deg/s: drift (relative pose error over 1 s, RMSE), median over the runs.",
+    "from": "from, to: quartiles of the m/s.",
+    "printed": "printed: the m/s that a publication prints.",
+    "m/frame": "m/frame: relative pose error from frame to frame, RMSE, median over the runs.",
+    "ms/frame": "ms/frame: time, decoding included, median over the runs.",
+    "together": "together: most runs that shared the machine and its time.",
+}
+"""What the columns of the table are."""
 TEST = (
     "Methods paired by sequence and seed: median of the ratio of their drifts, and p of the two-sided Wilcoxon "
     "signed-rank test, not corrected for the number of comparisons"
@@ -99,7 +116,7 @@ def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:
 
 def _news(outcome: Outcome) -> str:
     runs = outcome.batch.runs
-    labels = ", ".join(dict.fromkeys(run.label for run in runs))
+    labels = "; ".join(dict.fromkeys(run.label for run in runs))
     return f"{outcome.batch.part.name}: {labels}: {outcome.fault or f'{len(runs)} done'}"
 
 
@@ -120,24 +137,28 @@ def _report(folder: Path, markdown: bool) -> int:
     earlier = {row["sequence"] for row in others} - {row["sequence"] for row in rows if row["run"] in record.runs}
     summaries, comparisons = summarise(rows), compare(rows, earlier)
     sequences = list(dict.fromkeys(summary.sequence for summary in summaries))
-    tables = []
+    tables, explained = [], {}
     for name in sequences:
         cells = [_summary_row(summary, printed) for summary in summaries if summary.sequence == name]
-        tables.append(ReportTable(f"{name}. {DEFINITION}", SUMMARY_COLUMNS, cells))
-        _show(name, SUMMARY_COLUMNS, cells, markdown)
+        columns, cells = known_columns(SUMMARY_COLUMNS, cells)
+        meanings = {heading: words for heading, words in MEANINGS.items() if heading in columns}
+        explained |= meanings
+        tables.append(ReportTable(" ".join([f"{name}.", *meanings.values()]), columns, cells))
+        _show(name, columns, cells, markdown)
     for name in dict.fromkeys(comparison.sequence for comparison in comparisons):
         cells = [_comparison_row(found) for found in comparisons if found.sequence == name]
         tables.append(ReportTable(f"{name}. {TEST}.", COMPARISON_COLUMNS, cells))
         _show(f"{name}: first / second", COMPARISON_COLUMNS, cells, markdown)
     states = {_state(row) for row in rows}
-    notes = []
+    notes = _without_drift(summaries)
     if len(states) > 1:
         notes.append(f"The rows come from {len(states)} versions of the software or of what it uses.")
     if others:
         notes.append(f"{len(others)} of {len(rows)} runs are none of the experiment's as its file is now.")
-    note = " ".join(notes)
-    say(DEFINITION)
-    say(f"{TEST}.{' ' if note else ''}{note}")
+    for line in (*(MEANINGS[heading] for heading in MEANINGS if heading in explained), *notes):
+        say(line)
+    if comparisons:
+        say(f"{TEST}.")
     configurations = {row["run"]: json.loads(row["configuration"]) for row in rows}
     page = folder / PAGE
     write_report(
@@ -147,10 +168,19 @@ def _report(folder: Path, markdown: bool) -> int:
         _figures(folder, rows),
         configurations,
         environment(),
-        note,
+        " ".join(notes),
     )
     say(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
     return 0
+
+
+def _without_drift(summaries: Sequence[Summary]) -> list[str]:
+    """A sentence for the sequences without drift, and why."""
+    none = {summary.sequence: summary.per_frame for summary in summaries if summary.drift is None}
+    short = [name for name, per_frame in none.items() if per_frame is not None]
+    blind = [name for name, per_frame in none.items() if per_frame is None]
+    notes = [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
+    return notes + ([f"No errors of {', '.join(blind)}: no ground truth covers it."] if blind else [])
 
 
 def _show(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]], markdown: bool) -> None:
@@ -218,6 +248,7 @@ def _summary_row(summary: Summary, printed: Printed) -> list[Any]:
         *(number(value, 5) for value in (median, low, high)),
         number(printed.get((summary.sequence, summary.label)), 5),
         number(summary.rotation, 3),
+        number(None if summary.drift else summary.per_frame, 5),
         summary.lost,
         number(summary.milliseconds, 1),
         summary.together,

@@ -19,8 +19,8 @@ class Source:
     """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package. For
     `gavo run` also realsense: the first camera of that line, live."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML, ROS, Kalibr,
-    OpenCV or Open3D."""
+    """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML or ROS or
+    Kalibr, OpenCV, Open3D."""
     start: Annotated[int, arg(metavar="K")] = 0
     """First frame."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None

@@ -65,12 +65,12 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     counted = metrics.get("statuses", {}).items()
     rows += [(f"pairs: {status}", str(count), "") for status, count in counted if status != "ok"]
     if "loops" in metrics:
-        rows.append(("loops, those refused", f"{metrics['loops']}, {metrics['loops_refused']}", ""))
+        rows += [("loops that count", str(metrics["loops"]), ""), ("loops refused", str(metrics["loops_refused"]), "")]
     if metrics.get("unknown_motions"):
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
     print_table(name, ("", "", "unit"), rows)
     if reason := why_no_drift(metrics, trajectory, has_truth):
-        say(reason)
+        say(reason if known else f"{reason} The table has what the trajectory itself tells.")
     say(f"files in {folder}")
 
 
@@ -83,7 +83,7 @@ def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[R
     share = metrics.get("statuses", {}).get("ok", 0) / max(1, metrics.get("pairs", 0))
     return [
         ("length of the path", number(path), "m"),
-        ("end: x, y, z", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
+        ("end: x right, y down, z forward", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
         ("end: turned by", number(angle, 2), "deg"),
         ("pairs that are ok", number(100 * share, 1), "%"),
     ]
@@ -94,9 +94,9 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
     if metrics.get(DRIFT) is not None:
         return None
     if not has_truth:
-        return "No ground truth: no errors, but what the trajectory itself tells."
+        return "No ground truth, so no errors."
     if metrics.get(DRIFT_PER_FRAME) is None:
-        return "The ground truth covers no two of these frames: no errors, but what the trajectory itself tells."
+        return "The ground truth covers no two of these frames, so no errors."
     lasts = float(np.ptp(trajectory.timestamps))
     if lasts < 1:
         return f"No drift over 1 s: the frames last {lasts:.2f} s; the errors per frame and over all stand for it."

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import cast, overload
+from typing import ClassVar, cast, overload
 
 import cv2
 import numpy as np
@@ -185,6 +185,8 @@ class SyntheticSequence:
         GavoError: an argument out of range, a body that cannot be, or a trajectory that cannot be read, is empty, not
             finite or too large.
     """
+
+    kind: ClassVar[str] = "rendered room"
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gavo_jax.odometry.metrics import DRIFT, FRAMES_PER_SECOND, ROTATION_DRIFT
+from gavo_jax.odometry.metrics import DRIFT, DRIFT_PER_FRAME, FRAMES_PER_SECOND, ROTATION_DRIFT
 
 ALL = "all sequences"
 
@@ -23,6 +23,8 @@ class Summary(NamedTuple):
     """Lower quartile, median and upper quartile of the drift, m/s; None where there is no ground truth."""
     rotation: float | None
     """Median, deg/s."""
+    per_frame: float | None
+    """Median of the error from frame to frame, m; None where there is no ground truth."""
     lost: int
     """Lost pairs of the worst run."""
     milliseconds: float
@@ -55,6 +57,7 @@ def summarise(rows: Iterable[Row]) -> list[Summary]:
 def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
     drifts = [row[DRIFT] for row in rows if row[DRIFT] is not None]
     turns = [row[ROTATION_DRIFT] for row in rows if row[ROTATION_DRIFT] is not None]
+    steps = [row[DRIFT_PER_FRAME] for row in rows if row[DRIFT_PER_FRAME] is not None]
     quartiles = np.quantile(drifts, (0.25, 0.5, 0.75)).tolist() if drifts else None
     return Summary(
         sequence,
@@ -62,6 +65,7 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
         len(rows),
         None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
         float(np.median(turns)) if turns else None,
+        float(np.median(steps)) if steps else None,
         max(row["lost_pairs"] for row in rows),
         float(np.median([1e3 / row[FRAMES_PER_SECOND] for row in rows])),
         max(row["runs_together"] for row in rows),

@@ -122,6 +122,8 @@ def tune(
         raise GavoError("tuning needs Optuna: pip install 'gavo-jax[tune]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sequences = [part.open() for part in tuning.parts]
+    for part, sequence in zip(tuning.parts, sequences, strict=True):
+        _refuse_without_drift(part.name, sequence)
     start = presets.preset(tuning.method, tuning.preset)
     told = without_password(storage)
     with _storage_faults(told):
@@ -190,10 +192,23 @@ def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> 
     advice = "give this one another name or another --output"
     if kept is None:
         raise GavoError(f"{storage}: the study {study.study_name!r} does not tell what it is of: {advice}")
-    for name, before, after in differences(json.loads(kept), json.loads(json.dumps(configuration))):
+    there, now = json.loads(kept), json.loads(json.dumps(configuration))
+    if set(there["sequences"]) != set(now["sequences"]):
+        names = [", ".join(some["sequences"]) for some in (there, now)]
+        raise GavoError(f"{storage}: the study {study.study_name!r} is of {names[0]}, not of {names[1]}: {advice}")
+    for name, before, after in differences(there, now):
         raise GavoError(
             f"{storage}: the study {study.study_name!r} is another one: {name} {before} there, {after} now: {advice}"
         )
+
+
+def _refuse_without_drift(name: str, sequence: FrameSequence) -> None:
+    """Refuse a sequence that no drift can be told of, before a trial is made of it."""
+    lasts = float(np.ptp(sequence.timestamps))
+    if sequence.ground_truth is None:
+        raise GavoError(f"{name}: no ground truth, and so no drift to tune by")
+    if lasts < 1:
+        raise GavoError(f"{name}: drift is taken over 1 s, and these frames last {lasts:.2f} s")
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,22 +22,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def draw(folder: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> list[Picture]:
+def draw(
+    folder: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None, ours: Collection[str] = ()
+) -> list[Picture]:
     """Write the figures of named trajectories, where matplotlib is installed; errors where there is a truth.
+
+    Args:
+        folder: for the files.
+        estimates: the trajectories.
+        truth: what they are compared with.
+        ours: those that are not other libraries', which are grey; all of them where none is named.
 
     Raises:
         GavoError: a figure cannot be written.
     """
     if not plots.available():
         return []
-    pictures = [save_figure(plots.plot_trajectories(estimates, truth), folder, "trajectory")]
+    pictures = [save_figure(plots.plot_trajectories(estimates, truth, ours), folder, "trajectory")]
     if truth is None:
         return pictures
     try:
         errors = {name: distance_error(estimate, truth) for name, estimate in estimates.items()}
     except GavoError:
         return pictures
-    return [*pictures, save_figure(plots.plot_distance_error(errors), folder, "distance_error")]
+    return [*pictures, save_figure(plots.plot_distance_error(errors, ours), folder, "distance_error")]
 
 
 def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: list[Step]) -> None:
@@ -65,17 +73,29 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
     middle = good[len(good) // 2]
     landscape = _landscape_of(sequence, odometry, middle)
     if landscape is not None:
-        pair = f"frame {middle.index} against the one at {middle.reference_timestamp:.3f} s, the middle pair of the run"
-        save_figure(plots.plot_landscape(landscape, pair), folder, "landscape")
+        pair = f"frames {_reference_of(sequence, middle)} and {middle.index}, the middle pair of the run"
+        save_figure(plots.plot_landscape(landscape, pair, _beside_the_pair(odometry)), folder, "landscape")
+
+
+def _beside_the_pair(odometry: Odometry) -> list[str]:
+    """What a run's motions are found with that the landscape of two images does not know."""
+    options = odometry.settings.odometry
+    keyframe = ["a keyframe"] if options.reference == "keyframe" else []
+    shutter = ["the shutter's readout"] if options.rolling_shutter and odometry.camera.readout else []
+    return keyframe + shutter
+
+
+def _reference_of(sequence: Sequence, step: Step) -> int:
+    """The index of the frame that a step's frame was aligned with."""
+    return int(np.searchsorted(sequence.timestamps, step.reference_timestamp))
 
 
 def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landscape | None:
     """Return E around the motion of a step at the coarsest and the finest level; None where a frame is unreadable."""
-    reference = int(np.searchsorted(sequence.timestamps, step.reference_timestamp))
     settings = odometry.settings
     levels = dict.fromkeys((settings.solver.levels[0], settings.solver.levels[-1]))
     try:
-        frames = sequence[reference], sequence[step.index]
+        frames = sequence[_reference_of(sequence, step)], sequence[step.index]
     except FrameError:
         return None
     return error_landscape(*frames, odometry.camera, step.alignment, settings.alignment, tuple(levels))

@@ -1,8 +1,8 @@
 """Figures as files: trajectories and their errors, convergence, the error's landscape, basins and drift; PNG and SVG.
 
 Every function draws one figure from arrays and returns it, with a caption that defines what is measured; `save` writes
-it. Colours are those of Okabe and Ito, which colour-blind people tell apart; line styles, markers and hatches tell the
-curves and bars apart without colour.
+it. Colours are ones that colour-blind people tell apart; line styles, markers and hatches tell the curves and bars
+apart without colour. Where some methods are called ours, the others are grey.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import textwrap
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from io import BytesIO
 from itertools import cycle
 from pathlib import Path
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
     from gavo_jax.output.landscape import Landscape
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#8C7A1F")
+"""Of Okabe and Ito; the last two, of Tol's scheme, take the place of their yellow and black."""
+GREYS = (0.3, 0.6)
+"""Of other libraries' curves, the darkest and the lightest."""
 LINES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 FORMATS = ("png", "svg")
@@ -54,12 +57,10 @@ CAPTIONS = {
     "convergence": "By how much the best error E so far exceeds the last one of the same level, over the iterations of "
     "its search: median over the pairs of the run, and the range of their middle 80 %. Levels from coarse to fine. An "
     f"excess below {SMALLEST_EXCESS:g} % is drawn as that.",
-    "population": "Root of E over the iterations of each level's search of one pair: best and median of the "
+    "population": "Root of E over the iterations of each level's search of the run's last pair: best and median of the "
     "population, and the range of its middle 80 %. Levels from coarse to fine; their errors are not comparable.",
     "landscape": "Root of E around the motion that was found, along the eigenvectors of its covariance with the "
-    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left. The "
-    "motion was found with a keyframe and the shutter's readout, too: the minimum of this pair alone may lie "
-    "millimetres away.",
+    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left.",
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
@@ -68,65 +69,94 @@ WITH_TRUTH = (
     " The truth is interpolated at the frames' stamps and laid on the first estimate's first pose that it covers."
 )
 """Of the trajectories' caption."""
+MORE_THAN_THE_PAIR = " The motion was found with {}, too: the minimum of this pair alone may lie millimetres away."
+"""Of the landscape's caption."""
 SMALL = 0.1
 """Metres: what is smaller is drawn in millimetres."""
 
 
-def plot_distance_error(errors: Mapping[str, ErrorSeries]) -> Figure:
-    """Draw the distance error of each named run over time and frames, as the paper's figures 5 and 9."""
-    figure = _figure(7.0, 4.4, "distance_error")
+def plot_distance_error(errors: Mapping[str, ErrorSeries], ours: Collection[str] = ()) -> Figure:
+    """Draw the distance error of each named run over time and frames, as the paper's figures 5 and 9.
+
+    Args:
+        errors: of each run.
+        ours: runs in colour; the others are grey. All of them where none is named.
+    """
+    figure = _figure(7.0 if len(errors) == 1 else 8.0, 4.4, "distance_error")
     axes = figure.add_subplot()
     stamps = np.unique(np.concatenate([series.timestamps for series in errors.values()])) - min(
         series.timestamps[0] for series in errors.values()
     )
     scale, unit = _unit(max(float(np.max(series.values)) for series in errors.values()))
-    for (name, series), style in zip(errors.items(), _styles(), strict=False):
+    for (name, series), style in zip(errors.items(), _styles(errors, ours), strict=True):
         seconds = series.timestamps - series.timestamps[0] + stamps[0]
-        axes.plot(seconds, scale * series.values, label=name, **style, markevery=_marks(len(series.values)))
+        axes.plot(
+            seconds, scale * series.values, label=name, clip_on=False, **style, markevery=_marks(len(series.values))
+        )
     axes.set(xlabel="time (s)", ylabel=f"distance error ({unit})", ylim=(0, None))
     axes.margins(x=0)
     if len(stamps) > 1:
         _number_frames(axes, stamps)
     axes.grid(alpha=0.3)
-    axes.legend()
+    _label_ends(axes)
     return figure
 
 
-def plot_trajectories(estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> Figure:
-    """Draw each named trajectory from above and in space, all seen from their first camera (x right, z forward).
+def plot_trajectories(
+    estimates: Mapping[str, Trajectory], truth: Trajectory | None, ours: Collection[str] = ()
+) -> Figure:
+    """Draw each named trajectory from above and upright, all seen from their first camera (x right, z forward).
 
-    The truth, where there is any, is taken at the stamps of the first estimate that it covers; its first such pose is
-    laid on that estimate's.
+    The upright panel looks along z or, where the paths are longer along z than along x, along x. Both panels have one
+    scale. The truth, where there is any, is taken at the stamps of the first estimate that it covers; its first such
+    pose is laid on that estimate's.
+
+    Args:
+        estimates: the trajectories.
+        truth: what they are compared with.
+        ours: estimates in colour; the others are grey. All of them where none is named.
     """
     true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
-    figure = _figure(10.0, 5.2, "trajectory", "" if true_path is None else WITH_TRUTH)
-    above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
     paths = {name: _path(estimate) for name, estimate in estimates.items()}
-    shown = [*paths.values(), *([] if true_path is None else [true_path])]
-    scale, unit = _unit(
-        float(np.max(np.ptp(np.concatenate([path[np.isfinite(path[:, 0])] for path in shown]), axis=0)))
-    )
-    if true_path is not None:
-        x, y, z = scale * true_path.T
-        above.plot(x, z, **TRUTH_STYLE)
-        space.plot(x, z, -y, **TRUTH_STYLE)
-    for i, ((name, path), style) in enumerate(zip(paths.items(), _styles(), strict=False)):
-        # those below show beside those above where methods coincide
-        style |= {"linewidth": 1.2 + 2.0 * (1 - i / max(len(paths) - 1, 1)) * (len(paths) > 1)}
-        x, y, z = scale * path.T
-        above.plot(x, z, label=name, **style, markevery=_marks(len(path)))
-        space.plot(x, z, -y, label=name, **style, markevery=_marks(len(path)))
-    above.scatter([0], [0], marker="s", color="black", s=30, zorder=3)
-    space.scatter([0], [0], zs=0, marker="s", color="black", s=20)
-    above.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})", title="From above", aspect="equal")
-    above.grid(alpha=0.3)
-    above.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize="small")
-    space.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})", zlabel=f"−y, up ({unit})", title="In space")
-    _fit_above(above, [scale * path for path in shown])
-    if unit == "mm":
-        _draw_scale(above, unit)
-    _fit_in_space(space, [scale * path for path in shown])
+    shown = np.concatenate([*paths.values(), *([] if true_path is None else [true_path])]) * UPWARDS
+    low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
+    scale, unit = _unit(float(np.max(high - low)))
+    across = 0 if high[0] - low[0] >= high[2] - low[2] else 2
+    views = ((0, 2), (across, 1))
+    half = _half_widths(high - low, views)
+    figure = _figure(10.0, 4.4 * half[1] / half[0] + 1.4, "trajectory", "" if true_path is None else WITH_TRUTH)
+    titles = ("From above", "From behind" if across == 0 else "From the right")
+    for axes, (i, j), title in zip(figure.subplots(1, 2), views, titles, strict=True):
+        if true_path is not None:
+            axes.plot(*(scale * UPWARDS * true_path).T[[i, j]], **TRUTH_STYLE)
+        for (name, path), style in zip(paths.items(), _styles(paths, ours), strict=True):
+            axes.plot(*(scale * UPWARDS * path).T[[i, j]], label=name, **style, markevery=_marks(len(path)))
+        axes.scatter([0], [0], marker="s", color="black", s=30, zorder=3)
+        axes.annotate("start", (0, 0), (0, -14), bbox=HALO, textcoords="offset points", ha="center", fontsize="small")
+        middle = scale * (low + high)[[i, j]] / 2
+        axes.set(xlabel=f"{AXES[i]} ({unit})", ylabel=f"{AXES[j]} ({unit})", title=title, aspect="equal")
+        axes.set(xlim=middle[0] + scale * half[0] * SIDES, ylim=middle[1] + scale * half[1] * SIDES)
+        axes.grid(alpha=0.3)
+        if unit == "mm":
+            _draw_scale(axes, unit)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize="small")
     return figure
+
+
+UPWARDS = np.array([1.0, -1.0, 1.0])
+"""Camera axes, y downwards, into what is drawn."""
+AXES = ("x, right", "−y, up", "z, forward")
+SIDES = np.array([-1.0, 1.0])
+HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+MARGIN = 1.15
+"""Of a panel's sides over those of what it holds."""
+
+
+def _half_widths(extent: Float[np.ndarray, " 3"], views: Sequence[tuple[int, int]]) -> Float[np.ndarray, " 2"]:
+    """Half the sides of panels of one scale that hold each view; not very much wider than high, nor the reverse."""
+    wide, high = (max(float(extent[view[k]]) for view in views) for k in (0, 1))
+    wide = max(wide, 0.7 * high, 1e-3)
+    return 0.5 * MARGIN * np.array([wide, max(high, 0.5 * wide)])
 
 
 def _path(trajectory: Trajectory) -> Float[np.ndarray, "m 3"]:
@@ -151,9 +181,15 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
         _draw_band(axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of them")
         axes.set(title=f"level {level}", xlabel="iteration", yscale="log")
         axes.minorticks_off()
+        axes.yaxis.set_major_formatter(_excess)
     figure.axes[0].set_ylabel("excess of E (%)")
     figure.axes[0].legend(fontsize="small")
     return figure
+
+
+def _excess(value: float, _: int) -> str:
+    """The label of a tick; the smallest one says that what lies below is drawn there."""
+    return f"≤ {value:g}" if value <= SMALLEST_EXCESS else f"{value:g}"
 
 
 def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> Figure:
@@ -176,18 +212,21 @@ def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> 
     return figure
 
 
-def plot_landscape(landscape: Landscape, pair: str = "") -> Figure:
+def plot_landscape(landscape: Landscape, pair: str = "", more: Sequence[str] = ()) -> Figure:
     """Draw the error around the optimum along the worst- and the best-conditioned direction, level by level.
 
     Args:
         landscape: the errors.
         pair: which frames it is of, for the title.
+        more: what the motion was found with beside the two frames, for the caption.
     """
-    figure = _figure(8.0, 4.8, "landscape")
+    figure = _figure(8.0, 4.8, "landscape", MORE_THAN_THE_PAIR.format(" and ".join(more)) if more else "")
     figure.suptitle(pair, fontsize="medium")
     titles = ("worst-conditioned direction", "best-conditioned direction")
     for i, (axes, title) in enumerate(zip(_panels(figure, 2), titles, strict=True)):
-        for (level, errors), style in zip(landscape.errors.items(), _styles(), strict=False):
+        axes.axvline(0, color="black", linewidth=0.8, linestyle=":", label="motion found")
+        for (level, errors), style in zip(landscape.errors.items(), _styles(landscape.errors), strict=True):
+            style |= {"linewidth": 1.5}
             rmse = np.sqrt(np.where(np.isfinite(errors[i]), errors[i], np.nan))
             axes.plot(landscape.steps * 1e3, rmse, label=f"level {level}", **style, markevery=_marks(len(rmse)))
         numbers = ", ".join(f"{value:.2f}" for value in landscape.directions[i])
@@ -201,7 +240,7 @@ def plot_basin(
     motion: Float[np.ndarray, " n"],
     success: Mapping[str, Float[np.ndarray, " n"]],
     title: str,
-    ours: Sequence[str] = (),
+    ours: Collection[str] = (),
 ) -> Figure:
     """Draw how often each method still finds a motion, over the motion's size.
 
@@ -214,13 +253,8 @@ def plot_basin(
     figure = _figure(9.0, 4.6, "basin")
     axes = figure.add_subplot()
     order = np.argsort(motion)
-    greys = iter(np.linspace(0.35, 0.75, max(len(success) - len(ours), 1)))
-    colored = _styles()
-    for name, rates in success.items():
+    for (name, rates), style in zip(success.items(), _styles(success, ours), strict=True):
         tried = [i for i in order if np.isfinite(rates[i])]
-        style = next(colored)
-        if ours and name not in ours:
-            style |= {"color": str(next(greys)), "linewidth": 1.0, "markersize": 3}
         axes.plot(motion[tried], rates[tried], label=name, **style)
     axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
     axes.set(ylim=(-0.03, 1.03), xlim=(0, 1.02 * float(np.max(motion))))
@@ -229,7 +263,7 @@ def plot_basin(
     return figure
 
 
-def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], ours: Sequence[str]) -> Figure:
+def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], ours: Collection[str]) -> Figure:
     """Draw the drift of every method on every clip as bars, other libraries' hatched.
 
     Args:
@@ -241,21 +275,30 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
     panels = figure.subplots(len(clips), 2, squeeze=False)
     for (clip, methods), pair in zip(clips.items(), panels, strict=True):
         for column, (axes, label) in enumerate(zip(pair, ("translation (m/s)", "rotation (deg/s)"), strict=True)):
+            decimals = _decimals(np.concatenate([runs[:, column] for runs in methods.values()]), (4, 2)[column])
             for place, (name, runs) in enumerate(methods.items()):
                 values = runs[:, column]
                 middle = float(np.median(values))
-                style = {"color": COLORS[0]} if name in ours else {"color": "#DDDDDD", "hatch": "//"}
+                mine = {"color": COLORS[0], "edgecolor": "black"}
+                style = mine if name in ours else {"color": "#E4E4E4", "edgecolor": "#808080", "hatch": "//"}
                 spread = [[middle - values.min()], [values.max() - middle]] if len(values) > 1 else None
-                axes.barh(place, middle, xerr=spread, edgecolor="black", linewidth=0.5, capsize=2, **style)
-                axes.annotate(f" {middle:#.3g}", (values.max(), place), va="center", fontsize=7)
+                axes.barh(place, middle, xerr=spread, linewidth=0.5, capsize=2, **style)
+                axes.annotate(f" {middle:.{decimals}f}", (values.max(), place), va="center", fontsize=7)
             names = [_words(name) for name in methods] if column == 0 else [""] * len(methods)
             axes.set_yticks(range(len(methods)), names, fontsize="small")
             axes.invert_yaxis()
             axes.margins(x=0.15)
             axes.set(xlabel=label, title=_words(clip))
             axes.grid(alpha=0.3, axis="x")
+            axes.locator_params(axis="x", nbins=6)
             axes.set_axisbelow(True)
     return figure
+
+
+def _decimals(values: Float[np.ndarray, " n"], least: int) -> int:
+    """How many decimals give the smallest of some values two digits, and at least so many."""
+    smallest = float(np.min(values[values > 0], initial=1.0))
+    return max(least, 1 - int(np.floor(np.log10(smallest))))
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
@@ -303,7 +346,10 @@ def _figure(width: float, height: float, name: str, more: str = "") -> Figure:
 
 def _number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
     """Add an axis on top that counts the frames at these times."""
-    numbers = np.arange(len(stamps))
+    # beyond the last frame the axis goes on, so that no number above it is written at its place
+    span = max(float(stamps[-1] - stamps[0]), 1e-6)
+    stamps = np.array([stamps[0] - span, *stamps, stamps[-1] + span])
+    numbers = np.array([2 - len(stamps), *range(len(stamps) - 2), 2 * len(stamps)])
 
     def frame_at(time: Any) -> Any:
         return np.interp(time, stamps, numbers)
@@ -319,23 +365,57 @@ LABEL_HEIGHT = 0.05
 
 
 def _label_ends(axes: Any) -> None:
-    """Write each curve's name beside its last point, in its colour; names of curves that end together make room."""
+    """Write each curve's name beside the panel at the height of its last point, in its colour.
+
+    Names of curves that end together make room. Those that end at one point share a line to it.
+    """
     low, high = axes.get_ylim()
-    curves = sorted((line for line in axes.lines if len(line.get_xdata())), key=lambda line: -line.get_ydata()[-1])
-    places = np.array([(line.get_ydata()[-1] - low) / (high - low) for line in curves])
-    places = _apart(places, LABEL_HEIGHT, (0.0, 1.0))
-    for line, place in zip(curves, places.tolist(), strict=True):
+    ends = {line: (float(line.get_xdata()[-1]), float(line.get_ydata()[-1])) for line in axes.lines if _drawn(line)}
+    curves = sorted(ends, key=lambda line: (-ends[line][1], -ends[line][0]))
+    if not curves:
+        return
+    wanted = np.array([(ends[line][1] - low) / (high - low) for line in curves])
+    places = dict(zip(curves, _apart(wanted, LABEL_HEIGHT, (0.0, 1.0)).tolist(), strict=True))
+    for line, place in places.items():
         axes.annotate(
             _words(line.get_label()),
-            (line.get_xdata()[-1], line.get_ydata()[-1]),
-            (1.03, place),
+            (1.0, place),
+            (1.06, place),
+            xycoords="axes fraction",
             textcoords="axes fraction",
             annotation_clip=False,
             va="center",
             color=line.get_color(),
             fontsize="small",
-            arrowprops={"arrowstyle": "-", "color": line.get_color(), "linewidth": 0.5, "relpos": (0.0, 0.5)},
         )
+    for end in dict.fromkeys(ends.values()):
+        group = [places[line] for line in curves if ends[line] == end]
+        _draw_leader(axes, end, min(group), max(group))
+
+
+def _drawn(line: Any) -> bool:
+    """Whether a line is a curve with a name."""
+    return len(line.get_xdata()) > 0 and not str(line.get_label()).startswith("_")
+
+
+def _draw_leader(axes: Any, end: tuple[float, float], lowest: float, highest: float) -> None:
+    """Draw a thin line from the end of a curve, or of several, to the name or names beside the panel.
+
+    It is dotted where it crosses the panel: it is no curve.
+    """
+    style = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
+    beside = 1.03 if highest == lowest else 1.045
+    across = {"linestyle": ":", "linewidth": 0.8} if end[0] < axes.get_xlim()[0] + 0.9 * np.ptp(axes.get_xlim()) else {}
+    axes.annotate(
+        "",
+        end,
+        (beside, (lowest + highest) / 2),
+        textcoords="axes fraction",
+        annotation_clip=False,
+        arrowprops=style | across,
+    )
+    if highest > lowest:
+        axes.plot([beside] * 2, [lowest, highest], transform=axes.transAxes, clip_on=False, color="0.6", linewidth=0.6)
 
 
 def _apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float, float]) -> Float[np.ndarray, " n"]:
@@ -377,14 +457,6 @@ def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarra
     return np.take_along_axis(history, last, axis=1)
 
 
-def _fit_above(axes: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
-    """Have a panel hold the paths seen from above, with one scale, and half as wide as it is high at least."""
-    points = np.concatenate(paths)[:, [0, 2]]
-    low, high = _limits(points)
-    middle, half = (low + high) / 2, 0.55 * np.maximum(high - low, 0.6 * max(float(np.max(high - low)), 1e-3))
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
-
-
 def _draw_scale(axes: Any, unit: str) -> None:
     """Draw a bar of a round length, a fifth to a half of the panel, into its lower left corner."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
@@ -397,34 +469,27 @@ def _draw_scale(axes: Any, unit: str) -> None:
     )
 
 
-def _fit_in_space(space: Any, paths: Sequence[Float[np.ndarray, "n 3"]]) -> None:
-    """Give the three axes of a drawing in space the same scale, a few ticks each, and no more room than is needed."""
-    points = np.concatenate(paths)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-    low, high = _limits(points)
-    half = 0.55 * np.maximum(high - low, 0.35 * max(float(np.max(high - low)), 1e-3))
-    for i, (axis, middle) in enumerate(zip("xyz", (low + high) / 2, strict=True)):
-        getattr(space, f"set_{axis}lim")(middle - half[i], middle + half[i])
-        space.locator_params(axis=axis, nbins=4 if half[i] > 0.7 * np.max(half) else 1)
-    space.tick_params(labelsize="x-small")
-    for axis in (space.xaxis, space.yaxis, space.zaxis):
-        axis.labelpad = 12
-    space.set_box_aspect(tuple(half / np.max(half)), zoom=0.85)
-
-
-def _limits(points: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """Smallest and largest coordinates, places without a number left out."""
-    return np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-
-
 def _unit(extent: float) -> tuple[float, str]:
     """Values a metre and their unit, for what is so many metres large."""
     return (1e3, "mm") if extent < SMALL else (1.0, "m")
 
 
-def _styles() -> Iterator[dict[str, Any]]:
-    """Yield a colour, line style and marker for each curve; neighbours differ in all three."""
-    for color, line, marker in zip(cycle(COLORS), cycle(LINES), cycle(MARKERS), strict=False):
-        yield {"color": color, "linestyle": line, "marker": marker, "markersize": 4, "linewidth": 1.5}
+def _styles(names: Collection[Any], ours: Collection[str] = ()) -> Iterator[dict[str, Any]]:
+    """Yield a colour, line style and marker for each curve; neighbours differ in all three.
+
+    Those that are not ours are thin and grey. Of the others the first ones are wider, and show beside those drawn over
+    them where methods coincide.
+    """
+    muted = [name for name in names if ours and name not in ours]
+    greys = iter(np.linspace(*GREYS, max(len(muted), 2)).tolist())
+    widths = iter(np.linspace(2.8, 1.2, len(names) - len(muted)) if len(names) - len(muted) > 1 else [1.5])
+    colors = cycle(COLORS)
+    for name, line, marker in zip(names, cycle(LINES), cycle(MARKERS), strict=False):
+        style = {"linestyle": line, "marker": marker}
+        if name in muted:
+            yield style | {"color": f"{next(greys):.3g}", "markersize": 3, "linewidth": 1.0}
+        else:
+            yield style | {"color": next(colors), "markersize": 4, "linewidth": float(next(widths))}
 
 
 def _marks(count: int) -> int:

@@ -16,6 +16,9 @@ from rich.text import Text
 
 from gavo_jax.errors import printable
 
+UNKNOWN = "–"
+"""A cell for what is not known."""
+
 
 def say(line: str) -> None:
     """Print a line on standard output."""
@@ -80,6 +83,12 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
         Console(width=max(width, _width(table))).print(table)
 
 
+def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], list[list[Any]]]:
+    """A table without the columns of which nothing is known in any row: those of dashes alone."""
+    kept = [i for i in range(len(columns)) if not rows or any(row[i] != UNKNOWN for row in rows)]
+    return [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
+
+
 def _parts(columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> Iterator[Table]:
     """A table as one that fits the width or, the first column in each, as several."""
     start = 1
@@ -121,4 +130,4 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str
 
 def number(value: float | None, digits: int = 4) -> str:
     """Return a number of fixed decimals, or a dash for what is not known."""
-    return "–" if value is None else f"{value:.{digits}f}"
+    return UNKNOWN if value is None else f"{value:.{digits}f}"

@@ -111,6 +111,7 @@ def test_run_writes_its_files(gavo, pristine, tmp_path):
         assert (out / f"{name}.png").stat().st_size and (out / f"{name}.svg").stat().st_size
 
     evaluated = gavo("evaluate", out / "trajectory.txt", pristine / "groundtruth.txt")
+    assert evaluated.out.count("┏") == 1  # one table of 80 columns
     assert evaluated.status == 0 and f"{metrics['rpe_translation_rmse_m_per_s']:.6f}" in evaluated.out
 
 

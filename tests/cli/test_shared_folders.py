@@ -150,6 +150,8 @@ def test_a_study_of_something_else_is_not_gone_on_with(gavo, tmp_path, monkeypat
         done = gavo("tune", write("t.toml", TUNING, **first | change), "--output", "out")
         assert done.status == 2 and done.err.count("\n") == 1 and words in done.err, done.err
         assert (tmp_path / "out" / "front.json").read_bytes() == before
+    other = write("t.toml", TUNING.replace('name = "clip"', 'name = "hall"'), **first)
+    assert "is of clip, not of hall: give" in gavo("tune", other, "--output", "out").err
     (tmp_path / "out" / "trial-99.toml").write_text("of an earlier front")
     assert gavo("tune", write("t.toml", TUNING, **first | {"trials": 2}), "--output", "out").status == 0
     assert not (tmp_path / "out" / "trial-99.toml").exists()

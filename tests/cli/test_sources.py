@@ -246,6 +246,25 @@ def test_a_short_clip_has_the_errors_that_it_can_have_and_says_why(gavo, clip):
     assert sentences == ["No drift over 1 s: the frames last 0.23 s; the errors per frame and over all stand for it."]
 
 
+@pytest.mark.parametrize("truth", [True, False])
+def test_tables_of_a_short_clip_have_no_dash_without_its_reason(gavo, clip, monkeypatch, truth):
+    monkeypatch.setenv("COLUMNS", "80")
+    if not truth:
+        (clip / "groundtruth.txt").unlink()
+    Path("e.toml").write_text(
+        '[[sequences]]\npath = "clip"\n[[methods]]\nname = "opencv-rgb"\n[[methods]]\nname = "opencv-rgbd"\n'
+    )
+    compared = gavo("compare", clip, "--methods", "opencv-rgb,opencv-rgbd", "--output", "compared")
+    tried = gavo("experiment", "e.toml", "--output", "tried")
+    for done in (compared, tried):
+        assert done.status == 0, done.err
+        assert "\u2013" not in done.out and ("m/frame" in done.out) == truth
+        reason = ("No drift over 1 s: ", "No drift of clip: ") if truth else ("No ground truth", "No errors of clip: ")
+        assert any(line.startswith(reason) for line in done.out.splitlines()) or reason[1] in done.out
+        report = next(Path("compared" if done is compared else "tried").glob("report.html")).read_text()
+        assert "<td>\u2013</td>" not in report
+
+
 @pytest.mark.parametrize("truth", ["none", "elsewhere"])
 def test_without_a_truth_it_is_said_what_the_trajectory_tells(gavo, clip, truth):
     rows = (clip / "groundtruth.txt").read_text().splitlines()
@@ -262,7 +281,8 @@ def test_without_a_truth_it_is_said_what_the_trajectory_tells(gavo, clip, truth)
     estimate = Trajectory.read_tum("out/trajectory.txt").world_T_camera
     length = np.linalg.norm(np.diff(estimate[:, :3, 3], axis=0), axis=1).sum()
     assert float(table["length of the path"]) == pytest.approx(length, abs=1e-4) and length > 0.01
-    np.testing.assert_allclose([float(x) for x in table["end: x, y, z"].split()], estimate[-1, :3, 3], atol=1e-4)
+    end = [float(x) for x in table["end: x right, y down, z forward"].split()]
+    np.testing.assert_allclose(end, estimate[-1, :3, 3], atol=1e-4)
     assert float(table["pairs that are ok"]) == 100 and "RPE" not in done.out
     assert 0 < float(table["end: turned by"]) < 20
 

@@ -88,3 +88,16 @@ def test_troubleshooting_quotes_messages_that_there_are() -> None:
     for message in quoted:
         for words in re.split(r"…|'NAME'|\.\.\.", message):
             assert words.strip() in source, message
+
+
+def test_a_page_says_so_where_a_record_is_of_a_jax_that_is_ruled_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    records = importlib.import_module("records")
+    table = records.Table("t", ("", "x"), (("a", "1"),))
+    old, new, none = (
+        records.Record("b", "c", "2026-01-01", "m", versions, (table,))
+        for versions in ("JAX 0.10.2, NumPy 2.4.6", "JAX 0.10.1, NumPy 2.4.6", "Open3D 0.20.0")
+    )
+    assert "JAX 0.10.2 is ruled out" in records.section([old])
+    assert "ruled out" not in records.section([new, none])
+    assert "JAX 0." in records.sources_of_summary(records.Records())

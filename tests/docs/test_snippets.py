@@ -92,6 +92,8 @@ def test_files_of_settings_are_read(page: Path, sequences: Path, monkeypatch: py
             assert read_plan(file).runs
         elif "[space]" in block.code:
             assert read_tuning(file).space
+        elif "[project]" in block.code:
+            assert list(tomllib.loads(block.code)["project"]["entry-points"]) == [presets.PLUGINS]
         else:
             assert gavo.load_camera(file).width == 640
 

@@ -9,6 +9,7 @@ import pytest
 
 from gavo_jax import presets
 from gavo_jax.cli import main
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments import tuning
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state
@@ -168,6 +169,17 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
     front = json.loads((out / "front.json").read_text())
     assert len(front) == 5 and [f["milliseconds"] for f in front] == sorted(f["milliseconds"] for f in front)
     assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_frames_without_a_drift_are_refused_before_a_study_is_made(tuned, tmp_path, truth, capsys, monkeypatch):
+    tuned.write_text(tuned.read_text().replace("frames = 34", "frames = 4" if truth else "frames = 34"))
+    if not truth:
+        monkeypatch.setattr(SyntheticSequence, "ground_truth", None)
+    assert main(["tune", str(tuned), "--output", str(tmp_path / "study")]) == 2
+    words = capsys.readouterr().err
+    assert ("these frames last 0.10 s" if truth else "no ground truth") in words and words.count("\n") == 1
+    assert not (tmp_path / "study" / "study.db").exists()
 
 
 def test_what_a_trial_measures(tuned):

@@ -16,6 +16,7 @@ def rows(sequence: str, label: str, drifts: list[float | None], seeds: Sequence[
             "seed": seed,
             "rpe_translation_rmse_m_per_s": drift,
             "rpe_rotation_rmse_deg_per_s": None if drift is None else 100 * drift,
+            "rpe_translation_rmse_m_per_frame": 0.001 * (1 + i),
             "lost_pairs": i,
             "frames_per_second": 50.0 * (1 + i),
             "runs_together": 4,
@@ -29,7 +30,7 @@ def test_median_and_quartiles():
     assert found.drift == pytest.approx((0.02, 0.03, 0.04)) and found.rotation == pytest.approx(3.0)
     assert (found.runs, found.lost, found.together) == (5, 4, 4) and found.milliseconds == pytest.approx(1e3 / 150)
     (unknown,) = summarise(rows("a", "ga", [None, None]))
-    assert unknown.drift is None and unknown.rotation is None
+    assert unknown.drift is None and unknown.rotation is None and unknown.per_frame == pytest.approx(0.0015)
 
 
 def test_a_clear_difference_is_significant_and_none_is_not():

@@ -24,7 +24,7 @@ def test_distance_error_shows_every_run_in_its_own_style():
     errors = {f"run {i}": distance_error(straight(1.0 + 0.1 * i), truth) for i in range(8)}
     (axes,) = plots.plot_distance_error(errors).axes
     assert axes.get_xlabel() == "time (s)" and axes.get_ylabel() == "distance error (m)"
-    lines = axes.get_lines()
+    lines = [line for line in axes.get_lines() if line.get_label() in errors]
     assert [line.get_label() for line in lines] == list(errors)
     assert np.allclose(np.asarray(lines[3].get_ydata())[-1], 0.3) and np.asarray(lines[3].get_xdata())[-1] == 1.0
     assert len({(line.get_linestyle(), line.get_marker()) for line in lines}) == len(lines)
@@ -36,11 +36,86 @@ def test_trajectories_are_seen_from_the_first_camera(with_truth):
     moved = truth.world_T_camera.copy()
     moved[:, :3, 3] += [5.0, -3.0, 1.0]
     truth = Trajectory(truth.timestamps, moved) if with_truth else None
-    above, space = plots.plot_trajectories({"ga": estimate}, truth).axes
+    above, upright = plots.plot_trajectories({"ga": estimate}, truth).axes
     assert above.get_xlabel() == "x, right (m)" and above.get_ylabel() == "z, forward (m)"
     ends = {str(line.get_label()): np.asarray(line.get_ydata())[-1] for line in above.get_lines()}
     assert ends == pytest.approx({"ga": 1.0, "ground truth": 2.0} if with_truth else {"ga": 1.0})
-    assert len(space.get_lines()) == len(ends)
+    assert len(upright.get_lines()) == len(ends)
+    assert upright.get_xlabel() == "z, forward (m)" and upright.get_ylabel() == "−y, up (m)"
+
+
+def sideways(length: float) -> Trajectory:
+    """A camera that moves to the right, and a little downwards."""
+    trajectory = straight(0.0)
+    world_T_camera = trajectory.world_T_camera.copy()
+    world_T_camera[:, 0, 3], world_T_camera[:, 1, 3] = (np.linspace(0, end, 30) for end in (length, 0.1 * length))
+    return Trajectory(trajectory.timestamps, world_T_camera)
+
+
+@pytest.mark.parametrize("trajectory", [straight(0.02), straight(4.0), sideways(0.6)])
+def test_panels_hold_the_path_at_one_scale_and_name_the_start(trajectory):
+    figure = plots.plot_trajectories({"ga": trajectory, "pso": trajectory}, None)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        assert "start" in [text.get_text() for text in axes.texts]
+        for line in axes.get_lines():
+            data = np.asarray(line.get_data(), float)
+            for values, limits in zip(data, (axes.get_xlim(), axes.get_ylim()), strict=True):
+                assert limits[0] < values.min() and values.max() < limits[1]
+    sizes = [
+        (axes.bbox.width / np.ptp(axes.get_xlim()), axes.bbox.height / np.ptp(axes.get_ylim())) for axes in figure.axes
+    ]
+    assert np.allclose(sizes, sizes[0][0], rtol=1e-3)
+    whole = figure.get_tightbbox().get_points() * figure.dpi
+    assert np.all(whole[0] >= -1) and np.all(whole[1] <= [figure.bbox.width + 1, figure.bbox.height + 1])
+
+
+def test_what_is_longer_to_the_side_is_seen_from_behind():
+    _, upright = plots.plot_trajectories({"ga": sideways(1.0)}, None).axes
+    assert upright.get_title() == "From behind" and upright.get_xlabel() == "x, right (m)"
+    assert np.asarray(upright.get_lines()[0].get_ydata())[-1] == pytest.approx(-0.1)
+
+
+def test_rivals_are_grey_and_no_two_of_ours_share_a_colour():
+    runs = {name: straight(1.0) for name in ("ga", "opencv-rgb", "pso", "sift-pnp", "gauss-newton", "adam")}
+    ours = ["ga", "pso", "gauss-newton", "adam"]
+    figures = (
+        plots.plot_trajectories(runs, None, ours),
+        plots.plot_distance_error({name: distance_error(run, straight(1.1)) for name, run in runs.items()}, ours),
+        plots.plot_basin(np.array([2.0, 7.0]), {name: np.array([1.0, 0.5]) for name in runs}, "clip", ours),
+    )
+    for figure in figures:
+        colors = {line.get_label(): str(line.get_color()) for line in figure.axes[0].get_lines()}
+        assert len({colors[name] for name in ours}) == 4 and all(colors[name] in plots.COLORS for name in ours)
+        greys = [float(colors[name]) for name in runs if name not in ours]
+        assert len(set(greys)) == 2 and max(greys) <= 0.6  # still read on white
+    many = plots.plot_trajectories({f"run {i}": straight(1.0 + i) for i in range(8)}, None).axes[0]
+    assert len({line.get_color() for line in many.get_lines()}) == 8
+
+
+def test_methods_that_coincide_are_drawn_narrower_one_upon_the_other():
+    above = plots.plot_trajectories({name: straight(1.0) for name in ("ga", "pso", "adam")}, None).axes[0]
+    widths = [line.get_linewidth() for line in above.get_lines()]
+    assert widths == sorted(widths, reverse=True) and len(set(widths)) == 3
+
+
+def test_the_frame_axis_counts_no_frame_that_is_not_there():
+    truth = straight(1.0, 34)
+    figure = plots.plot_distance_error({"ga": distance_error(truth, truth)})
+    figure.draw_without_rendering()
+    (top,) = figure.axes[0].child_axes
+    ticks, (first, last) = top.get_xticks(), top.get_xlim()
+    assert last == pytest.approx(33) and first == pytest.approx(0)
+    to_place = top.transData.transform
+    shown = [tick for tick in ticks if to_place((tick, 0))[0] <= to_place((last, 0))[0] + 0.5]
+    assert max(shown) <= 33
+
+
+def test_names_stand_at_the_ends_of_the_errors_curves():
+    errors = {f"run {i}": distance_error(straight(1.0 + 0.1 * i), straight(1.0)) for i in range(3)}
+    (axes,) = plots.plot_distance_error(errors).axes
+    names = [text.get_text() for text in axes.texts if text.get_text()]
+    assert names == ["run 2", "run 1", "run 0"] and axes.get_legend() is None
 
 
 def test_truth_that_covers_nothing_is_left_out():
@@ -114,6 +189,7 @@ def test_convergence_carries_the_last_error_on_and_counts_from_it():
     assert np.asarray(coarse.get_lines()[0].get_ydata()).tolist() == pytest.approx([300.0, 100.0])
     assert np.asarray(fine.get_lines()[0].get_ydata()).tolist() == [plots.SMALLEST_EXCESS] * 2
     assert coarse.get_title() == "level 4" and fine.get_title() == "level 1"
+    assert [coarse.yaxis.get_major_formatter()(value) for value in (0.001, 0.1, 100.0)] == ["≤ 0.001", "0.1", "100"]
 
 
 def test_population_shows_best_median_and_spread_of_what_was_searched():
@@ -127,8 +203,18 @@ def test_population_shows_best_median_and_spread_of_what_was_searched():
 def test_landscape_leaves_gaps_where_a_motion_is_worthless():
     errors = {4: np.array([[np.inf, 4.0, 9.0], [1.0, 4.0, np.inf]])}
     worst, best = plots.plot_landscape(Landscape(np.array([-0.1, 0.0, 0.1]), np.eye(6)[:2], errors)).axes
-    assert np.array_equal(worst.get_lines()[0].get_ydata(), [np.nan, 2.0, 3.0], equal_nan=True)
-    assert np.asarray(best.get_lines()[0].get_xdata()).tolist() == [-100.0, 0.0, 100.0]
+    curves = [{line.get_label(): line for line in axes.get_lines()} for axes in (worst, best)]
+    assert np.array_equal(curves[0]["level 4"].get_ydata(), [np.nan, 2.0, 3.0], equal_nan=True)
+    assert np.asarray(curves[1]["level 4"].get_xdata()).tolist() == [-100.0, 0.0, 100.0]
+    assert all("motion found" in lines for lines in curves)
+
+
+def test_landscape_says_what_else_the_motion_was_found_with_only_where_there_was_more():
+    landscape = Landscape(np.linspace(-0.1, 0.1, 5), np.eye(6)[:2], {1: np.full((2, 5), 4.0)})
+    with_keyframe = plots.plot_landscape(landscape, "frames 3 and 4", ["a keyframe"])
+    assert "with a keyframe, too" in " ".join(with_keyframe.get_supxlabel().split())
+    assert with_keyframe.get_suptitle() == "frames 3 and 4"
+    assert "keyframe" not in plots.plot_landscape(landscape).get_supxlabel()
 
 
 def test_drift_bars_are_medians_and_others_are_hatched():
@@ -152,12 +238,13 @@ def test_curves_that_end_together_have_names_apart_in_the_order_of_their_ends():
     ends = {"ga": 0.9, "sift-pnp": 0.0, "orb-pnp": 0.0, "opencv-rgb": 0.02}
     success = {name: np.array([1.0, end]) for name, end in ends.items()}
     (axes,) = plots.plot_basin(np.array([7.0, 20.0]), success, "clip", ["ga"]).axes
-    places = {text.get_text(): text.xyann[1] for text in axes.texts if isinstance(text, Annotation)}
+    places = {text.get_text(): text.xyann[1] for text in axes.texts if isinstance(text, Annotation) and text.get_text()}
     assert sorted(places, key=lambda name: -places[name]) == ["ga", "opencv-rgb", "sift-pnp", "orb-pnp"]
     assert np.diff(sorted(places.values())).min() >= plots.LABEL_HEIGHT - 1e-9
     assert min(places.values()) >= -1e-9 and max(places.values()) <= 1.0
     colors = {line.get_label(): line.get_color() for line in axes.lines}
-    assert {text.get_text(): text.get_color() for text in axes.texts} == colors
+    shown = {text.get_text(): text.get_color() for text in axes.texts if text.get_text()}
+    assert shown == {name: color for name, color in colors.items() if name in ends}
 
 
 def test_places_move_no_further_than_the_distance_asks_for():
@@ -169,5 +256,10 @@ def test_a_small_motion_has_a_bar_of_round_length():
     small, large = (plots.plot_trajectories({"ga": straight(scale)}, None).axes[0] for scale in (0.01, 10.0))
     (bar,) = [line for line in small.lines if str(line.get_label()).startswith("_")]
     x = np.asarray(bar.get_xdata(), float)
-    (text,) = [text.get_text() for text in small.texts]
-    assert text == f"{x[1] - x[0]:g} mm" and not large.texts
+    text = [text.get_text() for text in small.texts if text.get_text() != "start"]
+    assert text == [f"{x[1] - x[0]:g} mm"] and [text.get_text() for text in large.texts] == ["start"]
+
+
+def test_bars_of_a_panel_have_as_many_decimals_as_the_smallest_needs():
+    assert plots._decimals(np.array([0.0008, 0.239]), 4) == 5 and plots._decimals(np.array([0.0125, 0.0]), 4) == 4
+    assert plots._decimals(np.array([0.67, 20.4]), 2) == 2

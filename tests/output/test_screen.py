@@ -2,7 +2,7 @@
 
 import pytest
 
-from gavo_jax.output.screen import print_table
+from gavo_jax.output.screen import known_columns, number, print_table
 
 
 def boxes(printed: str) -> list[list[list[str]]]:
@@ -33,3 +33,9 @@ def test_nothing_is_cut(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     monkeypatch.setenv("COLUMNS", "20")
     print_table("t", ("", "x" * 30), [("a", 1)])
     assert boxes(capsys.readouterr().out) == [[["", "x" * 30], ["a", "1"]]]
+
+
+def test_a_column_of_dashes_alone_is_left_out() -> None:
+    rows = [["ga", number(None), number(1.0)], ["pso", number(None), number(None)]]
+    assert known_columns(("method", "m/s", "ms"), rows) == (["method", "ms"], [["ga", "1.0000"], ["pso", "–"]])
+    assert known_columns(("method", "m/s"), []) == (["method", "m/s"], [])
