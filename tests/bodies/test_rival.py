@@ -44,6 +44,16 @@ def test_a_card_before_a_wall_stands_before_it() -> None:
     assert (standing_before(q) == card).all() and (nearer_part(q) == card).all()
 
 
+def test_of_two_surfaces_that_fill_the_image_the_larger_one_is_asked() -> None:
+    """What is left is to show a motion; all that stands before something is too much."""
+    q, card, table = wall(), np.zeros((60, 80), bool), np.zeros((60, 80), bool)
+    card[:, 25:75], table[35:, :22] = True, True
+    q[table], q[card] = 1.0 / 1.2, 1.0 / 0.8
+    assert (standing_before(q) == card).all()
+    q[:, 55:75], card[:, 55:75] = 1.0 / 2.0, False
+    assert (standing_before(q) == card | table).all()
+
+
 def test_a_shadow_without_depth_lies_between_a_card_and_a_wall() -> None:
     q, card = wall(), np.zeros((60, 80), bool)
     card[20:40, 30:60] = True
@@ -136,6 +146,46 @@ def test_a_rival_is_given_up_where_it_is_the_same_motion() -> None:
     assert there[0] and not there[-1]
 
 
+class Scripted:
+    """Stands for a `BodyAware` search: its attempts are told beforehand."""
+
+    def __init__(self, aware: BodyAware, *attempts: tuple[bool, float, float]) -> None:
+        self.aware, self.attempts = aware, list(attempts)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.aware, name)
+
+    def align(self, state: Any, frame: Any, clock: Any) -> Attempt:
+        usable, x, deviation = self.attempts.pop(0)
+        covariance = np.diag(np.full(6, deviation**2, np.float32))
+        result = no_alignment(AlignmentStatus.OK)._replace(
+            target_T_reference=exp(np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])), covariance=covariance, findings=0
+        )
+        return Attempt(state, result, usable)
+
+
+@pytest.mark.parametrize(("missed", "unknown"), [(0, 0), (4, 4)])
+def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(missed: int, unknown: int) -> None:
+    """A rival that could not be followed at first is asked for again; its anchor is then the later frame."""
+    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    aligner = WithRival(Scripted(aware, *[(True, 0.05, 1e-3)] * (missed + 1)))  # pyright: ignore[reportArgumentType]
+    second = Scripted(aware, *[(False, 0.0, 1.0)] * missed, (True, 0.0, 1e-3))
+    object.__setattr__(aligner, "second", second)
+    state = aligner.start(frame)
+    assert state.rival.is_there and int(state.open_for) == 0
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    for _ in range(missed):
+        attempt = aligner.align(state, frame, clock)
+        state = attempt.state
+        assert state.rival.is_there and attempt.unknown == 0
+    taken = aligner.align(state, frame, clock)
+    assert not taken.state.rival.is_there and int(taken.state.open_for) < 0
+    assert taken.unknown == unknown and AlignmentStatus.MOVING_BODY in taken.result.statuses
+    assert taken.result.target_T_reference[0, 3] == pytest.approx(0.0, abs=1e-6)
+
+
 def result_of(covariance: np.ndarray) -> Alignment:
     found = exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
     result = no_alignment(AlignmentStatus.LOW_TEXTURE)._replace(findings=bit(AlignmentStatus.LOW_TEXTURE))
@@ -152,12 +202,13 @@ def test_what_the_images_do_not_tell_goes_on_as_before() -> None:
     sharp = np.diag([1e-8, 0.25, 1e-8, 1e-8, 1e-8, 1e-8])
     attempt = Attempt(blank.tracker, result_of(sharp), usable=False)
     clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
-    completed, is_carried = aware._go_on(state, clock, attempt, covered=0.1)
-    assert completed.usable and is_carried
+    completed = aware._go_on(state, clock, attempt, covered=0.1)
+    assert completed.usable and completed.unknown == 0
     assert completed.result.target_T_reference[:3, 3] == pytest.approx([0.02, 0.03, 0.0], abs=1e-3)
     assert completed.result.status is AlignmentStatus.LOW_TEXTURE
     variances = np.diag(completed.result.covariance)
     assert variances[0] == pytest.approx(1e-8, rel=0.1) and variances[1] == pytest.approx(1e-4, rel=0.1)
     blind = attempt._replace(result=result_of(np.full((6, 6), np.nan)))
-    untold, is_carried = aware._go_on(state, clock, blind, covered=0.1)
-    assert not untold.usable and not is_carried
+    assert aware._go_on(state, clock, blind, covered=0.1) is blind
+    guessed = aware._go_on(state, clock, blind, covered=0.9)
+    assert guessed.usable and guessed.unknown == 1

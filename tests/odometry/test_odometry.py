@@ -620,6 +620,37 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
     assert odometry.progress.tracker == (sequence[0].timestamp if x is None else sequence[1].timestamp)
 
 
+class Guessing(Told):
+    """An aligner that guesses its motions, or says of how many it has guessed, where it is told so."""
+
+    def __init__(self, *unknown: int) -> None:
+        super().__init__(found(AlignmentStatus.OK, 0.01))
+        self.unknown = list(unknown)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        return super().align(state, frame, clock)._replace(unknown=self.unknown.pop(0))
+
+
+@pytest.mark.parametrize(
+    ("unknown", "segments"),
+    [
+        ((0, 1, 1, 0, 0), [0, 0, 0, 0, 0]),
+        ((0, 1, 1, 1, 0, 0), [0, 0, 0, 0, 1, 1]),
+        ((0, 0, 5, 0), [0, 0, 0, 1]),
+        ((1, 1, 0, 1, 0), [0, 0, 0, 0, 0]),
+    ],
+)
+def test_behind_a_stretch_of_guesses_a_new_segment_starts(unknown: tuple[int, ...], segments: list[int]) -> None:
+    """Through a guessed motion or two the world is the same; a longer way that nobody saw breaks the trajectory."""
+    sequence = Rendered(frames=len(unknown) + 1, camera=CAMERA, noise=NONE)
+    odometry = Odometry(CAMERA, aligner=Guessing(*unknown))
+    steps = [odometry.register(frame, index / 30) for index, frame in enumerate(sequence)][1:]
+    assert [step.segment for step in steps if step is not None] == segments
+    assert [step.origin for step in steps if step is not None] == ["guessed" if n else "tracked" for n in unknown]
+    assert not any(step.lost for step in steps if step is not None)
+    assert odometry.progress.world_T_camera[0, 3] == pytest.approx(-0.01 * len(unknown))
+
+
 def test_the_wide_search_stands_behind_the_default_one() -> None:
     aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
     assert isinstance(aligner, Recovering) and isinstance(aligner.first, DoubtingDepth)
