@@ -24,7 +24,7 @@ FRAME_COLUMNS = (
 that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations
 of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
 0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the reference is
-then a keyframe of the map) or `guessed` (of a lost pair)."""
+then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body)."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
