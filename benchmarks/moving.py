@@ -4,7 +4,8 @@ The card (`moving_clips.py`) covers 0.1, 0.25 and 0.4 of the image of each clip;
 and distance. The room has a box, then a box and a walking figure. Prints one row per clip, body and method, over the
 seeds:
 
-- drift (RPE over 1 s, RMSE) over that of the clean clip, median and worst;
+- drift (RPE over 1 s, RMSE) over that of the clean clip, median and worst. It is taken within segments; `breaks` counts
+  the places where trajectories break, and `across` is the median with the guessed ways across these counted in;
 - IoU of a body's mask with the true one, in the median frame; of several bodies, each frame counts once for each;
 - error of a body's motion between two frames, medians: displacement of its centroid in mm, rotation in degrees;
 - wrong pairs (camera motion off by more than 2 cm or 1.5 degrees) whose status is not ok, and the share of the other
@@ -75,6 +76,9 @@ class Score:
     seed: int
     drift: float
     clean_drift: float
+    drift_across: float = np.nan
+    """As if the trajectory had not been broken."""
+    breaks: int = 0
     wrong: int = 0
     wrong_flagged: int = 0
     right: int = 0
@@ -256,6 +260,9 @@ def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[
             score = Score(case.clip, case.body, contender.name, case.seed, np.nan, clean[key])
             trajectory = run(f"{label}, {case.body}", case.sequence, contender, seed, score)
             score.drift = drift(trajectory, case.sequence.ground_truth)
+            whole = Trajectory(trajectory.timestamps, trajectory.world_T_camera)
+            score.drift_across = drift(whole, case.sequence.ground_truth)
+            score.breaks = len(np.unique(trajectory.segments)) - 1
             scores.append(score)
             print(f"{label}, {case.body}: drift {score.ratio:.2f} times the clean clip's", file=sys.stderr)
     return scores
@@ -271,6 +278,9 @@ class Summary(NamedTuple):
     """Median, m/s."""
     ratio_median: float
     ratio_worst: float
+    ratio_across: float
+    """Median, breaks counted in."""
+    breaks: int
     overlap: float | None
     """Median over frames and bodies."""
     displacement_mm: float | None
@@ -303,6 +313,8 @@ def summarise(clip: str, body: str, scores: list[Score]) -> Summary:
         float(np.median([score.drift for score in scores])),
         float(np.median(ratios)),
         float(max(ratios)),
+        float(np.median([score.drift_across / score.clean_drift for score in scores])),
+        sum(score.breaks for score in scores),
         median([value for score in scores for value in score.overlaps]),
         median([value for score in scores for value in score.displacements_mm]),
         median([value for score in scores for value in score.rotations_deg]),
@@ -324,8 +336,8 @@ def groups(scores: list[Score], *names: str) -> list[list[Score]]:
 
 
 COLUMNS = (
-    *("clip", "body", "method", "m/s", "ratio", "worst", "IoU", "mm", "deg", "wrong", "flagged", "precision", "recall"),
-    *("others", "runs"),
+    *("clip", "body", "method", "m/s", "ratio", "worst", "across", "breaks", "IoU", "mm", "deg"),
+    *("wrong", "flagged", "precision", "recall", "others", "runs"),
 )
 
 
@@ -342,6 +354,8 @@ def row(summary: Summary) -> list[str]:
         number(summary.drift, 4),
         number(summary.ratio_median, 2),
         number(summary.ratio_worst, 2),
+        number(summary.ratio_across, 2),
+        str(summary.breaks),
         number(summary.overlap, 2),
         number(summary.displacement_mm, 1),
         number(summary.rotation_deg, 2),

@@ -1,5 +1,6 @@
 """Fixtures and settings shared by all tests."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -36,11 +37,38 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "test-jax" / proce
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 TRACED = Path(os.environ["GAVO_CACHE_DIR"]) / "traced"
 
+LONGEST = (
+    "alignment/test_alignment.py",
+    "cli/test_contract.py",
+    "cli/test_cli.py",
+    "test_benchmarks.py",
+    "output/test_resume.py",
+    "experiments/test_together.py",
+    "calibration/test_calibration.py",
+    "test_examples.py",
+    "bodies/test_rival.py",
+    "odometry/test_odometry.py",
+    "objective/test_objective.py",
+    "datasets/test_forms.py",
+    "selfcheck/test_selfcheck.py",
+    "experiments/test_sharding.py",
+)
+"""Files that take longest, in the order in which they begin: one that began last would keep a process waiting."""
+
 MOST_MAPS = 20_000
 """Maps of memory: a process has 65,530 by default, and each compiled program holds some."""
 
+# what tracing makes by the hundred thousand stays: to look through it again and again takes a fifth of the time
+gc.set_threshold(100_000, 20, 100)
+
 settings.register_profile("gavo", deadline=None, derandomize=True)
 settings.load_profile("gavo")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first; all else stays in order."""
+    places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -59,6 +87,15 @@ def maps_of_memory() -> int:
         return Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:
         return 0
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`gavo run` draws no figures: they take longer than a short run, and are made of what its files say."""
+    from gavo_jax.cli import run
+
+    for name in ("draw", "draw_search"):
+        monkeypatch.setattr(run, name, lambda *_: None)
 
 
 @pytest.fixture(scope="session")

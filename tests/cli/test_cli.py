@@ -115,6 +115,7 @@ def test_run_writes_its_files(gavo, pristine, tmp_path):
     assert evaluated.status == 0 and f"{metrics['rpe_translation_rmse_m_per_s']:.6f}" in evaluated.out
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
     pytest.importorskip("gtsam")
     out, camera = tmp_path / "out", ("--camera", pristine / "camera.toml")
@@ -130,6 +131,7 @@ def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
     assert gavo(*command[:-1]).status == 0 and not (out / "odometry.txt").exists() and not (out / "loops.csv").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_same_seed_same_bytes_and_default_folder(gavo, clip, tmp_path):
     arguments = ("run", "clip", "--camera", clip / "camera.toml", *FAST, "--frames", 3, "--seed", 7)
     assert gavo(*arguments).status == 0
@@ -138,6 +140,7 @@ def test_same_seed_same_bytes_and_default_folder(gavo, clip, tmp_path):
     assert first.read_bytes() == (tmp_path / "again" / "trajectory.txt").read_bytes()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_range_of_frames(gavo, clip, tmp_path):
     camera = ("--camera", clip / "camera.toml")
     done = gavo("run", clip, *camera, *FAST, "--start", 1, "--stride", 2, "--frames", 2, "--output", tmp_path / "out")
@@ -203,6 +206,7 @@ def test_interrupted_run_keeps_what_is_done(gavo, clip, tmp_path, monkeypatch):
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.txt")) == 3
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_that_dies_leaves_nothing_that_looks_whole(gavo, clip, tmp_path, monkeypatch):
     arguments = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
     assert gavo(*arguments).status == 0
@@ -414,6 +418,7 @@ def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     assert 0 < (tmp_path / "out" / "view.rrd").stat().st_size < whole / 2
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("fault", ["frames.csv", "trajectory.txt", "config.json"])
 def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
     assert gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", "out").status == 0

@@ -43,6 +43,8 @@ frames = {frames}
 alignment.loss = {choices}
 """
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture
 def gavo(capsys, monkeypatch, tmp_path, forty_frames):

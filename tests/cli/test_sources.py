@@ -18,6 +18,8 @@ from gavo_jax.trajectory import Trajectory
 INFO = "/camera/color/camera_info"
 FAST = ("--method", "gauss-newton")
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture
 def gavo(capsys, monkeypatch, tmp_path):

@@ -64,12 +64,6 @@ def whole(clip, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def undrawn(monkeypatch) -> None:
-    """No figures: they are made of what the files say."""
-    monkeypatch.setattr(run, "draw", lambda *_, **__: None)
-
-
 def same_ending(one: Path, other: Path, drawn: bool = True) -> bool:
     """Whether two runs ended with the same files, byte by byte but for the times they took; figures alone by name."""
 
@@ -124,13 +118,30 @@ def test_resumed_run_ends_as_one_in_one_go(clip, whole, tmp_path, monkeypatch, u
     assert same_ending(tmp_path / "out", whole, drawn=False)
 
 
-@pytest.mark.parametrize(("after", "fault"), [(9, Power), (20, KeyboardInterrupt), (38, Power)])
-def test_resumed_run_with_loops_ends_as_one_in_one_go(clip, tmp_path, monkeypatch, undrawn, after, fault):
+def close_loops_soon(patch: pytest.MonkeyPatch) -> None:
+    """Let loops close within the second that the clip lasts."""
     pytest.importorskip("gtsam")
-    monkeypatch.setattr("gavo_jax.mapping.candidates.MIN_SECONDS", 0.2)
-    monkeypatch.setattr("gavo_jax.mapping.keyframes.SPACING", 0.03)
-    in_one_go, out = arguments(clip, tmp_path / "whole", "--loops"), arguments(clip, tmp_path / "out", "--loops")
-    assert main(in_one_go) == 0
+    patch.setattr("gavo_jax.mapping.candidates.MIN_SECONDS", 0.2)
+    patch.setattr("gavo_jax.mapping.keyframes.SPACING", 0.03)
+
+
+@pytest.fixture(scope="module")
+def whole_with_loops(clip, tmp_path_factory) -> Path:
+    """The files of a run with loops in one go."""
+    folder = tmp_path_factory.mktemp("loops")
+    with pytest.MonkeyPatch.context() as patch:
+        close_loops_soon(patch)
+        assert main(arguments(clip, folder, "--loops")) == 0
+    assert len((folder / "loops.csv").read_text().splitlines()) > 1, "there are loops"
+    return folder
+
+
+@pytest.mark.parametrize(("after", "fault"), [(9, Power), (20, KeyboardInterrupt), (38, Power)])
+def test_resumed_run_with_loops_ends_as_one_in_one_go(
+    clip, whole_with_loops, tmp_path, monkeypatch, undrawn, after, fault
+):
+    close_loops_soon(monkeypatch)
+    out = arguments(clip, tmp_path / "out", "--loops")
     with monkeypatch.context() as patch:
         cut_short(patch, after, fault)
         if fault is Power:
@@ -139,10 +150,9 @@ def test_resumed_run_with_loops_ends_as_one_in_one_go(clip, tmp_path, monkeypatc
         else:
             assert main(out) == 130
     assert main([*out, "--resume"]) == 0
-    assert len((tmp_path / "whole" / "loops.csv").read_text().splitlines()) > 1, "there are loops"
-    assert same_ending(tmp_path / "out", tmp_path / "whole", drawn=False)
+    assert same_ending(tmp_path / "out", whole_with_loops, drawn=False)
     for name in ("loops.csv", "motions.csv", "odometry.txt"):
-        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (whole_with_loops / name).read_bytes()
 
 
 def test_interrupted_run_is_resumed(clip, whole, tmp_path, monkeypatch):
