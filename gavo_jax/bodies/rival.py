@@ -64,6 +64,8 @@ class Rival(NamedTuple):
     anchor: View
     near: Bool[np.ndarray, "h w"]
     """What the anchor shows of surfaces that are taken for bodies."""
+    stands_before: Any
+    """Whether these stand before the rest: only then it says something that both searches agree."""
     first_T_anchor: Float[np.ndarray, "4 4"]
     """Motion since the anchor by the first search,"""
     rival_T_anchor: Float[np.ndarray, "4 4"]
@@ -158,7 +160,7 @@ class WithRival:
         apart, deviation = _between(first, second), float(np.sqrt(np.trace(other.result.covariance[:3, :3])))
         if not deviation < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
-        confirmed = attempt._replace(state=self._alone(attempt.state, DECIDED))
+        confirmed = attempt._replace(state=self._alone(attempt.state, DECIDED if rival.stands_before else open_for))
         if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
             return confirmed
         ahead = 0
@@ -183,6 +185,7 @@ class WithRival:
             other.state,
             rival.anchor,
             rival.near,
+            rival.stands_before,
             first.astype(np.float32),
             second.astype(np.float32),
             np.int32(age),
@@ -196,7 +199,9 @@ class WithRival:
         """No rival, in the shapes and types of every one."""
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
         nothing = np.zeros(self.first.retina.size, bool)
-        return Rival(blank, _view(blank), nothing, still, still, np.int32(-1), np.float32(0), np.int32(0))
+        return Rival(
+            blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.float32(0), np.int32(0)
+        )
 
     def _alone(self, state: AwareState, open_for: int) -> RivalledState:
         """A state without a rival."""
@@ -205,7 +210,7 @@ class WithRival:
     def _rival_of(self, state: AwareState) -> Rival:
         """The motion of what the last frame shows behind all that stands before other surfaces, from here on."""
         retina, anchor = self.first.retina, _view(state)
-        near = nearer_part(inverse_depth_of(anchor))
+        near, stands_before = nearer_part(inverse_depth_of(anchor))
         if not np.any(near):
             return self._nobody
         number = np.int32(state.scene.roll.last + 1)
@@ -219,7 +224,9 @@ class WithRival:
         )
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
         seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
-        return self._nobody._replace(state=seen, anchor=anchor, near=near, age=np.int32(0))
+        return self._nobody._replace(
+            state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=np.int32(0)
+        )
 
 
 def _view(state: AwareState) -> View:

@@ -4,6 +4,8 @@ A body hides the scene and not the other way round. So the surfaces that stand b
 may move, whatever the motion.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -27,19 +29,25 @@ LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 BINS = 64
 
 
-def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The pixels of what may be a body: surfaces that stand before others, or else the nearer part of the image.
+class NearerPart(NamedTuple):
+    """The pixels of what may be a body; none where nothing may."""
+
+    mask: Bool[np.ndarray, "h w"]
+    stands_before: bool
+    """Whether these are surfaces that stand before others, and not just the nearer part of the image."""
+
+
+def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
+    """Surfaces that stand before others, or else the nearer part of the image.
 
     Args:
         inverse_depth: 1/m; 0 where there is no reading.
-
-    Returns:
-        Nothing where neither is there.
     """
-    for part in (standing_before(inverse_depth), _nearer_class(inverse_depth)):
-        if LEAST_NEAR < part.mean() < MOST_NEAR:
-            return part
-    return np.zeros(inverse_depth.shape, bool)
+    for find, stands_before in ((standing_before, True), (_nearer_class, False)):
+        mask = find(inverse_depth)
+        if LEAST_NEAR < mask.mean() < MOST_NEAR:
+            return NearerPart(mask, stands_before)
+    return NearerPart(np.zeros(inverse_depth.shape, bool), False)
 
 
 def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

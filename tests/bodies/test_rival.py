@@ -41,7 +41,7 @@ def test_a_card_before_a_wall_stands_before_it() -> None:
     q, card = wall(), np.zeros((60, 80), bool)
     card[20:40, 30:60] = True
     q[card] = 1.0 / 0.8
-    assert (standing_before(q) == card).all() and (nearer_part(q) == card).all()
+    assert (standing_before(q) == card).all() and (nearer_part(q).mask == card).all() and nearer_part(q).stands_before
 
 
 def test_of_two_surfaces_that_fill_the_image_the_larger_one_is_asked() -> None:
@@ -70,13 +70,13 @@ def test_a_window_is_behind_and_no_body() -> None:
 
 @pytest.mark.parametrize("q", [wall(), np.zeros((60, 80)), np.where(np.arange(80) == 3, 1.0, wall())])
 def test_nothing_stands_before_a_plain_wall(q: np.ndarray) -> None:
-    assert not nearer_part(q).any()
+    assert not nearer_part(q).mask.any()
 
 
 def test_a_floor_has_a_nearer_part() -> None:
     q = np.repeat(np.linspace(0.3, 1.2, 60)[:, None], 80, axis=1)
-    near = nearer_part(q)
-    assert near[-1].all() and not near[0].any() and 0.3 < near.mean() < 0.7
+    near, stands_before = nearer_part(q)
+    assert not stands_before and near[-1].all() and not near[0].any() and 0.3 < near.mean() < 0.7
 
 
 def test_blocks_vote_for_the_true_motion() -> None:
