@@ -146,6 +146,12 @@ SWEPT = {
 """By method: a few coarse levels alone, and a rate with eight values."""
 
 
+def clocks() -> np.ndarray:
+    """Seconds on the wall, and of the processor: what else runs beside takes a core from either way, and more of the
+    first from the one that uses both."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
 @pytest.mark.parametrize("method", SWEPT)
 def test_64_runs_compile_once_and_are_the_single_runs_in_half_the_time(
     write_experiment: Callable[..., Path], tmp_path: Path, method: str
@@ -159,26 +165,19 @@ def test_64_runs_compile_once_and_are_the_single_runs_in_half_the_time(
     assert settings is not None
     run_odometry(frames(), settings)
 
-    def seconds_together(name: str) -> float:
-        plan = read_plan(experiment, tmp_path / name)
-        with compilations() as events:
-            start = time.perf_counter()
-            assert run_experiment(plan, Table(plan.folder), LocalExecutor()) == (64, [])
-            assert events == []
-        return time.perf_counter() - start
-
-    together = seconds_together("out")
+    with compilations() as events:
+        start = clocks()
+        assert run_experiment(plan, Table(plan.folder), LocalExecutor()) == (64, [])
+        together = clocks() - start
+        assert events == []
     rows = {row["run"]: row for row in Table(plan.folder).read()}
-    start = time.perf_counter()
+    start = clocks()
     for run in plan.runs:
         assert run.settings is not None and run.seed is not None
         alone = run_odometry(frames(), run.settings, seed=run.seed).metrics
         for name in ("rpe_translation_rmse_m_per_frame", "ate_translation_rmse_m", "distance_error_final_m"):
             assert rows[run.id][name] == alone[name]
-    single = time.perf_counter() - start
-    for name in ("again", "once more"):  # it needs both cores, which something else may have had
-        if together > 0.5 * single:
-            together = min(together, seconds_together(name))
+    single = clocks() - start
     if method == "ga":
         assert len({row["ate_translation_rmse_m"] for row in rows.values()}) > 32, "seeds and rates change nothing"
-    assert together < 0.5 * single, f"{together:.2f} s together, {single:.2f} s one by one"
+    assert np.min(together / single) < 0.5, f"{together} s together, {single} s one by one"
