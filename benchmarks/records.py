@@ -178,12 +178,15 @@ def ruled_out(record: Record) -> str | None:
 
 def sources_of_summary(records: Records) -> str:
     """Which JAX the columns of README's table are of."""
-    columns = {"Drift": "drift", "found": "basin", "time": "throughput"}
+    columns = {"Drift": "drift", "*found*": "basin", "*time*": "throughput"}
     by_version: dict[str, list[str]] = {}
     for column, benchmark in columns.items():
         by_version.setdefault(jax_of(records.of(benchmark)[0]) or UNKNOWN, []).append(column)
-    parts = [f"{' and '.join(names)} are of JAX {version}" for version, names in by_version.items()]
-    return "; ".join(parts).replace("time are", "*time* is").replace("found are", "*found* are") + "."
+    parts = [
+        f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} of JAX {version}"
+        for version, names in by_version.items()
+    ]
+    return "; ".join(parts) + "."
 
 
 def section(records: Sequence[Record]) -> str:
@@ -213,8 +216,10 @@ def fill(text: str, records: Records) -> str:
         start, kind, name, end = place.groups()
         if kind == "records" and not records.of(name):
             raise ValueError(f"no record of {name!r}")
-        quoted = f"{markdown(summary(records))}\n\n{sources_of_summary(records)}"
-        inside = quoted if kind == "summary" else section(records.of(name))
+        if kind == "summary":
+            inside = f"{markdown(summary(records))}\n\n{sources_of_summary(records)}"
+        else:
+            inside = section(records.of(name))
         return f"{start}\n\n{inside}\n\n{end}"
 
     return PLACE.sub(insert, text)

@@ -181,16 +181,13 @@ class WithRival:
             return confirmed
         if age > DROPPED_AFTER:
             return attempt._replace(state=self._alone(attempt.state, open_for))
-        after = Rival(
-            other.state,
-            rival.anchor,
-            rival.near,
-            rival.stands_before,
-            first.astype(np.float32),
-            second.astype(np.float32),
-            np.int32(age),
-            np.float32(contradiction),
-            np.int32(ahead),
+        after = rival._replace(
+            state=other.state,
+            first_T_anchor=first.astype(np.float32),
+            rival_T_anchor=second.astype(np.float32),
+            age=np.int32(age),
+            contradiction=np.float32(contradiction),
+            ahead=np.int32(ahead),
         )
         return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
 

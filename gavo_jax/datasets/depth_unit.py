@@ -5,7 +5,7 @@ its like measure disparity, so that the steps between the depths that they can r
 the same factor in every such camera: `KINECT_STEP`. And they see nothing nearer than `KINECT_NEAREST`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -133,7 +133,7 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:
     """Why a sequence is of no use, where not one of a few frames, its first, its middle and its last, has a reading."""
-    read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
+    read = _reader_of(sequence)
     places = sorted({*range(min(LOOKED_AT, len(sequence))), len(sequence) // 2, len(sequence) - 1})
     looked = recorded = 0
     for index in places:
@@ -154,9 +154,14 @@ def lack_of_depth(sequence: FrameSequence) -> str | None:
     return f"no reading in the depth of the {looked} frames that were looked at: 0, 65535, negative and NaN are none"
 
 
+def _reader_of(sequence: FrameSequence) -> Callable[[int], np.ndarray]:
+    """What gives a frame's depth: as it is stored, where the sequence tells."""
+    return getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
+
+
 def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
     """What the first frames' depth says, as it is stored where the sequence tells, and the units per metre it has."""
-    read = getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
+    read = _reader_of(sequence)
     unit = getattr(sequence, "depth_unit", None)
     images = []
     for index in range(min(LOOKED_AT, len(sequence))):

@@ -28,7 +28,7 @@ from gavo_jax.datasets.files import (
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, stamps
-from gavo_jax.datasets.truth import MAX_POSE_BYTES, Seconds, pose_files, pose_of, truth_in
+from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -364,6 +364,6 @@ def _check_identity(file: Path) -> None:
     """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
     if not file.is_file():
         return
-    pose = pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+    pose = pose_in(file)
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")

@@ -142,10 +142,15 @@ def pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
     poses = {}
     for file in files:
         numbers = re.findall(r"\d+", file.name)
-        pose = pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
+        pose = pose_in(file)
         if pose is not None and numbers and int(numbers[-1]) < MAX_NUMBER:
             poses[int(numbers[-1])] = pose
     return poses
+
+
+def pose_in(file: Path) -> Float[np.ndarray, "4 4"] | None:
+    """The pose that a file of its own holds; see `pose_of`."""
+    return pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
 
 
 def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
