@@ -97,6 +97,8 @@ class OdometryOptions:
         synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
             sequence tells both stamps.
         rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
+        sway: Whether, under a rolling shutter, the camera's velocity at each frame's own moment is found with the
+            motion; else it is taken for the mean since the last frame. See `alignment.sway`.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
         bodies: Whether what moves on its own is left out of the search: `off` no, `mask` yes; `track` finds each body's
             own motion, too. See docs/bodies.md.
@@ -109,6 +111,7 @@ class OdometryOptions:
     prior: bool = static(True)
     synchronise: bool = static(True)
     rolling_shutter: bool = static(True)
+    sway: bool = static(True)
     recover: bool = static(True)
     bodies: Literal["off", "mask", "track"] = static("mask")
     on_lost: Literal["hold", "predict", "stop"] = static("hold")

@@ -12,6 +12,7 @@ from gavo_jax.alignment.evidence import Held, is_held
 from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
+from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying
 from gavo_jax.alignment.visits import Level, Search
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
@@ -53,6 +54,7 @@ def conclude(
     history: jax.Array,
     centre: Float[Array, "4 4"],
     judge: Objective | None = None,
+    swaying: Swaying | None = None,
 ) -> Alignment:
     """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
     found = search.islands[0]
@@ -65,13 +67,19 @@ def conclude(
     if options.last_step and not options.symmetric:
         problem = replace(problem, origin=_refine(problem, residuals))
         residuals = objective.residuals(problem.origin)
+    swayed = Swayed(problem.origin, jnp.zeros(6), jnp.zeros((6, 6)))
+    if swaying is not None and objective.readout is not None and not options.symmetric:
+        swayed = refine_swaying(problem, swaying)
+        problem = replace(problem.with_sway(swayed.twist), origin=swayed.motion)
+        objective = problem.objective
+        residuals = objective.residuals(swayed.motion)
     motion = problem.origin
     evidence = _examine(problem, residuals)
     held, chosen_by = None, None
     if judge is not None:
         held = is_held(judge, motion, evidence.information.directions)
         chosen_by = evidence_for(judge, motion)
-    covariance = _covariance(evidence, objective, held)
+    covariance = _covariance(evidence, objective, held) + swayed.covariance
     if held is not None:
         determined = evidence.information.determined | held.held
         evidence = evidence._replace(information=evidence.information._replace(determined=determined))
@@ -88,6 +96,7 @@ def conclude(
         findings,
         evidence.explained,
         jnp.asarray(objective.scales.depth, jnp.float32),
+        swayed.twist,
     )
 
 

@@ -39,6 +39,9 @@ class Alignment(NamedTuple):
     """Share of the grey and of the depth residuals that are not large."""
     depth_scale: Any = np.float32(np.nan)
     """Scale of the depth residuals, 1/m."""
+    sway: Any = np.zeros(6, np.float32)
+    """Twist of the points in the target camera at its moment, less ξ: metres and radians over the time between the
+    frames; 0 where a rolling shutter does not tell it. See `alignment.sway`."""
 
     @property
     def statuses(self) -> tuple[AlignmentStatus, ...]:

@@ -20,6 +20,7 @@ from gavo_jax.alignment.evidence import evidence
 from gavo_jax.alignment.judgement import conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.sway import Swaying
 from gavo_jax.alignment.visits import (
     Exchanged,
     Level,
@@ -89,6 +90,7 @@ def align_views(
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
     hypotheses: Float[Array, "h 4 4"] | None = None,
+    swaying: Swaying | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -109,6 +111,8 @@ def align_views(
             None where all rows are exposed at once.
         hypotheses: Motions that compete with what a search with `refine` finds, wherever they lie; not-a-number where
             there is none.
+        swaying: Under a rolling shutter what is known of the target's own velocity, which is then refined with the
+            motion at the end; None where it is taken for the mean since the anchor.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
@@ -159,7 +163,7 @@ def align_views(
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, centre, judge), populations
+    return conclude(objective, search, finest, options, history, centre, judge, swaying), populations
 
 
 class Frames(NamedTuple):

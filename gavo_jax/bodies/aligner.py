@@ -280,7 +280,9 @@ def _moved(
     xi = log_on_host(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
-    tracker = tracker._replace(keyframe=tracker.previous, motion=jnp.asarray(xi), usual=state.tracker.usual)
+    tracker = tracker._replace(
+        keyframe=tracker.previous, motion=jnp.asarray(xi), passing=jnp.asarray(xi), usual=state.tracker.usual
+    )
     return attempt._replace(state=tracker, result=result, usable=True)
 
 

@@ -66,11 +66,12 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
     assert state.whole is not None
-    whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.motion) else state.whole
+    whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.passing) else state.whole
     tracker = state.tracker._replace(
         previous=whole,
         keyframe=whole,
         motion=jnp.asarray(before.motions[place], jnp.float32),
+        swayed=jnp.zeros(6),
         seconds=jnp.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )
@@ -79,7 +80,7 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
 
 def _unsettled(whole: Reference, tracker: TrackerState, retina: Retina) -> Reference:
     """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
-    twist = tracker.motion * (retina.full.readout / tracker.seconds)
+    twist = tracker.passing * (retina.full.readout / tracker.seconds)
     return unsettle_reference(whole, twist, retina.planes)
 
 

@@ -139,11 +139,13 @@ class WithRival:
             rival = self._rival_of(state.first)
             open_for = max(open_for, 0) if rival.is_there else open_for
         open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
-        if not attempt.usable:
-            return attempt._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if not rival.is_there:
             return attempt._replace(state=self._alone(own, open_for))
         other = self.second.align(rival.state, frame, clock)
+        if not attempt.usable:  # that motion has come to an end, and the rival's goes on
+            if other.usable and _deviation(other) < EXACT:
+                return self._taken(other, rival, open_for)
+            return attempt._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if other.usable:
             return self._decide(attempt, other, rival, open_for)
         again = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
@@ -157,7 +159,7 @@ class WithRival:
         age = int(rival.age) + 1
         new = min(_distance(attempt.result, other.result), LARGEST)
         contradiction = float(rival.contradiction) + max(1 / age, 1 / REMEMBERED) * (new - float(rival.contradiction))
-        apart, deviation = _between(first, second), float(np.sqrt(np.trace(other.result.covariance[:3, :3])))
+        apart, deviation = _between(first, second), _deviation(other)
         if not deviation < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
         confirmed = attempt._replace(state=self._alone(attempt.state, DECIDED if rival.stands_before else open_for))
@@ -172,9 +174,7 @@ class WithRival:
             certainty = contradiction / LARGEST + far
             contradicts = age >= FRAMES and contradiction > CONTRADICTED and certainty > CLEAR
             if deviation < EXACT and (contradicts or ahead >= FRAMES or whole > LANDSLIDE):
-                result = _returned(other.result, second @ inverse(before))
-                state = self._alone(other.state, DECIDED)
-                return mistrusted(other._replace(state=state, result=result, unknown=max(open_for - age, 0)))
+                return self._taken(other, rival, open_for)
             if age >= FRAMES and certainty > DOUBTFUL and contradiction > DOUBTFUL * CONTRADICTED:
                 attempt = mistrusted(attempt)
         if age >= DROPPED_EARLY and contradiction < LEAST_DOUBT:
@@ -190,6 +190,13 @@ class WithRival:
             ahead=np.int32(ahead),
         )
         return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
+
+    def _taken(self, other: Attempt, rival: Rival, open_for: int) -> Attempt:
+        """The rival's attempt in place of the first one's, by the way from where its camera was believed to be."""
+        second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
+        result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
+        unknown = max(open_for - int(rival.age) - 1, 0)
+        return mistrusted(other._replace(state=self._alone(other.state, DECIDED), result=result, unknown=unknown))
 
     @cached_property
     def _nobody(self) -> Rival:
@@ -236,6 +243,11 @@ def _distance(first: Alignment, second: Alignment) -> float:
     step = log(np.asarray(first.target_T_reference) @ inverse(np.asarray(second.target_T_reference)))
     covariance = np.asarray(first.covariance, np.float64) + np.asarray(second.covariance, np.float64)
     return float(step @ np.linalg.solve(covariance, step))
+
+
+def _deviation(attempt: Attempt) -> float:
+    """Of an attempt's translation, metres."""
+    return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:

@@ -105,7 +105,7 @@ class Retina:
 
     def view(self, tracker: TrackerState) -> View:
         """Of a tracker's last frame."""
-        return view_of(tracker.previous_image, self.levels, tracker.motion * (self.full.readout / tracker.seconds))
+        return view_of(tracker.previous_image, self.levels, tracker.passing * (self.full.readout / tracker.seconds))
 
     def blank(self) -> Scene:
         """A scene before the first frame, in the shapes and types of every scene."""
@@ -124,7 +124,7 @@ class Retina:
         keep = (1, 2) if int(scene.age) + 1 < OLD else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
-            (tracker.previous_image, tracker.motion, tracker.seconds),
+            (tracker.previous_image, tracker.passing, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             np.array(keep, np.int32),
             self.full,
@@ -135,7 +135,7 @@ class Retina:
         """What a motion makes of the last frame's pixels."""
         return _look_back(
             (scene.known, scene.views),
-            (tracker.previous_image, tracker.motion, tracker.seconds),
+            (tracker.previous_image, tracker.passing, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             self.full,
             levels=self.levels,
@@ -168,8 +168,8 @@ def _look(
 ) -> Look:
     """One program for all that is asked about every frame: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
-    image, motion, seconds = new
-    here = view_of(image, levels, motion * (camera.readout / seconds))
+    image, passing, seconds = new
+    here = view_of(image, levels, passing * (camera.readout / seconds))
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
@@ -192,8 +192,8 @@ def _look_back(
 ) -> Belief:
     """One program, so that it is kept between processes: it is asked for in the middle of a run."""
     before, views = known
-    image, motion, seconds = new
-    here = view_of(image, levels, motion * (camera.readout / seconds))
+    image, passing, seconds = new
+    here = view_of(image, levels, passing * (camera.readout / seconds))
     last = jax.tree.map(lambda leaf: leaf[0], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
     here = jax.tree.map(lambda leaf: leaf[None], here)

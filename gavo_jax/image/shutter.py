@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gavo_jax.camera import Camera, to_pixels
+from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.levels import ImagePlane
 from gavo_jax.image.warp import Points, Warped
 
@@ -29,6 +29,9 @@ class Shutter(NamedTuple):
     row_time: Float[Array, "*n"]
     """When each reference point was seen, in readouts after its frame's moment (that of the middle row); 0 where the
     point was moved there."""
+    sway: Float[Array, " 6"] | None = None
+    """Twist, over the same time, that the points in the target camera have at the target's moment beside that motion;
+    see `alignment.sway`."""
 
 
 def row_time(v: Float[Array | np.ndarray, "*n"] | float, camera: Camera | ImagePlane) -> Any:
@@ -40,12 +43,28 @@ def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | Ima
     """Where warped points really are when the row on which they land is read.
 
     The camera moves on along ξ meanwhile, so each point goes on along its own way from the reference, by the share of
-    the motion that falls into its delay. To first order in that share, a few hundredths between frames of a video.
+    the motion that falls into its delay; and by its sway on top of that. To first order in that share, a few hundredths
+    between frames of a video.
     """
     share, way = _passed(points, warped, shutter, camera)
     u, v, inverse_depth = (start + share * step for start, step in zip(warped[:3], way, strict=True))
+    if shutter.sway is not None:
+        late = shutter.readout * row_time(warped.v, camera)
+        flow = twist_flow(shutter.sway, warped, camera)
+        u, v, inverse_depth = (start + late * step for start, step in zip((u, v, inverse_depth), flow, strict=True))
     inside = (warped.inside > 0) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
     return Warped(u, v, inverse_depth, inside.astype(jnp.float32))
+
+
+def twist_flow(
+    twist: Float[Array, " 6"], warped: Warped, camera: Camera | ImagePlane
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """How far a small twist moves the points that are seen at pixels: along u, v and 1/z."""
+    (x, y), q, (v, w) = to_ray(camera, warped.u, warped.v), warped.inverse_depth, (twist[:3], twist[3:])
+    away = w[0] * y - w[1] * x + v[2] * q
+    along_u = camera.fx * (w[1] - w[2] * y + v[0] * q - x * away)
+    along_v = camera.fy * (w[2] * x - w[0] + v[1] * q - y * away)
+    return along_u, along_v, -q * away
 
 
 def delayed_slopes(

@@ -99,6 +99,8 @@ class Objective:
     readout: Float[Array, ""] | None = None
     """Of a camera with a rolling shutter the share of the motion that passes during a readout; see `Shutter`. None: all
     rows are exposed at once."""
+    sway: Float[Array, " 6"] | None = None
+    """The target's, under a rolling shutter; see `Shutter`. None: it moved as on average since the reference."""
     backward: "Objective | None" = None
     """The same error with the frames' parts exchanged: the target's points seen from the reference, by the inverse
     motion. With it E is the mean of both, as neither frame is nearer to the truth than the other."""
@@ -180,7 +182,7 @@ class Objective:
 
     def shutter(self, reference: Reference) -> Shutter | None:
         """How the rows of some points were exposed; None where all were at once."""
-        return None if self.readout is None else Shutter(self.readout, reference.row_time)
+        return None if self.readout is None else Shutter(self.readout, reference.row_time, self.sway)
 
     def cost(self, r: Residuals) -> Float[Array, "*n"]:
         """Cost of every point; −1 marks those outside, so that one pass over the points does."""

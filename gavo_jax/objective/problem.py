@@ -1,6 +1,6 @@
 """An objective in search coordinates: what a solver is handed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -37,6 +37,10 @@ class Problem:
     reach: Float[Array, " 2"] | None = None
     searched: Bool[Array, ""] | bool = True
     """Whether anything is to be found here; if not, no candidate is worth anything and none costs anything."""
+
+    def with_sway(self, twist: Float[Array, " 6"]) -> "Problem":
+        """The same with a target that sways; see `alignment.sway`."""
+        return replace(self, objective=replace(self.objective, sway=twist))
 
     def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
         """target_T_reference of search coordinates."""

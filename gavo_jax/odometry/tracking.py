@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.search import Population, align_views
+from gavo_jax.alignment.sway import Swaying, after
 from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
@@ -63,6 +64,10 @@ class TrackerState(NamedTuple):
     """The previous frame, packed for sampling: what the symmetric error needs of it."""
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
+    passing: Float[Array, " 6"]
+    """What that twist would be, had the camera moved as it did at the previous frame's own moment."""
+    swayed: Float[Array, " 6"]
+    """Sum of the last frames' sways; see `sway.Swaying`."""
     seconds: Float[Array, ""]
     """Time that motion took."""
     exposure: Exposure
@@ -164,24 +169,29 @@ def track_frame(
     if alignment.symmetric:
         exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
     key = jax.random.fold_in(key, clock.frame)
+    swaying = Swaying(clock.elapsed, state.swayed) if options.sway else None
     result, populations = align_views(
-        views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout
+        views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout, swaying=swaying
     )
     result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
     motion = jnp.where(is_first, 0.0, result.xi)
+    sway = jnp.where(is_first, 0.0, result.sway)
+    passing = motion + sway
     if options.synchronise:
-        target = _synchronised(raw, camera, delay * motion, finest)
+        target = _synchronised(raw, camera, delay * passing, finest)
     newest = make_references(target, camera, levels)
     if readout is not None:
         unsettled = newest.row_time
-        newest, keyframe = (settle_reference(frame, motion * readout) for frame in (newest, keyframe))
+        newest, keyframe = settle_reference(newest, passing * readout), settle_reference(keyframe, motion * readout)
         newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
     keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
     keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
     usual = jax.tree.map(
         lambda new, old: jnp.where(is_first, old, new), state.usual.after(result, exposure.spread), state.usual
     )
-    return TrackerState(newest, keyframe, packed, motion, clock.elapsed, exposure, usual), result, populations
+    swayed = after(Swaying(clock.elapsed, state.swayed), sway)
+    after_it = TrackerState(newest, keyframe, packed, motion, passing, swayed, clock.elapsed, exposure, usual)
+    return after_it, result, populations
 
 
 @jax.jit
@@ -195,6 +205,8 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         keyframe=reference,
         previous_image=packed,
         motion=jnp.zeros(6),
+        passing=jnp.zeros(6),
+        swayed=jnp.zeros(6),
         seconds=jnp.float32(1.0),
         exposure=Exposure.of(pyramid),
         usual=Usual.unknown(),
@@ -213,6 +225,8 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         keyframe=reference,
         previous_image=Target(words, words),
         motion=jnp.zeros(6),
+        passing=jnp.zeros(6),
+        swayed=jnp.zeros(6),
         seconds=jnp.float32(1.0),
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),

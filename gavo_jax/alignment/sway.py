@@ -1,0 +1,120 @@
+"""The camera's velocity at a frame's own moment, as the rolling shutter shows it.
+
+The motion between two frames tells the mean velocity since the last one. A hand trembles several times a second: when a
+frame is taken the camera turns faster or slower than that, by up to half a radian a second, which stretches and shears
+the image. A search that knows the mean alone explains the stretch by a step to the side that a turn makes up for, a
+centimetre and more. So how far the frame's own velocity is from the mean, its sway, is an unknown beside the motion.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gavo_jax.image.shutter import row_time
+from gavo_jax.objective.derivatives import weighted_terms
+from gavo_jax.objective.problem import Problem
+from gavo_jax.se3 import adjoint, exp, rigid_inverse
+
+USUAL = (0.05, 0.5)
+"""m/s and rad/s: standard deviations of a hand-held camera's sway,"""
+USUAL_SUM = (0.1, 0.3)
+"""and of the sum over the last frames' sways: they follow the mean velocity, so that they make up for each other. What
+does not is an error of the model (depth, lens), which would add up to drift."""
+FORGETTING = 0.97
+"""Factor on that sum from frame to frame."""
+UNSWAYED = (0.03, 0.03)
+"""Metres and radians: standard deviations of a motion that was found with the mean velocity."""
+DEPENDENT = 10.0
+"""Points that tell as much as one: errors of neighbours are alike. Over the square of the share of the points that have
+depth and are at rest: the less of the image these fill, the more alike are a turn and a step."""
+FRAMES = 2.0
+"""Factor on the covariance that comes from the target's sway: the reference's is known no better."""
+ROUNDS = 2
+"""Gauss-Newton steps; one falls short of half the way."""
+LARGEST_RISE = 0.003
+"""Share by which E may rise; beyond, there is no sway and the motion stays."""
+
+
+class Swaying(NamedTuple):
+    """What is known of the sway before a frame is looked at."""
+
+    elapsed: Float[Array, ""]
+    """Seconds since the last frame."""
+    summed: Float[Array, " 6"]
+    """Sum of the last frames' sways, m/s and rad/s; see `after`."""
+
+
+class Swayed(NamedTuple):
+    """A motion with the target's sway."""
+
+    motion: Float[Array, "4 4"]
+    twist: Float[Array, " 6"]
+    """Of the points in the target camera at its moment, less the mean since the last frame; metres and radians over the
+    time between the two."""
+    covariance: Float[Array, "6 6"]
+    """What not knowing the sway adds to that of δ in motion · exp(δ)."""
+
+
+def after(swaying: Swaying, twist: Float[Array, " 6"]) -> Float[Array, " 6"]:
+    """The sum with one more frame's sway."""
+    return FORGETTING * (swaying.summed + twist / swaying.elapsed)
+
+
+def refine_swaying(problem: Problem, swaying: Swaying) -> Swayed:
+    """The motion and the sway about the problem's origin that explain the images best, if that is better.
+
+    Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from what is known of both beforehand. A twist of the
+    target's own moves a point in row v as a step on the target's side would, times the row's time.
+    """
+    objective = problem.objective
+    readout = jnp.float32(0.0) if objective.readout is None else objective.readout
+    usual, usual_sum, unswayed = (jnp.repeat(jnp.array(pair), 3) ** -2.0 for pair in (USUAL, USUAL_SUM, UNSWAYED))
+    usual, usual_sum = usual / swaying.elapsed**2, usual_sum / swaying.elapsed**2
+    prior = jnp.concatenate([unswayed, usual + usual_sum])
+    share = objective.readings() / objective.reference.points.q.size
+    factor = share**2 / (objective.scales.grey**2 * DEPENDENT)
+
+    def normal_equations(motion: jax.Array, twist: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+        here = problem.with_sway(twist).objective
+        r = here.residuals(motion)
+        late = (readout * row_time(r.warped.v, objective.plane)).reshape(-1)
+        gradient, hessian = jnp.zeros(12), jnp.zeros((12, 12))
+        for jacobian, residual, weight in weighted_terms(here, here.reference, r):
+            both = jnp.concatenate([jacobian, late * jacobian])
+            gradient += factor * both @ (weight * residual)
+            hessian += factor * (both * weight) @ both.T
+        gradient += prior * step
+        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.summed)
+        return gradient, hessian + jnp.diag(prior)
+
+    def newton(_: Any, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        motion, step, _ = state
+        gradient, hessian = normal_equations(motion, step[6:], step)
+        move = -jnp.linalg.solve(hessian, gradient)
+        return exp(move[:6]) @ motion, step + move, hessian
+
+    start = problem.origin, jnp.zeros(12), jnp.eye(12)
+    motion, step, hessian = jax.lax.fori_loop(0, ROUNDS, newton, start)
+    before, _ = objective.error(problem.origin)
+    error, _ = problem.with_sway(step[6:]).objective.error(motion)
+    better = (error < before * (1.0 + LARGEST_RISE)) & jnp.all(jnp.isfinite(step)) & ~problem.is_out_of_reach(motion)
+    better &= readout != 0.0
+    to_reference = adjoint(rigid_inverse(motion))
+    added = FRAMES * to_reference @ _from_sway(hessian) @ to_reference.T
+    return Swayed(
+        *jax.lax.optimization_barrier(
+            (
+                jnp.where(better, motion, problem.origin),
+                jnp.where(better, step[6:], 0.0),
+                jnp.where(better & jnp.all(jnp.isfinite(added)), added, 0.0),
+            )
+        )
+    )
+
+
+def _from_sway(hessian: Float[Array, "12 12"]) -> Float[Array, "6 6"]:
+    """Covariance of the motion that comes from the sway's: what is left of it where that is known is taken off."""
+    follows = jnp.linalg.solve(hessian[:6, :6], hessian[:6, 6:])
+    return follows @ jnp.linalg.inv(hessian[6:, 6:] - hessian[6:, :6] @ follows) @ follows.T
