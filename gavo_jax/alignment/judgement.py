@@ -12,7 +12,7 @@ from gavo_jax.alignment.evidence import Held, is_held
 from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
-from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying
+from gavo_jax.alignment.sway import Swaying, refine_swaying, unswayed_from
 from gavo_jax.alignment.visits import Level, Search
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
@@ -64,16 +64,16 @@ def conclude(
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     reach = jnp.stack([search.box[0], search.box[3]])
     problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
+    swayed = unswayed_from(found, residuals)
     if options.last_step and not options.symmetric:
-        problem = replace(problem, origin=_refine(problem, residuals))
-        residuals = objective.residuals(problem.origin)
-    swayed = Swayed(problem.origin, jnp.zeros(6), jnp.zeros((6, 6)))
-    if swaying is not None and objective.readout is not None and not options.symmetric:
-        swayed = refine_swaying(problem, swaying)
-        problem = replace(problem.with_sway(swayed.twist), origin=swayed.motion)
-        objective = problem.objective
-        residuals = objective.residuals(swayed.motion)
-    motion = problem.origin
+        if swaying is not None and objective.readout is not None:
+            swayed = refine_swaying(problem, residuals, swaying)
+            objective = problem.with_sway(swayed.twist).objective
+        else:
+            refined = _refine(problem, residuals)
+            swayed = unswayed_from(refined, objective.residuals(refined))
+        problem = replace(problem, origin=swayed.motion, objective=objective)
+    motion, residuals = problem.origin, swayed.residuals
     evidence = _examine(problem, residuals)
     held, chosen_by = None, None
     if judge is not None:

@@ -6,7 +6,7 @@ the image. A search that knows the mean alone explains the stretch by a step to 
 centimetre and more. So how far the frame's own velocity is from the mean, its sway, is an unknown beside the motion.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from gavo_jax.image.shutter import row_time
 from gavo_jax.objective.derivatives import weighted_terms
+from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import adjoint, exp, rigid_inverse
 
@@ -55,6 +56,12 @@ class Swayed(NamedTuple):
     time between the two."""
     covariance: Float[Array, "6 6"]
     """What not knowing the sway adds to that of δ in motion · exp(δ)."""
+    residuals: Residuals
+
+
+def unswayed_from(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
+    """A motion without sway."""
+    return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
 
 
 def after(swaying: Swaying, twist: Float[Array, " 6"]) -> Float[Array, " 6"]:
@@ -62,8 +69,9 @@ def after(swaying: Swaying, twist: Float[Array, " 6"]) -> Float[Array, " 6"]:
     return FORGETTING * (swaying.summed + twist / swaying.elapsed)
 
 
-def refine_swaying(problem: Problem, swaying: Swaying) -> Swayed:
-    """The motion and the sway about the problem's origin that explain the images best, if that is better.
+def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> Swayed:
+    """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
+    best; the origin without sway where E would rise.
 
     Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from what is known of both beforehand. A twist of the
     target's own moves a point in row v as a step on the target's side would, times the row's time.
@@ -76,42 +84,27 @@ def refine_swaying(problem: Problem, swaying: Swaying) -> Swayed:
     share = objective.readings() / objective.reference.points.q.size
     factor = share**2 / (objective.scales.grey**2 * DEPENDENT)
 
-    def normal_equations(motion: jax.Array, twist: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-        here = problem.with_sway(twist).objective
-        r = here.residuals(motion)
+    motion, x, r, hessian = problem.origin, jnp.zeros(12), residuals, jnp.diag(prior)
+    for _ in range(ROUNDS):
         late = (readout * row_time(r.warped.v, objective.plane)).reshape(-1)
-        gradient, hessian = jnp.zeros(12), jnp.zeros((12, 12))
-        for jacobian, residual, weight in weighted_terms(here, here.reference, r):
+        gradient, hessian = prior * x, jnp.diag(prior)
+        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.summed)
+        for jacobian, residual, weight in weighted_terms(objective, objective.reference, r):
             both = jnp.concatenate([jacobian, late * jacobian])
             gradient += factor * both @ (weight * residual)
             hessian += factor * (both * weight) @ both.T
-        gradient += prior * step
-        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.summed)
-        return gradient, hessian + jnp.diag(prior)
-
-    def newton(_: Any, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        motion, step, _ = state
-        gradient, hessian = normal_equations(motion, step[6:], step)
-        move = -jnp.linalg.solve(hessian, gradient)
-        return exp(move[:6]) @ motion, step + move, hessian
-
-    start = problem.origin, jnp.zeros(12), jnp.eye(12)
-    motion, step, hessian = jax.lax.fori_loop(0, ROUNDS, newton, start)
-    before, _ = objective.error(problem.origin)
-    error, _ = problem.with_sway(step[6:]).objective.error(motion)
-    better = (error < before * (1.0 + LARGEST_RISE)) & jnp.all(jnp.isfinite(step)) & ~problem.is_out_of_reach(motion)
+        step = -jnp.linalg.solve(hessian, gradient)
+        motion, x = exp(step[:6]) @ motion, x + step
+        objective = problem.with_sway(x[6:]).objective
+        r = jax.lax.optimization_barrier(objective.residuals(motion))
+    error, _ = objective.error_of(r)
+    before, _ = problem.objective.error_of(residuals)
+    better = (error < before * (1.0 + LARGEST_RISE)) & jnp.all(jnp.isfinite(x)) & ~problem.is_out_of_reach(motion)
     better &= readout != 0.0
     to_reference = adjoint(rigid_inverse(motion))
     added = FRAMES * to_reference @ _from_sway(hessian) @ to_reference.T
-    return Swayed(
-        *jax.lax.optimization_barrier(
-            (
-                jnp.where(better, motion, problem.origin),
-                jnp.where(better, step[6:], 0.0),
-                jnp.where(better & jnp.all(jnp.isfinite(added)), added, 0.0),
-            )
-        )
-    )
+    found = Swayed(motion, x[6:], jnp.where(jnp.all(jnp.isfinite(added)), added, 0.0), r)
+    return jax.lax.cond(better, lambda: found, lambda: unswayed_from(problem.origin, residuals))
 
 
 def _from_sway(hessian: Float[Array, "12 12"]) -> Float[Array, "6 6"]:
