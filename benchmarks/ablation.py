@@ -63,6 +63,7 @@ VARIANTS: dict[str, tuple[str, Callable[[Settings], Settings]]] = {
     "brightness": ("no brightness model", _alignment(brightness=False)),
     "synchronise": ("depth as it was read", _odometry(synchronise=False)),
     "shutter": ("all rows exposed at once", _odometry(rolling_shutter=False)),
+    "sway": ("each frame's velocity the mean since the last", _odometry(sway=False)),
     "keyframe": ("previous frame only", _odometry(reference="previous")),
     "prior": ("no constant velocity", _odometry(prior=False)),
     "recover": ("no second try", _odometry(recover=False)),
