@@ -4,6 +4,7 @@ import importlib
 import itertools
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.odometry.metrics import DRIFT
 from gavo_jax.se3 import log
+from gavo_jax.settings import AlignmentOptions
 from gavo_jax.trajectory import inverse
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -421,3 +423,14 @@ def test_table_1_is_made_of_the_experiment_and_recorded(
     with pytest.raises(SystemExit):
         sys.modules["common"].command(sys.modules["table1"].main)
     assert "--record: name the file" in capsys.readouterr().err
+
+
+def test_sway_compares_velocities(load, tmp_path: Path) -> None:
+    sway: ModuleType = load("sway")
+    walk = Rendered(8, rate=5.0, speed=0.4, camera=replace(CAMERA, readout=0.1))
+    sway.common.open_clip = lambda _: walk
+    sway.common.preset_of = lambda _: replace(NEWTON, alignment=AlignmentOptions(depth=False))
+    sway.main(clips=CLIP, json=tmp_path / "sway.json")
+    [rows] = read(tmp_path / "sway.json")["clips"].values()
+    assert [row["velocity"] for row in rows] == list(sway.VELOCITIES)
+    assert all(0 < row["pair_m"] <= row["worst_m"] < 0.05 for row in rows) and rows[0]["pair_m"] != rows[1]["pair_m"]

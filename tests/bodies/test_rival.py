@@ -186,6 +186,23 @@ def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(
     assert taken.result.target_T_reference[0, 3] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(("deviation", "usable"), [(1e-3, True), (0.02, False)])
+def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation: float, usable: bool) -> None:
+    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    aligner = WithRival(Scripted(aware, (True, 0.0, 1e-3), (False, 0.0, 1.0)))  # pyright: ignore[reportArgumentType]
+    object.__setattr__(aligner, "second", Scripted(aware, (True, 0.01, 1e-3), (True, 0.02, deviation)))
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    both = aligner.align(aligner.start(frame), frame, clock)
+    assert both.usable and both.state.rival.is_there and both.result.status == AlignmentStatus.OK
+    ended = aligner.align(both.state, frame, clock)
+    assert ended.usable == usable and ended.state.rival.is_there != usable
+    if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be
+        assert ended.result.target_T_reference[0, 3] == pytest.approx(0.03, abs=1e-6)
+        assert AlignmentStatus.MOVING_BODY in ended.result.statuses
+
+
 def result_of(covariance: np.ndarray) -> Alignment:
     found = exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
     result = no_alignment(AlignmentStatus.LOW_TEXTURE)._replace(findings=bit(AlignmentStatus.LOW_TEXTURE))
