@@ -16,6 +16,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import summary
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import (
@@ -90,6 +91,7 @@ def compare(options: Compare) -> int:
             say(f"the earlier comparison in {folder} is replaced")
         remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
         remove_figures(folder)
+        say(summary(sequence))
         entries, status = _run_methods(options, methods, sequence, peers, folder)
         _write(options, sequence, entries, folder)
     say(f"files in {folder}")

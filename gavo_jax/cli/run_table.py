@@ -1,5 +1,7 @@
 """What `gavo run` prints in the end: its figures, and in words why one that people look for is missing."""
 
+import csv
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from gavo_jax.odometry.metrics import (
     MILLISECONDS,
     ROTATION_DRIFT,
 )
-from gavo_jax.output.files import TRAJECTORY
+from gavo_jax.output.files import BODIES, TRAJECTORY
 from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.trajectory import Trajectory
 
@@ -68,10 +70,29 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
         rows += [("loops that count", str(metrics["loops"]), ""), ("loops refused", str(metrics["loops_refused"]), "")]
     if metrics.get("unknown_motions"):
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
+    rows += _of_bodies(folder / BODIES)
     print_table(name, ("", "", "unit"), rows)
     if reason := why_no_drift(metrics, trajectory, has_truth):
         say(reason if known else f"{reason} The table has what the trajectory itself tells.")
     say(f"files in {folder}")
+
+
+def _of_bodies(path: Path) -> list[Row]:
+    """What bodies.csv tells, where anything was seen to move."""
+    covered: dict[str, float] = defaultdict(float)
+    bodies: set[str] = set()
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                covered[row["timestamp"]] += float(row["share"])
+                bodies.add(row["body"])
+    if not bodies:
+        return []
+    return [
+        ("bodies that moved", str(len(bodies)), ""),
+        ("frames that show one", str(len(covered)), ""),
+        ("largest share of an image", number(100 * max(covered.values()), 0), "%"),
+    ]
 
 
 def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:

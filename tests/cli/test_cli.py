@@ -382,7 +382,7 @@ def test_compare(gavo, pristine, tmp_path):
     assert "gauss-newton" in done.out and "opencv-rgb" in done.out
     lines = done.out.splitlines()
     assert max(len(line) for line in lines if line.startswith(("┃", "│"))) <= 80 and "decoding included" in lines[-2]
-    assert "the earlier comparison in" in lines[0]
+    assert "the earlier comparison in" in lines[0] and "34 frames" in lines[1] and "camera fx" in lines[1]
     table = read_json(tmp_path / "out" / "comparison.json")
     assert [row["method"] for row in table] == ["gauss-newton", "opencv-rgb"]
     assert all(set(METRICS) <= set(row) and row["frames"] == 34 for row in table)

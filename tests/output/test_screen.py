@@ -1,8 +1,14 @@
 """Tables on the screen."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from gavo_jax.cli.run_table import print_run
+from gavo_jax.output.bodies import BODY_COLUMNS
 from gavo_jax.output.screen import known_columns, number, print_table
+from gavo_jax.trajectory import Trajectory
 
 
 def boxes(printed: str) -> list[list[list[str]]]:
@@ -39,3 +45,26 @@ def test_a_column_of_dashes_alone_is_left_out() -> None:
     rows = [["ga", number(None), number(1.0)], ["pso", number(None), number(None)]]
     assert known_columns(("method", "m/s", "ms"), rows) == (["method", "ms"], [["ga", "1.0000"], ["pso", "–"]])
     assert known_columns(("method", "m/s"), []) == (["method", "m/s"], [])
+
+
+@pytest.mark.parametrize("shares", [[], ["0.25", "0.125", "0.125"]])
+def test_a_run_tells_of_the_bodies_it_saw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], shares: list[str]
+) -> None:
+    """Those of one frame together, and of none nothing."""
+    Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))).write_tum(tmp_path / "trajectory.txt")
+    stamps, numbers = ("0.0", "0.5", "0.5"), ("1", "1", "2")
+    rows = [(stamp, number, share) for stamp, number, share in zip(stamps, numbers, shares, strict=False)]
+    lines = [",".join([*row, *["0"] * 9, "seen"]) for row in rows]
+    (tmp_path / "bodies.csv").write_text("\n".join([",".join(BODY_COLUMNS), *lines]) + "\n")
+    print_run("run", {}, tmp_path, has_truth=False)
+    [table] = boxes(capsys.readouterr().out)
+    told = {row[0]: row[1] for row in table}
+    if shares:
+        assert (told["bodies that moved"], told["frames that show one"], told["largest share of an image"]) == (
+            "2",
+            "2",
+            "25",
+        )
+    else:
+        assert "bodies that moved" not in told
