@@ -18,13 +18,18 @@ from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import adjoint, exp, rigid_inverse
 
-USUAL = (0.05, 0.5)
-"""m/s and rad/s: standard deviations of a hand-held camera's sway,"""
-USUAL_SUM = (0.1, 0.3)
-"""and of the sum over the last frames' sways: they follow the mean velocity, so that they make up for each other. What
-does not is an error of the model (depth, lens), which would add up to drift."""
+SHARE = 1.5
+"""Standard deviation of a sway, over that of the mean velocity's changes from pair to pair. By the truth of the TUM clips
+it is 0.6 to 0.7, at 30 and at 7.5 frames a second; some frames have much more."""
+SUMMED = 1.0
+"""The same of the sum over the last frames' sways, over that of one: they follow the mean velocity, so that they make up
+for each other. What does not is an error of the model (depth, lens), which would add up to drift."""
 FORGETTING = 0.97
 """Factor on that sum from frame to frame."""
+FIRST_CHANGES, LEAST_CHANGES = (0.03, 0.3), (0.002, 0.01)
+"""m/s and rad/s: changes of the mean velocity before any is known, and at least."""
+REMEMBERED = 15.0
+"""Pairs that tell how much it changes, about."""
 UNSWAYED = (0.03, 0.03)
 """Metres and radians: standard deviations of a motion that was found with the mean velocity."""
 DEPENDENT = 10.0
@@ -43,8 +48,32 @@ class Swaying(NamedTuple):
 
     elapsed: Float[Array, ""]
     """Seconds since the last frame."""
+    unrest: "Unrest"
+
+
+class Unrest(NamedTuple):
+    """How a run's velocity changes from frame to frame."""
+
     summed: Float[Array, " 6"]
-    """Sum of the last frames' sways, m/s and rad/s; see `after`."""
+    """Sum of the last frames' sways, m/s and rad/s."""
+    changes: Float[Array, " 2"]
+    """Mean square of the mean velocity's change from pair to pair, of one axis: (m/s)² and (rad/s)²."""
+
+    @classmethod
+    def unknown(cls) -> "Unrest":
+        """Before the first pair."""
+        return cls(jnp.zeros(6), jnp.square(jnp.array(FIRST_CHANGES)))
+
+    def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"] | float) -> "Unrest":
+        """With one more pair: its sway and its mean velocity's change, m/s and rad/s."""
+        squares = jnp.mean(jnp.square(jnp.broadcast_to(change, 6)).reshape(2, 3), axis=1)
+        return Unrest(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
+
+    @property
+    def deviation(self) -> Float[Array, " 6"]:
+        """Standard deviation of a sway, m/s and rad/s."""
+        least = jnp.square(jnp.array(LEAST_CHANGES))
+        return jnp.repeat(SHARE * jnp.sqrt(jnp.maximum(self.changes, least)), 3)
 
 
 class Swayed(NamedTuple):
@@ -64,11 +93,6 @@ def unswayed_from(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
     return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
 
 
-def after(swaying: Swaying, twist: Float[Array, " 6"]) -> Float[Array, " 6"]:
-    """The sum with one more frame's sway."""
-    return FORGETTING * (swaying.summed + twist / swaying.elapsed)
-
-
 def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> Swayed:
     """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
     best; the origin without sway where E would rise.
@@ -78,9 +102,9 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     """
     objective = problem.objective
     readout = jnp.float32(0.0) if objective.readout is None else objective.readout
-    usual, usual_sum, unswayed = (jnp.repeat(jnp.array(pair), 3) ** -2.0 for pair in (USUAL, USUAL_SUM, UNSWAYED))
-    usual, usual_sum = usual / swaying.elapsed**2, usual_sum / swaying.elapsed**2
-    prior = jnp.concatenate([unswayed, usual + usual_sum])
+    usual = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
+    usual_sum = usual / SUMMED**2
+    prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, usual + usual_sum])
     share = objective.readings() / objective.reference.points.q.size
     factor = share**2 / (objective.scales.grey**2 * DEPENDENT)
 
@@ -88,7 +112,7 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     for _ in range(ROUNDS):
         late = (readout * row_time(r.warped.v, objective.plane)).reshape(-1)
         gradient, hessian = prior * x, jnp.diag(prior)
-        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.summed)
+        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.unrest.summed)
         for jacobian, residual, weight in weighted_terms(objective, objective.reference, r):
             both = jnp.concatenate([jacobian, late * jacobian])
             gradient += factor * both @ (weight * residual)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.sway import Unrest
 from gavo_jax.bodies.belief import Belief
 from gavo_jax.bodies.evidence import inverse_depth_of
 from gavo_jax.bodies.identity import Roll, identify
@@ -71,7 +72,7 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
         previous=whole,
         keyframe=whole,
         motion=jnp.asarray(before.motions[place], jnp.float32),
-        swayed=jnp.zeros(6),
+        unrest=Unrest.unknown(),
         seconds=jnp.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.search import Population, align_views
-from gavo_jax.alignment.sway import Swaying, after
+from gavo_jax.alignment.sway import Swaying, Unrest
 from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
@@ -66,8 +66,8 @@ class TrackerState(NamedTuple):
     """Twist of the last motion, from the frame before the previous one to the previous one."""
     passing: Float[Array, " 6"]
     """What that twist would be, had the camera moved as it did at the previous frame's own moment."""
-    swayed: Float[Array, " 6"]
-    """Sum of the last frames' sways; see `sway.Swaying`."""
+    unrest: Unrest
+    """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
     """Time that motion took."""
     exposure: Exposure
@@ -169,7 +169,7 @@ def track_frame(
     if alignment.symmetric:
         exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
     key = jax.random.fold_in(key, clock.frame)
-    swaying = Swaying(clock.elapsed, state.swayed) if options.sway else None
+    swaying = Swaying(clock.elapsed, state.unrest) if options.sway else None
     result, populations = align_views(
         views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout, swaying=swaying
     )
@@ -189,8 +189,11 @@ def track_frame(
     usual = jax.tree.map(
         lambda new, old: jnp.where(is_first, old, new), state.usual.after(result, exposure.spread), state.usual
     )
-    swayed = after(Swaying(clock.elapsed, state.swayed), sway)
-    after_it = TrackerState(newest, keyframe, packed, motion, passing, swayed, clock.elapsed, exposure, usual)
+    change = motion / clock.elapsed - state.motion / state.seconds
+    was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
+    unrest = state.unrest.after(sway / clock.elapsed, jnp.where(was_second, 0.0, change))
+    unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
+    after_it = TrackerState(newest, keyframe, packed, motion, passing, unrest, clock.elapsed, exposure, usual)
     return after_it, result, populations
 
 
@@ -206,7 +209,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         previous_image=packed,
         motion=jnp.zeros(6),
         passing=jnp.zeros(6),
-        swayed=jnp.zeros(6),
+        unrest=Unrest.unknown(),
         seconds=jnp.float32(1.0),
         exposure=Exposure.of(pyramid),
         usual=Usual.unknown(),
@@ -226,7 +229,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         previous_image=Target(words, words),
         motion=jnp.zeros(6),
         passing=jnp.zeros(6),
-        swayed=jnp.zeros(6),
+        unrest=Unrest.unknown(),
         seconds=jnp.float32(1.0),
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),
