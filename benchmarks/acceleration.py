@@ -1,6 +1,8 @@
-"""How fast the cameras of real clips change their motion, by the ground truth: what `odometry.plausibility` allows for.
+"""How fast the cameras of real clips change their motion, by the ground truth.
 
-Prints one row per clip and interval: largest speed and largest change of speed a second, of translation and rotation.
+Prints one row per clip and interval: largest speed and largest change of speed a second, of translation and rotation,
+which `odometry.plausibility` allows for. Then how much the mean velocity changes from interval to interval, and how far
+the velocity at an interval's end is from its mean (RMS of an axis): what `alignment.sway` expects.
 
     python benchmarks/acceleration.py
 """
@@ -15,10 +17,31 @@ import numpy as np
 
 from gavo_jax import se3
 from gavo_jax.errors import GavoError
-from gavo_jax.trajectory import inverse
+from gavo_jax.trajectory import Trajectory, inverse
 
 INTERVALS = (1 / 30, 2 / 30, 4 / 30)
 """Seconds from frame to frame."""
+MOMENT = 0.016
+"""Seconds over which a velocity is taken for that of a moment: motion capture comes every 10 ms."""
+PARTS = (slice(3), slice(3, 6))
+"""Of a twist: translation, rotation."""
+
+
+def velocities(truth: Trajectory, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Mean twists of the points in the camera between moments [n], m/s and rad/s; not-a-number where unknown."""
+    (first, known_first), (last, known_last) = truth.interpolate(begin), truth.interpolate(end)
+    twists = np.asarray(jax.vmap(se3.log)(jnp.asarray(inverse(last) @ first)), float) / (end - begin)[:, None]
+    return np.where((known_first & known_last)[:, None], twists, np.nan)
+
+
+def largest(twists: np.ndarray) -> list[float]:
+    """Of the translations' lengths and of the rotations'."""
+    return [float(np.nanmax(np.linalg.norm(twists[:, part], axis=1))) for part in PARTS]
+
+
+def typical(twists: np.ndarray) -> list[float]:
+    """RMS of an axis, of the translations and of the rotations."""
+    return [float(np.sqrt(np.nanmean(np.square(twists[:, part])))) for part in PARTS]
 
 
 def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
@@ -28,23 +51,28 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
         clips: names with commas between.
         json: file for the figures.
     """
-    rows = []
+    rows, sways = [], []
     for clip in common.names(clips):
         truth = common.open_clip(clip).ground_truth
         if truth is None:
             raise GavoError(f"{clip}: no ground truth")
         for interval in INTERVALS:
-            poses, valid = truth.interpolate(np.arange(truth.timestamps[0], truth.timestamps[-1], interval))
-            poses = poses[valid]
-            twists = np.asarray(jax.vmap(se3.log)(jnp.asarray(inverse(poses[1:]) @ poses[:-1])), float) / interval
-            changes = np.diff(twists, axis=0) / interval
-            speeds = [float(np.linalg.norm(twists[:, part], axis=1).max()) for part in (slice(3), slice(3, 6))]
-            largest = [float(np.linalg.norm(changes[:, part], axis=1).max()) for part in (slice(3), slice(3, 6))]
-            rows.append((clip, interval, *speeds, *largest))
+            moments = np.arange(truth.timestamps[0], truth.timestamps[-1], interval)
+            mean = velocities(truth, moments[:-1], moments[1:])
+            changes = np.diff(mean, axis=0)
+            rows.append((clip, interval, *largest(mean), *largest(changes / interval)))
+            own = velocities(truth, moments[1:] - MOMENT / 2, moments[1:] + MOMENT / 2)
+            sways.append((clip, interval, *typical(changes), *typical(own - mean)))
     columns = ("clip", "interval, s", "m/s", "rad/s", "m/s²", "rad/s²")
     cells = [[row[0], f"{row[1]:.3f}", *(f"{value:.2f}" for value in row[2:])] for row in rows]
     common.print_table("largest speeds and accelerations", columns, cells)
-    results = {"rows": [dict(zip(columns, row, strict=True)) for row in rows]}
+    of_sways = ("clip", "interval, s", "change, m/s", "change, rad/s", "sway, m/s", "sway, rad/s")
+    cells = [[row[0], *(f"{value:.3f}" for value in row[1:])] for row in sways]
+    common.print_table("changes of the mean velocity, and how far that of a moment is from it", of_sways, cells)
+    results = {
+        "rows": [dict(zip(columns, row, strict=True)) for row in rows],
+        "sways": [dict(zip(of_sways, row, strict=True)) for row in sways],
+    }
     common.record(json, "acceleration", results)
     return results
 

@@ -317,8 +317,10 @@ def test_accelerations_are_those_of_the_path(load, tmp_path: Path) -> None:
     acceleration: ModuleType = load("acceleration")
     acceleration.common.open_clip = lambda _: SyntheticSequence(20)
     acceleration.main(clips=CLIP, json=tmp_path / "a.json")
-    rows = read(tmp_path / "a.json")["rows"]
-    assert len(rows) == 3 and all(0 < row["m/s"] < 5 and 0 < row["m/s²"] < 15 for row in rows)
+    figures = read(tmp_path / "a.json")
+    assert len(figures["rows"]) == 3 and all(0 < row["m/s"] < 5 and 0 < row["m/s²"] < 15 for row in figures["rows"])
+    for row in figures["sways"]:  # on a smooth path half of what the mean velocity changes by
+        assert 0.4 < row["sway, rad/s"] / row["change, rad/s"] < 0.6
 
 
 def test_moving_bodies_are_scored(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

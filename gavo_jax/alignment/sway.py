@@ -19,11 +19,11 @@ from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import adjoint, exp, rigid_inverse
 
 SHARE = 1.5
-"""Standard deviation of a sway, over that of the mean velocity's changes from pair to pair. By the truth of the TUM clips
-it is 0.6 to 0.7, at 30 and at 7.5 frames a second; some frames have much more."""
+"""Standard deviation of a sway, over that of the mean velocity's changes from pair to pair. By the truth of the TUM
+clips it is 0.5 to 0.9, whatever the rate (`benchmarks/acceleration.py`); single frames have much more."""
 SUMMED = 1.0
-"""The same of the sum over the last frames' sways, over that of one: they follow the mean velocity, so that they make up
-for each other. What does not is an error of the model (depth, lens), which would add up to drift."""
+"""The same of the sum over the last frames' sways, over that of one: the mean velocity follows them, so that they make
+up for each other. What does not is an error of the model (depth, lens), which would add up to drift."""
 FORGETTING = 0.97
 """Factor on that sum from frame to frame."""
 FIRST_CHANGES, LEAST_CHANGES = (0.03, 0.3), (0.002, 0.01)
