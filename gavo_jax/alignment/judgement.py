@@ -12,7 +12,7 @@ from gavo_jax.alignment.evidence import Held, is_held
 from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
-from gavo_jax.alignment.sway import Swaying, refine_swaying, unswayed_from
+from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying
 from gavo_jax.alignment.visits import Level, Search
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
@@ -64,22 +64,17 @@ def conclude(
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     reach = jnp.stack([search.box[0], search.box[3]])
     problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
-    swayed = unswayed_from(found, residuals)
+    added = jnp.zeros((6, 6))
     if options.last_step and not options.symmetric:
-        if swaying is not None and objective.readout is not None:
-            swayed = refine_swaying(problem, residuals, swaying)
-            objective = problem.with_sway(swayed.twist).objective
-        else:
-            refined = _refine(problem, residuals)
-            swayed = unswayed_from(refined, objective.residuals(refined))
-        problem = replace(problem, origin=swayed.motion, objective=objective)
-    motion, residuals = problem.origin, swayed.residuals
+        problem, residuals, added = _last_step(problem, residuals, swaying)
+        objective = problem.objective
+    motion = problem.origin
     evidence = _examine(problem, residuals)
     held, chosen_by = None, None
     if judge is not None:
         held = is_held(judge, motion, evidence.information.directions)
         chosen_by = evidence_for(judge, motion)
-    covariance = _covariance(evidence, objective, held) + swayed.covariance
+    covariance = _covariance(evidence, objective, held) + added
     if held is not None:
         determined = evidence.information.determined | held.held
         evidence = evidence._replace(information=evidence.information._replace(determined=determined))
@@ -96,8 +91,27 @@ def conclude(
         findings,
         evidence.explained,
         jnp.asarray(objective.scales.depth, jnp.float32),
-        swayed.twist,
+        jnp.zeros(6) if objective.sway is None else objective.sway,
     )
+
+
+def _last_step(
+    problem: Problem, residuals: Residuals, swaying: Swaying | None
+) -> tuple[Problem, Residuals, Float[Array, "6 6"]]:
+    """The problem about a refined motion, under a rolling shutter with the target's sway; its residuals; and what not
+    knowing the sway adds to the covariance.
+    """
+
+    def without_sway() -> Swayed:
+        refined = _refine(problem, residuals)
+        return Swayed(refined, jnp.zeros(6), jnp.zeros((6, 6)), problem.objective.residuals(refined))
+
+    if swaying is None or problem.objective.readout is None:
+        found = without_sway()
+        return replace(problem, origin=found.motion), found.residuals, found.covariance
+    rolls = problem.objective.readout != 0.0
+    found = jax.lax.cond(rolls, lambda: refine_swaying(problem, residuals, swaying), without_sway)
+    return replace(problem.with_sway(found.twist), origin=found.motion), found.residuals, found.covariance
 
 
 def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:

@@ -88,11 +88,6 @@ class Swayed(NamedTuple):
     residuals: Residuals
 
 
-def unswayed_from(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
-    """A motion without sway."""
-    return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
-
-
 def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> Swayed:
     """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
     best; the origin without sway where E would rise.
@@ -124,11 +119,11 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     error, _ = objective.error_of(r)
     before, _ = problem.objective.error_of(residuals)
     better = (error < before * (1.0 + LARGEST_RISE)) & jnp.all(jnp.isfinite(x)) & ~problem.is_out_of_reach(motion)
-    better &= readout != 0.0
     to_reference = adjoint(rigid_inverse(motion))
     added = FRAMES * to_reference @ _from_sway(hessian) @ to_reference.T
     found = Swayed(motion, x[6:], jnp.where(jnp.all(jnp.isfinite(added)), added, 0.0), r)
-    return jax.lax.cond(better, lambda: found, lambda: unswayed_from(problem.origin, residuals))
+    still = Swayed(problem.origin, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
+    return jax.lax.cond(better, lambda: found, lambda: still)
 
 
 def _from_sway(hessian: Float[Array, "12 12"]) -> Float[Array, "6 6"]:

@@ -56,10 +56,14 @@ def test_a_tremor_is_told_from_a_step_to_the_side(axis: int) -> None:
     assert not any(np.any(step.alignment.sway) for step in without.steps)
 
 
-def test_without_a_readout_there_is_no_sway() -> None:
-    camera = replace(CAMERA, readout=0.0)
-    run = run_odometry(Rendered(4, camera=camera, noise=NONE), SEARCH)
-    assert not any(np.any(step.alignment.sway) for step in run.steps)
+def test_without_a_readout_nothing_changes() -> None:
+    """Not a bit: the last step is the one that there is without sway."""
+    sequence = Rendered(4, camera=replace(CAMERA, readout=0.0), noise=NONE)
+    with_sway, without = (
+        run_odometry(sequence, replace(SEARCH, odometry=replace(SEARCH.odometry, sway=sway))) for sway in (True, False)
+    )
+    assert np.array_equal(with_sway.trajectory.world_T_camera, without.trajectory.world_T_camera)
+    assert not any(np.any(step.alignment.sway) for step in with_sway.steps)
 
 
 def test_a_sway_moves_each_row_by_its_time() -> None:
