@@ -1,10 +1,10 @@
 """What the photometric error says of a camera's rolling shutter: E over the time from the first row to the last.
 
-Runs Gauss-Newton frame to frame with each readout time, at the mean velocity since the last frame: a frame's own would
-make up for a wrong readout. Prints, for each clip, a row a readout: E relative to that of a shutter that exposes all rows
-at once (geometric mean over the pairs; below 1, the images agree better) and, where the clip has ground truth, the drift.
-E needs no ground truth: the readout where it is least is the camera's, as far as the clip can tell. A camera that moves
-slowly, or a series of blurred images, tells little.
+Runs Gauss-Newton frame to frame with each readout time, at the mean velocity since the last frame: a frame's own
+would make up for a wrong readout. Prints, for each clip, a row a readout: E relative to that of a shutter that
+exposes all rows at once (geometric mean over the pairs; below 1, the images agree better) and, where the clip has
+ground truth, the drift. E needs no ground truth: the readout where it is least is the camera's, as far as the clip
+can tell. A camera that moves slowly, or a series of blurred images, tells little.
 
     python benchmarks/shutter.py
     python benchmarks/shutter.py --clips FOLDER --readouts 0,10,20,30 --json shutter.json
