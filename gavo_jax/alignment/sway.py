@@ -43,14 +43,6 @@ LARGEST_RISE = 0.003
 """Share by which E may rise; beyond, there is no sway and the motion stays."""
 
 
-class Swaying(NamedTuple):
-    """What is known of the sway before a frame is looked at."""
-
-    elapsed: Float[Array, ""]
-    """Seconds since the last frame."""
-    unrest: "Unrest"
-
-
 class Unrest(NamedTuple):
     """How a run's velocity changes from frame to frame."""
 
@@ -64,9 +56,9 @@ class Unrest(NamedTuple):
         """Before the first pair."""
         return cls(jnp.zeros(6), jnp.square(jnp.array(FIRST_CHANGES)))
 
-    def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"] | float) -> "Unrest":
+    def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "Unrest":
         """With one more pair: its sway and its mean velocity's change, m/s and rad/s."""
-        squares = jnp.mean(jnp.square(jnp.broadcast_to(change, 6)).reshape(2, 3), axis=1)
+        squares = jnp.mean(jnp.square(change.reshape(2, 3)), axis=1)
         return Unrest(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
 
     @property
@@ -74,6 +66,14 @@ class Unrest(NamedTuple):
         """Standard deviation of a sway, m/s and rad/s."""
         least = jnp.square(jnp.array(LEAST_CHANGES))
         return jnp.repeat(SHARE * jnp.sqrt(jnp.maximum(self.changes, least)), 3)
+
+
+class Swaying(NamedTuple):
+    """What is known of the sway before a frame is looked at."""
+
+    elapsed: Float[Array, ""]
+    """Seconds since the last frame."""
+    unrest: Unrest
 
 
 class Swayed(NamedTuple):

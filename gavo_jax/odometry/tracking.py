@@ -191,7 +191,7 @@ def track_frame(
     )
     change = motion / clock.elapsed - state.motion / state.seconds
     was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
-    unrest = state.unrest.after(sway / clock.elapsed, jnp.where(was_second, 0.0, change))
+    unrest = state.unrest.after(sway / clock.elapsed, change)
     unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
     after_it = TrackerState(newest, keyframe, packed, motion, passing, unrest, clock.elapsed, exposure, usual)
     return after_it, result, populations
