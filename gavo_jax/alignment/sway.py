@@ -21,11 +21,10 @@ from gavo_jax.se3 import adjoint, exp, rigid_inverse
 SHARE = 1.5
 """Standard deviation of a sway, over that of the mean velocity's changes from pair to pair. By the truth of the TUM
 clips it is 0.5 to 0.9, whatever the rate (`benchmarks/acceleration.py`); single frames have much more."""
-SUMMED = 1.0
-"""The same of the sum over the last frames' sways, over that of one: the mean velocity follows them, so that they make
-up for each other. What does not is an error of the model (depth, lens), which would add up to drift."""
 FORGETTING = 0.97
-"""Factor on that sum from frame to frame."""
+"""Factor from frame to frame on the sum of the sways, which is expected to be no larger than one of them: the mean
+velocity follows them, so that they make up for each other. What does not is an error of the model (depth, lens), which
+would add up to drift."""
 FIRST_CHANGES, LEAST_CHANGES = (0.03, 0.3), (0.002, 0.01)
 """m/s and rad/s: changes of the mean velocity before any is known, and at least."""
 REMEMBERED = 15.0
@@ -88,6 +87,16 @@ class Swayed(NamedTuple):
     residuals: Residuals
 
 
+class At(NamedTuple):
+    """How far the refinement has come."""
+
+    motion: Float[Array, "4 4"]
+    x: Float[Array, " 12"]
+    """Twists of the motion's change and of the sway."""
+    residuals: Residuals
+    hessian: Float[Array, "12 12"]
+
+
 def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> Swayed:
     """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
     best; the origin without sway where E would rise.
@@ -95,27 +104,29 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from what is known of both beforehand. A twist of the
     target's own moves a point in row v as a step on the target's side would, times the row's time.
     """
-    objective = problem.objective
-    readout = jnp.float32(0.0) if objective.readout is None else objective.readout
-    usual = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
-    usual_sum = usual / SUMMED**2
-    prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, usual + usual_sum])
-    share = objective.readings() / objective.reference.points.q.size
-    factor = share**2 / (objective.scales.grey**2 * DEPENDENT)
+    readout = jnp.float32(0.0) if problem.objective.readout is None else problem.objective.readout
+    known = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
+    prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # of the sway, and of the sum
+    share = problem.objective.readings() / problem.objective.reference.points.q.size
+    factor = share**2 / (problem.objective.scales.grey**2 * DEPENDENT)
 
-    motion, x, r, hessian = problem.origin, jnp.zeros(12), residuals, jnp.diag(prior)
-    for _ in range(ROUNDS):
-        late = (readout * row_time(r.warped.v, objective.plane)).reshape(-1)
-        gradient, hessian = prior * x, jnp.diag(prior)
-        gradient = gradient.at[6:].add(usual_sum * swaying.elapsed * swaying.unrest.summed)
-        for jacobian, residual, weight in weighted_terms(objective, objective.reference, r):
+    def step_on(_: int, at: At) -> At:
+        objective = problem.with_sway(at.x[6:]).objective
+        late = (readout * row_time(at.residuals.warped.v, objective.plane)).reshape(-1)
+        gradient, hessian = prior * at.x, jnp.diag(prior)
+        gradient = gradient.at[6:].add(known * swaying.elapsed * swaying.unrest.summed)
+        for jacobian, residual, weight in weighted_terms(objective, objective.reference, at.residuals):
             both = jnp.concatenate([jacobian, late * jacobian])
             gradient += factor * both @ (weight * residual)
             hessian += factor * (both * weight) @ both.T
         step = -jnp.linalg.solve(hessian, gradient)
-        motion, x = exp(step[:6]) @ motion, x + step
-        objective = problem.with_sway(x[6:]).objective
-        r = jax.lax.optimization_barrier(objective.residuals(motion))
+        motion, x = exp(step[:6]) @ at.motion, at.x + step
+        return At(motion, x, problem.with_sway(x[6:]).objective.residuals(motion), hessian)
+
+    start = At(problem.origin, jnp.zeros(12), residuals, jnp.diag(prior))
+    # a loop, as steps written out one by one take XLA a second longer
+    motion, x, r, hessian = jax.lax.fori_loop(0, ROUNDS, step_on, start)
+    objective = problem.with_sway(x[6:]).objective
     error, _ = objective.error_of(r)
     before, _ = problem.objective.error_of(residuals)
     better = (error < before * (1.0 + LARGEST_RISE)) & jnp.all(jnp.isfinite(x)) & ~problem.is_out_of_reach(motion)

@@ -25,7 +25,10 @@ from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
 OLD = 7
-"""Frames after which an older view takes the place of the one before."""
+"""Frames after which an older view takes the place of the one before,"""
+FAR_OFF = 0.8
+"""or part of the image that it sees, below which it does at once: over a long way, errors of the poses and other light
+look like bodies."""
 
 
 class Scene(NamedTuple):
@@ -143,7 +146,8 @@ class Retina:
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
-        age = (int(scene.age) + 1) % OLD
+        is_far_off = float(look.belief.in_view[1]) < FAR_OFF
+        age = OLD - 1 if is_far_off else (int(scene.age) + 1) % OLD
         return scene._replace(
             known=look.belief.known,
             views=look.views,

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,11 +23,13 @@ from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import Attempt, blank_of
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
+from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -264,6 +267,27 @@ def test_no_frame_after_the_warm_up_waits_for_a_program() -> None:
     assert set(program_cache._loaded) == before
 
 
+@pytest.mark.parametrize(("in_view", "goes"), [(0.5, True), (0.95, False)])
+def test_an_older_view_that_sees_little_of_the_image_goes_at_once(in_view: float, goes: bool) -> None:
+    odometry = Odometry(CAMERA, TRACKED)
+    odometry.register(Carded()[0], 0.0)
+    state, retina = odometry.progress.tracker.first, Retina(CAMERA, TRACKED)
+    look = retina.look(state.scene, state.tracker, np.eye(4))
+    belief = look.belief._replace(in_view=jnp.array([1.0, in_view]))
+    scene = retina.renewed(state.scene, look._replace(belief=belief))
+    older, between = scene.views_T_last[1], jnp.eye(4).at[0, 3].set(0.1)
+    scene = scene._replace(views_T_last=scene.views_T_last.at[2].set(between))
+    after = retina.renewed(scene, retina.look(scene, state.tracker, np.eye(4)))
+    np.testing.assert_allclose(after.views_T_last[1], between if goes else older, atol=1e-6)
+
+
+def test_a_camera_that_moves_fast_finds_no_bodies_where_nothing_moves(data_dir: Path) -> None:
+    clip = TumSequence(data_dir / "fr1_desk_loop")
+    odometry = Odometry(clip.camera, preset("ga", "fast"))
+    steps = [odometry.register(frame, frame.timestamp) for frame in (clip[index] for index in range(55, 90))]
+    assert sum(bool(step.bodies) for step in steps if step is not None) <= 3
+
+
 def test_a_state_keeps_its_shape() -> None:
     odometry = Odometry(CAMERA, TRACKED)
     odometry.register(Carded()[0], 0.0)
@@ -278,7 +302,8 @@ def test_a_state_keeps_its_shape() -> None:
 def test_depth_that_disagrees_where_no_body_is_has_no_excuse(explained: float, status: AlignmentStatus) -> None:
     image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1.0)
     some = jnp.float32(0.2)
-    belief = Belief(2 * covered - 1, 2 * covered - 1, jnp.float32(0.8), some, covered > 0, some, image, image)
+    shares = jnp.float32(0.8), some, covered > 0, some
+    belief = Belief(2 * covered - 1, 2 * covered - 1, *shares, image, image, jnp.ones(2))
     result = no_alignment(AlignmentStatus.DEPTH_MISMATCH)
     result = result._replace(explained=result.explained._replace(depth=np.float32(explained)))
     best = Candidate(Attempt(None, result, usable=False), belief)
