@@ -146,7 +146,7 @@ class Retina:
 
     def renewed(self, scene: Scene, look: Look) -> Scene:
         """The scene with the new frame as its last one."""
-        is_far_off = float(look.belief.in_view[1]) < FAR_OFF
+        is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
         age = OLD - 1 if is_far_off else (int(scene.age) + 1) % OLD
         return scene._replace(
             known=look.belief.known,
