@@ -58,7 +58,7 @@ class Belief(NamedTuple):
     suspected: Float[Array, "h w"]
     """From 0 to 1: how lately a body was seen on the pixel's surface, before this frame."""
     in_view: Float[Array, " v"]
-    """Share of the pixels with depth that lie inside each of the others."""
+    """Share of what was known to be static that lies inside each of the others."""
 
 
 @partial(jax.jit, static_argnames="carried")
@@ -110,7 +110,7 @@ def form_belief(
         jnp.mean(arisen),
         known,
         _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
-        jnp.sum(evidence.seen, (1, 2)) / jnp.maximum(jnp.sum(has), 1.0),
+        jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )
 
 

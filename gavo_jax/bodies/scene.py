@@ -26,9 +26,9 @@ from gavo_jax.settings import Settings
 
 OLD = 7
 """Frames after which an older view takes the place of the one before,"""
-FAR_OFF = 0.8
-"""or part of the image that it sees, below which it does at once: over a long way, errors of the poses and other light
-look like bodies."""
+FAR_OFF = 0.7
+"""or part of what is at rest that it sees, below which it does at once: over a long way, errors of the poses and other
+light look like bodies."""
 
 
 class Scene(NamedTuple):
