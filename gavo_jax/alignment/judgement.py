@@ -12,7 +12,7 @@ from gavo_jax.alignment.evidence import Held, is_held
 from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
-from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying
+from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying, unswayed
 from gavo_jax.alignment.visits import Level, Search
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
@@ -104,7 +104,7 @@ def _last_step(
 
     def without_sway() -> Swayed:
         refined = _refine(problem, residuals)
-        return Swayed(refined, jnp.zeros(6), jnp.zeros((6, 6)), problem.objective.residuals(refined))
+        return unswayed(refined, problem.objective.residuals(refined))
 
     if swaying is None or problem.objective.readout is None:
         found = without_sway()

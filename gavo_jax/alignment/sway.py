@@ -87,6 +87,11 @@ class Swayed(NamedTuple):
     residuals: Residuals
 
 
+def unswayed(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
+    """A motion without sway."""
+    return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
+
+
 class At(NamedTuple):
     """How far the refinement has come."""
 
@@ -104,7 +109,8 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from what is known of both beforehand. A twist of the
     target's own moves a point in row v as a step on the target's side would, times the row's time.
     """
-    readout = jnp.float32(0.0) if problem.objective.readout is None else problem.objective.readout
+    readout = problem.objective.readout
+    assert readout is not None, "only a rolling shutter shows a sway"
     known = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
     prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # of the sway, and of the sum
     share = problem.objective.readings() / problem.objective.reference.points.q.size
@@ -133,8 +139,7 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     to_reference = adjoint(rigid_inverse(motion))
     added = FRAMES * to_reference @ _from_sway(hessian) @ to_reference.T
     found = Swayed(motion, x[6:], jnp.where(jnp.all(jnp.isfinite(added)), added, 0.0), r)
-    still = Swayed(problem.origin, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
-    return jax.lax.cond(better, lambda: found, lambda: still)
+    return jax.lax.cond(better, lambda: found, lambda: unswayed(problem.origin, residuals))
 
 
 def _from_sway(hessian: Float[Array, "12 12"]) -> Float[Array, "6 6"]:
