@@ -210,9 +210,9 @@ class BodyAware:
         return self.retina.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
-        """A tracker without the points that dissent, which expects the motion that the others ask for."""
-        motion = log(opinion.target_T_reference) * (tracker.seconds / clock.elapsed)
-        return self.retina.without(tracker, opinion.dissenting)._replace(motion=motion)
+        """A tracker without the points that dissent, whose search begins from the motion that the others ask for."""
+        guess = log(opinion.target_T_reference) * (tracker.seconds / clock.elapsed)
+        return self.retina.without(tracker, opinion.dissenting)._replace(guess=guess)
 
     def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
         """The motion that most of what was at rest agrees with.
@@ -281,7 +281,11 @@ def _moved(
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
     tracker = tracker._replace(
-        keyframe=tracker.previous, motion=jnp.asarray(xi), passing=jnp.asarray(xi), usual=state.tracker.usual
+        keyframe=tracker.previous,
+        motion=jnp.asarray(xi),
+        guess=jnp.asarray(xi),
+        passing=jnp.asarray(xi),
+        usual=state.tracker.usual,
     )
     return attempt._replace(state=tracker, result=result, usable=True)
 

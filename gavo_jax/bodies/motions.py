@@ -68,10 +68,12 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
     place = int(np.flatnonzero(before.numbers == number)[0])
     assert state.whole is not None
     whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.passing) else state.whole
+    motion = jnp.asarray(before.motions[place], jnp.float32)
     tracker = state.tracker._replace(
         previous=whole,
         keyframe=whole,
-        motion=jnp.asarray(before.motions[place], jnp.float32),
+        motion=motion,
+        guess=motion,
         unrest=Unrest.unknown(),
         seconds=jnp.float32(before.seconds[place]),
         usual=Usual.unknown(),

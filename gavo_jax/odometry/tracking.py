@@ -64,6 +64,8 @@ class TrackerState(NamedTuple):
     """The previous frame, packed for sampling: what the symmetric error needs of it."""
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
+    guess: Float[Array, " 6"]
+    """Of the next motion, if it took as long: the last one again, unless somebody knows better."""
     passing: Float[Array, " 6"]
     """What that twist would be, had the camera moved as it did at the previous frame's own moment."""
     unrest: Unrest
@@ -150,11 +152,12 @@ def track_frame(
     """
     is_first = ~jnp.any(state.previous.points.q > 0)
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
-    predicted = state.motion * (clock.elapsed / state.seconds)
+    share = clock.elapsed / state.seconds
+    predicted, guess = state.motion * share, state.guess * share
     levels = levels_of(camera, solver, alignment)
     finest = levels.numbers[-1]
     delay = clock.depth_delay / clock.elapsed
-    target = _synchronised(raw, camera, delay * predicted, finest) if options.synchronise else raw
+    target = _synchronised(raw, camera, delay * guess, finest) if options.synchronise else raw
     readout = None
     if options.rolling_shutter:  # a readout that is longer than the time between two frames cannot be
         readout = jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
@@ -163,7 +166,7 @@ def track_frame(
     views = (previous, keyframe) if options.reference == "keyframe" else (previous,)
     guesses = jnp.eye(4)[None]
     if options.prior:
-        guesses = jnp.concatenate([exp(predicted)[None], guesses])
+        guesses = jnp.concatenate([exp(guess)[None], guesses])
     packed = prepare_target(target, levels)
     exchanged = None
     if alignment.symmetric:
@@ -193,7 +196,7 @@ def track_frame(
     was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
     unrest = state.unrest.after(sway / clock.elapsed, change)
     unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
-    after_it = TrackerState(newest, keyframe, packed, motion, passing, unrest, clock.elapsed, exposure, usual)
+    after_it = TrackerState(newest, keyframe, packed, motion, motion, passing, unrest, clock.elapsed, exposure, usual)
     return after_it, result, populations
 
 
@@ -208,6 +211,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         keyframe=reference,
         previous_image=packed,
         motion=jnp.zeros(6),
+        guess=jnp.zeros(6),
         passing=jnp.zeros(6),
         unrest=Unrest.unknown(),
         seconds=jnp.float32(1.0),
@@ -228,6 +232,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         keyframe=reference,
         previous_image=Target(words, words),
         motion=jnp.zeros(6),
+        guess=jnp.zeros(6),
         passing=jnp.zeros(6),
         unrest=Unrest.unknown(),
         seconds=jnp.float32(1.0),
