@@ -22,6 +22,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
+from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -108,6 +109,8 @@ class Progress(NamedTuple):
     """Whether the last frame's depth did not agree with its image."""
     unknown: int = 0
     """So many of the last motions are guesses that frames have been chained by."""
+    leap: Leap | None = None
+    """What the last frame may have been; it is lost until the next one confirms that."""
 
 
 class Odometry:
@@ -186,8 +189,10 @@ class Odometry:
         elif usable is None:
             after, result, lost = self._lose(before, None, timestamp), no_alignment(finding.status), True
         else:
-            attempt = self.aligner.align(before.tracker, usable, clock_of(before, usable))
+            clock = clock_of(before, usable)
+            attempt, leap = align_leaping(self.aligner, before.tracker, usable, clock, before.leap)
             after, result, lost = self._advance(before, usable, finding, attempt)
+            after = after._replace(leap=leap if after.held else None)
             candidates = attempt.candidates
             size = (self.camera.height, self.camera.width)
             bodies = tuple(

@@ -16,6 +16,7 @@ import numpy as np
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.driver import Progress
+from gavo_jax.odometry.leaps import Leap
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 
@@ -59,6 +60,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "adrift": progress.adrift,
         "doubted": progress.doubted,
         "unknown": progress.unknown,
+        "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
@@ -93,11 +95,13 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
             raise ValueError("altered")
         numbers = json.loads(str(arrays[NUMBERS]))
         history: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in numbers["history"].items()}
+        leap = numbers.pop("leap")
         files = {name: Mark(*mark) for name, mark in numbers.pop("files").items()}
         images = numbers.pop("images")
         poses = {name: arrays[name] for name in POSES}
         leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
-        progress = Progress(**{**numbers, "history": History(**history)}, **poses)
+        numbers |= {"history": History(**history), "leap": leap and Leap(np.array(leap[0]), *leap[1:])}
+        progress = Progress(**numbers, **poses)
     except GavoError:
         raise
     except Exception:  # what the readers of damaged archives, arrays and numbers raise has no end

@@ -21,6 +21,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Progress, track
+from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
@@ -328,6 +329,17 @@ def test_a_checkpoint_of_another_camera_is_refused(tmp_path):
     save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress(own, 3), {}))
     with pytest.raises(GavoError, match="another camera"):
         load_checkpoint(tmp_path / "checkpoint.npz", other)
+
+
+def test_a_leap_is_kept_in_mind(tmp_path):
+    leap = Leap(np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) / 3, 0.4, 1.1)
+    blank = blank_state(CAMERA, SOLVER, NEWTON.alignment)
+    for progress in (Progress(blank, 3), Progress(blank, 3, leap=leap)):
+        save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(progress, {}))
+        kept = load_checkpoint(tmp_path / "checkpoint.npz", blank).progress.leap
+        assert (kept is None) == (progress.leap is None)
+    assert kept is not None and kept[1:] == leap[1:]
+    np.testing.assert_array_equal(kept.target_T_reference, leap.target_T_reference)
 
 
 @pytest.mark.parametrize(("settings", "at"), [(NEWTON, 1), (NEWTON, 4), (GENETIC, 3)])

@@ -1,0 +1,87 @@
+"""Frames that went missing although the stamps go on: the camera seems to leap.
+
+A motion that no camera makes in the time between two stamps has one of two causes. The image belongs to another moment:
+then the next frame is where the camera was expected. Or frames are missing, and those that are left were stamped anew:
+then the next frame is one ordinary step further. Which one it is shows at that next frame; until then the leap is kept
+in mind. The shutter's part of a motion hangs on the time it took, so a leap is searched for as a motion of the time in
+which the camera, as fast as it was, would have made it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.alignment.result import with_finding
+from gavo_jax.datasets.base import Frame
+from gavo_jax.mapping.motions import size
+from gavo_jax.odometry.aligners import Aligner, Attempt
+from gavo_jax.odometry.plausibility import MAX_ACCELERATION, SCENE_DISTANCE, SMALLEST_SHIFT, TOLERANCE
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
+
+LONGEST = 1.0
+"""Seconds that a leap is taken for, at most."""
+
+
+class Leap(NamedTuple):
+    """A motion from the reference that no camera makes in the time that the stamps say."""
+
+    target_T_reference: Float64[np.ndarray, "4 4"]
+    seconds: float
+    """In which a camera would have made it."""
+    timestamp: float
+    """Of the frame it leads to."""
+
+
+def align_leaping(
+    aligner: Aligner, state: object, frame: Frame, clock: Clock, leap: Leap | None
+) -> tuple[Attempt, Leap | None]:
+    """An attempt at a frame, and the leap that it may be.
+
+    Args:
+        aligner: Who aligns.
+        state: Its own.
+        frame: The new frame.
+        clock: When it was taken.
+        leap: What the frame before may have been.
+
+    Returns:
+        The attempt; of a leap that the new frame confirms it is usable and has the finding `IMPLAUSIBLE_MOTION`.
+    """
+    attempt = aligner.align(state, frame, clock)
+    leaps = not attempt.usable and AlignmentStatus.IMPLAUSIBLE_MOTION in attempt.result.statuses
+    if leap is not None and (attempt.usable or leaps):
+        since = frame.timestamp - leap.timestamp
+        again = aligner.align(state, frame, clock._replace(elapsed=np.float32(leap.seconds + since)))
+        if again.usable and _goes_on(aligner, state, clock, leap, since, again):
+            return again._replace(result=with_finding(again.result, AlignmentStatus.IMPLAUSIBLE_MOTION)), None
+    if not leaps:
+        return attempt, None
+    seconds = _seconds(aligner, state, clock, attempt)
+    again = aligner.align(state, frame, clock._replace(elapsed=np.float32(seconds)))
+    if not again.usable:
+        return attempt, None
+    return attempt, Leap(np.asarray(again.result.target_T_reference, np.float64), seconds, frame.timestamp)
+
+
+def _goes_on(aligner: Aligner, state: object, clock: Clock, leap: Leap, since: float, attempt: Attempt) -> bool:
+    """Whether a motion is one step further than a leap, rather than where the camera was expected without it."""
+    motion = np.asarray(attempt.result.target_T_reference, np.float64)
+    length, angle = size(motion @ inverse(leap.target_T_reference) @ inverse(aligner.predict(state, since)))
+    limits = np.array(MAX_ACCELERATION) * since * 0.5 * (since + leap.seconds) + np.array(TOLERANCE)
+    if length > limits[0] or angle > limits[1]:
+        return False
+    stayed = size(motion @ inverse(aligner.predict(state, float(clock.elapsed))))
+    return bool(angle + length / SCENE_DISTANCE < stayed[1] + stayed[0] / SCENE_DISTANCE)
+
+
+def _seconds(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) -> float:
+    """The time in which the camera, as fast as it was, makes a motion."""
+    elapsed = float(clock.elapsed)
+    shifts = []
+    for motion in (np.asarray(attempt.result.target_T_reference), aligner.predict(state, elapsed)):
+        length, angle = size(np.asarray(motion, np.float64))
+        shifts.append(float(angle + length / SCENE_DISTANCE))
+    return max(elapsed, min(elapsed * shifts[0] / max(shifts[1], SMALLEST_SHIFT), LONGEST))
