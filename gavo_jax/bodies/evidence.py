@@ -30,7 +30,12 @@ class View(NamedTuple):
     image: Target
     """[h, w]."""
     sweep: Float[Array, "*v 6"]
-    """Twist of the points in the camera during one readout; 0 where all rows are exposed at once."""
+    """Twist of the points in the camera during one readout; 0 where all rows are exposed at once, not-a-number of a
+    first frame, before which there is no other."""
+
+    def moving_as(self, other: Float[Array, " 6"]) -> "View":
+        """The view with another one's sweep where its own is not known."""
+        return self._replace(sweep=jnp.where(jnp.isnan(self.sweep), jnp.nan_to_num(other), self.sweep))
 
 
 def seen_level(levels: Levels) -> int:
@@ -137,6 +142,8 @@ def compare(
 ) -> Compared:
     """Every pixel of a view, or one of `stride` along either side, in V others; arguments as of `gather_evidence`."""
     plane = image_plane(camera)
+    here = here.moving_as(others.sweep[0])
+    others = others.moving_as(here.sweep)
     height, width = here.image.grey.shape
     u, v = jnp.arange(0, width, stride, dtype=jnp.float32), jnp.arange(0, height, stride, dtype=jnp.float32)[:, None]
     u, v = (jnp.broadcast_to(a, (v.shape[0], u.shape[0])).reshape(-1) for a in (u, v))

@@ -120,7 +120,8 @@ class Retina:
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
-        return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), self.view(tracker)))
+        view = self.view(tracker)._replace(sweep=jnp.full(6, jnp.nan))
+        return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), view))
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
@@ -174,6 +175,7 @@ def _look(
     before, suspected, views, views_T_last = known
     image, passing, seconds = new
     here = view_of(image, levels, passing * (camera.readout / seconds))
+    views = views.moving_as(here.sweep)
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
     seen = camera.level(levels.numbers[seen_level(levels)])

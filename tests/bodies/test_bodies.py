@@ -288,6 +288,33 @@ def test_a_camera_that_moves_fast_finds_no_bodies_where_nothing_moves(data_dir: 
     assert sum(bool(step.bodies) for step in steps if step is not None) <= 3
 
 
+@pytest.mark.parametrize(("name", "first"), [("fr1_xyz", 68), ("fr1_rpy", 6), ("fr1_rpy", 52), ("fr1_desk", 42)])
+def test_a_first_frame_moved_while_it_was_exposed(data_dir: Path, name: str, first: int) -> None:
+    """Its rows were taken for those of one moment, and by the second frame half of the scene seemed to move."""
+    clip = TumSequence(data_dir / name)
+    odometry = Odometry(clip.camera, preset("ga", "fast"))
+    odometry.register(clip[first], clip[first].timestamp)
+    step = odometry.register(clip[first + 1], clip[first + 1].timestamp)
+    assert step is not None and step.alignment.status is AlignmentStatus.OK
+
+
+def test_depth_upside_down_is_no_body(data_dir: Path) -> None:
+    """Where depth is wrong, half of the image seems to stand before what was seen; the image itself agrees."""
+    clip = TumSequence(data_dir / "fr1_rpy")
+    odometry = Odometry(clip.camera, preset("ga", "fast"))
+    steps = []
+    for index in range(20, 29):
+        frame = clip[index]
+        frame = replace(frame, depth=np.flipud(frame.depth)) if index in (26, 27) else frame
+        steps += [step] if (step := odometry.register(frame, frame.timestamp)) is not None else []
+    assert [AlignmentStatus.DEPTH_MISMATCH in step.alignment.statuses for step in steps] == [
+        *[False] * 5,
+        *[True] * 2,
+        False,
+    ]
+    assert not any(step.bodies for step in steps)
+
+
 def test_a_state_keeps_its_shape() -> None:
     odometry = Odometry(CAMERA, TRACKED)
     odometry.register(Carded()[0], 0.0)
