@@ -121,10 +121,12 @@ class WithRival:
         return self._alone(self.first.blank_state(), DECIDED)
 
     def start(self, frame: Frame) -> RivalledState:
-        """A scene in which nothing is known to move, and a rival if something stands before the rest."""
+        """A scene in which nothing is known to move, and a rival if something stands before the rest. It is open whose
+        motion is found, too, where nothing does: a body may fill the image.
+        """
         state = self.first.start(frame)
         rival = self._rival_of(state)
-        return RivalledState(state, rival, np.int32(0 if rival.is_there else DECIDED))
+        return RivalledState(state, rival, np.int32(0))
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the first one."""
@@ -142,9 +144,9 @@ class WithRival:
         if not rival.is_there:
             return attempt._replace(state=self._alone(own, open_for))
         other = self.second.align(rival.state, frame, clock)
-        if not attempt.usable:  # that motion has come to an end, and the rival's goes on
+        if not attempt.usable:  # that motion has come to an end, and the rival's goes on; whose it was stays open
             if other.usable and _deviation(other) < EXACT:
-                return self._taken(other, rival, open_for)
+                return self._taken(other, rival, open_for, open_for)
             return attempt._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if other.usable:
             return self._decide(attempt, other, rival, open_for)
@@ -191,12 +193,12 @@ class WithRival:
         )
         return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
 
-    def _taken(self, other: Attempt, rival: Rival, open_for: int) -> Attempt:
+    def _taken(self, other: Attempt, rival: Rival, open_for: int, open_after: int = DECIDED) -> Attempt:
         """The rival's attempt in place of the first one's, by the way from where its camera was believed to be."""
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
         unknown = max(open_for - int(rival.age) - 1, 0)
-        return mistrusted(other._replace(state=self._alone(other.state, DECIDED), result=result, unknown=unknown))
+        return mistrusted(other._replace(state=self._alone(other.state, open_after), result=result, unknown=unknown))
 
     @cached_property
     def _nobody(self) -> Rival:

@@ -1,6 +1,7 @@
 """A motion that only seems to be the camera's loses against what stands behind: from the first frame on, and told."""
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,25 @@ class Scripted:
         return Attempt(state, result, usable)
 
 
+def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
+    """Nothing stands before anything else in the first frames, so that there is no rival to tell."""
+    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
+    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    aligner = WithRival(Scripted(aware, *[(True, 0.05, 1e-3)] * 7))  # pyright: ignore[reportArgumentType]
+    object.__setattr__(aligner, "second", Scripted(aware, (True, 0.0, 1e-3)))
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    state, seen = aligner.start(covered), aligner.start(frame)
+    assert not state.rival.is_there and seen.rival.is_there
+    for _ in range(6):
+        attempt = aligner.align(state, covered, clock)
+        state = attempt.state
+        assert attempt.unknown == 0 and not state.rival.is_there
+    taken = aligner.align(state._replace(rival=seen.rival), frame, clock)
+    assert taken.unknown == 6 and int(taken.state.open_for) < 0
+
+
 @pytest.mark.parametrize(("missed", "unknown"), [(0, 0), (4, 4)])
 def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(missed: int, unknown: int) -> None:
     """A rival that could not be followed at first is asked for again; its anchor is then the later frame."""
@@ -198,6 +218,7 @@ def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation:
     assert both.usable and both.state.rival.is_there and both.result.status == AlignmentStatus.OK
     ended = aligner.align(both.state, frame, clock)
     assert ended.usable == usable and ended.state.rival.is_there != usable
+    assert int(ended.state.open_for) == 2, "nobody has said whose motion either is"
     if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be
         assert ended.result.target_T_reference[0, 3] == pytest.approx(0.03, abs=1e-6)
         assert AlignmentStatus.MOVING_BODY in ended.result.statuses
