@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNDETERMINED
-from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.identity import LEAST, Roll, parts
@@ -26,6 +25,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp as exp_on_host
 from gavo_jax.mapping.motions import log as log_on_host
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, moved_on
+from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit
@@ -72,11 +72,6 @@ EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """What a body may cause by hiding what the points saw;"""
 MOST = 0.9
 """of depth so much of what it leaves in view has to agree."""
-
-MUCH, SHOWN = 0.3, 0.25
-"""Share of the depth that disagrees with a motion, from which on depth itself may be wrong, and is if the image
-disagrees with less than this part of that. A card before the TUM clips mostly has 0.3 and more, depth upside down 0.02
-to 0.15."""
 
 
 class Candidate(NamedTuple):
@@ -150,7 +145,9 @@ class BodyAware:
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (np.any(before) or np.any(found))
-        is_asked = ((arisen > SUSPICIOUS and attempt is first) or is_lost) and not _depth_is_wrong(first.result)
+        statuses, explained = first.result.statuses, first.result.explained
+        is_depth_wrong = AlignmentStatus.DEPTH_MISMATCH in statuses and bool(depth_alone_disagrees(explained))
+        is_asked = ((arisen > SUSPICIOUS and attempt is first) or is_lost) and not is_depth_wrong
         if is_asked and not self.is_eager:
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
@@ -278,13 +275,6 @@ class BodyAware:
         findings = bit(AlignmentStatus.MOVING_BODY)
         result = attempt.result._replace(status=AlignmentStatus.MOVING_BODY, findings=findings)
         return attempt._replace(result=result, unknown=1)
-
-
-def _depth_is_wrong(result: Alignment) -> bool:
-    """Whether depth speaks against a motion and the image does not: a body that moves shows in both."""
-    unlike, moving = 1.0 - float(result.explained.depth), 1.0 - float(result.explained.grey)
-    is_alone = unlike > MUCH and moving < SHOWN * unlike
-    return is_alone and AlignmentStatus.DEPTH_MISMATCH in result.statuses
 
 
 def _moved(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,11 +12,13 @@ import pytest
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.odometry.aligners import Attempt, DoubtingDepth
 from gavo_jax.odometry.driver import MAX_DOUBTED, MAX_HELD, Odometry, Step, track
 from gavo_jax.odometry.plausibility import MIN_REMEMBERED, Usual, judge_by_history
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus as Status
@@ -27,9 +30,9 @@ DT = 1 / 30
 
 
 def result_of(x: float = 0.0, error: float = 10.0, depth: float = 0.95, scale: float = 0.005) -> Alignment:
-    """A pair that moved along x, metres."""
+    """A pair that moved along x, metres, and of which the image does not explain much more than depth may."""
     motion = jnp.eye(4).at[0, 3].set(x)
-    explained = ExplainedShare(jnp.float32(0.9), jnp.float32(depth))
+    explained = ExplainedShare(jnp.float32(0.7), jnp.float32(depth))
     alignment = no_alignment(Status.OK)._replace(target_T_reference=motion, error=jnp.float32(error))
     return alignment._replace(explained=explained, findings=jnp.int32(0), depth_scale=jnp.float32(scale))
 
@@ -255,3 +258,25 @@ def test_a_frame_of_doubtful_depth_is_no_reference(frames: list[Frame], alone_us
     stamps = [step.reference_timestamp for step in steps]
     renewed = [i for i in range(len(stamps) - 1) if stamps[i] != stamps[i + 1]]
     assert renewed == ([] if alone_usable else [MAX_DOUBTED - 1])
+
+
+@pytest.mark.parametrize(
+    ("grey", "depth", "disagrees"), [(0.95, 0.3, True), (0.95, 0.9, False), (0.6, 0.3, False), (np.nan, np.nan, False)]
+)
+def test_depth_is_wrong_that_disagrees_alone(grey: float, depth: float, disagrees: bool) -> None:
+    """Known of the first pair already, before anything is usual."""
+    explained = ExplainedShare(jnp.float32(grey), jnp.float32(depth))
+    result = result_of()._replace(explained=explained)
+    still, elapsed = jnp.zeros(6), jnp.float32(DT)
+    judged = judge_by_history(result, Usual.unknown(), jnp.float32(50.0), still, elapsed, jnp.float32(1.0))
+    assert bool(int(judged.findings) & bit(Status.DEPTH_MISMATCH)) == disagrees
+
+
+@pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
+def test_depth_upside_down_in_the_second_frame(data_dir: Path, clip: str) -> None:
+    sequence = TumSequence(data_dir / clip)
+    odometry = Odometry(sequence.camera, preset("ga", "fast"))
+    odometry.register(sequence[0], sequence[0].timestamp)
+    frame = replace(sequence[1], depth=np.flipud(sequence[1].depth))
+    step = odometry.register(frame, frame.timestamp)
+    assert step is not None and Status.DEPTH_MISMATCH in step.alignment.statuses
