@@ -21,8 +21,9 @@ from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.mapping.motions import exp as exp_on_host
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
-from gavo_jax.se3 import exp, rigid
+from gavo_jax.se3 import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -129,7 +130,7 @@ class Search:
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
-        return rigid(moved_on(state.motion, np.float32(elapsed / float(state.seconds))))
+        return exp_on_host(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
 
 
 @jax.jit  # one program, and not one for each of its dozens of operations
