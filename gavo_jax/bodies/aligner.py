@@ -24,7 +24,7 @@ from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp as exp_on_host
 from gavo_jax.mapping.motions import log as log_on_host
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, moved_on
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.se3 import log
@@ -145,10 +145,8 @@ class BodyAware:
         found, carried = _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (np.any(before) or np.any(found))
-        statuses, explained = first.result.statuses, first.result.explained
-        is_depth_wrong = AlignmentStatus.DEPTH_MISMATCH in statuses and bool(depth_alone_disagrees(explained))
-        is_asked = ((arisen > SUSPICIOUS and attempt is first) or is_lost) and not is_depth_wrong
-        if is_asked and not self.is_eager:
+        is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
+        if is_asked and not self.is_eager and not depth_alone_disagrees(first.result.explained):
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 found_none = attempt
@@ -231,9 +229,7 @@ class BodyAware:
             return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
 
         found = Candidate(first, retina.look_back(scene, first.state, first.result.target_T_reference))
-        predicted = retina.look_back(
-            scene, first.state, moved_on(tracker.motion, np.float32(clock.elapsed / tracker.seconds))
-        )
+        predicted = retina.look_back(scene, first.state, self.predict(state, float(clock.elapsed)))
         tried = [found]
         if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
             tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]
@@ -284,12 +280,9 @@ def _moved(
     xi = log_on_host(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
+    twist = jnp.asarray(xi)
     tracker = tracker._replace(
-        keyframe=tracker.previous,
-        motion=jnp.asarray(xi),
-        guess=jnp.asarray(xi),
-        passing=jnp.asarray(xi),
-        usual=state.tracker.usual,
+        keyframe=tracker.previous, motion=twist, guess=twist, passing=twist, usual=state.tracker.usual
     )
     return attempt._replace(state=tracker, result=result, usable=True)
 

@@ -120,7 +120,7 @@ class Retina:
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
-        view = self.view(tracker)._replace(sweep=jnp.full(6, jnp.nan))
+        view = view_of(tracker.previous_image, self.levels, jnp.full(6, jnp.nan))
         return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), view))
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:

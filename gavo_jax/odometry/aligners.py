@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
@@ -21,9 +21,8 @@ from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
-from gavo_jax.mapping.motions import exp as exp_on_host
+from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
-from gavo_jax.se3 import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -130,13 +129,7 @@ class Search:
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
-        return exp_on_host(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
-
-
-@jax.jit  # one program, and not one for each of its dozens of operations
-def moved_on(motion: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, "4 4"]:
-    """The motion of a twist that goes on for a share of its time."""
-    return exp(motion * share)
+        return exp(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:

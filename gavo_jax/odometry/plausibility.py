@@ -5,9 +5,10 @@ starts and stops as no camera does. And a match that is far worse than the run's
 even where it would pass for a pair by itself.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.alignment.result import Alignment
@@ -101,7 +102,7 @@ def judge_by_history(
     """
     motion = result.target_T_reference
     change = _change(log(motion), predicted, STAMP_JITTER / elapsed)
-    possible = jnp.array(MAX_ACCELERATION) * elapsed * 0.5 * (elapsed + last_elapsed)
+    possible = possible_change(elapsed, last_elapsed)
     reachable = jnp.array(MAX_SPEED) * elapsed
     tolerance = jnp.array(TOLERANCE)
     implausible = jnp.any(change > possible + tolerance) | jnp.any(_lengths(log(motion)) > reachable + tolerance)
@@ -125,8 +126,18 @@ def judge_by_history(
 
 def depth_alone_disagrees(explained: ExplainedShare) -> Bool[Array, ""]:
     """Whether depth speaks against a motion and the image does not: what moves, or hides the scene, shows in both."""
-    unlike = 1.0 - jnp.asarray(explained.depth)
+    unlike = 1.0 - explained.depth
     return (unlike > MUCH_DEPTH) & (1.0 - explained.grey < SHOWN * unlike)
+
+
+def possible_change(elapsed: Any, last_elapsed: Any) -> Any:
+    """How far a camera's translation and rotation can be from what was predicted, metres and radians."""
+    return np.array(MAX_ACCELERATION, np.float32) * elapsed * 0.5 * (elapsed + last_elapsed)
+
+
+def image_shift(translation: Any, rotation: Any) -> Any:
+    """How far a motion of this length and angle moves the image, about, in radians."""
+    return rotation + translation / SCENE_DISTANCE
 
 
 def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, " 2"]:
@@ -139,8 +150,7 @@ def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Flo
 
 def _shift(result: Alignment) -> Float[Array, ""]:
     """How far a motion moves the image, about, in radians."""
-    translation, rotation = _lengths(log(result.target_T_reference))
-    return rotation + translation / SCENE_DISTANCE
+    return image_shift(*_lengths(log(result.target_T_reference)))
 
 
 def _lengths(twist: Float[Array, " 6"]) -> Float[Array, " 2"]:

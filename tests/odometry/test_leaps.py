@@ -1,21 +1,22 @@
 """Frames that went missing without a gap in the stamps, and frames of another moment."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gavo_jax import presets
-from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
+from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.aligners import Attempt
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.tracking import Clock
+from gavo_jax.presets import preset
 from gavo_jax.status import AlignmentStatus as Status
 from gavo_jax.trajectory import inverse
 
@@ -66,8 +67,8 @@ def follow(numbers: list[int]) -> list[Step]:
     return steps
 
 
-@pytest.fixture(autouse=True)
-def _all_frames_are_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def all_frames_are_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     from gavo_jax.odometry import driver
 
     whole = driver.Finding(Status.OK, driver.Use.ALL)
@@ -78,6 +79,7 @@ def places(steps: list[Step]) -> list[float]:
     return [round(float(step.world_T_camera[0, 3]) / STEP, 3) for step in steps]
 
 
+@pytest.mark.usefixtures("all_frames_are_fit")
 def test_the_frame_after_a_leap_confirms_it() -> None:
     steps = follow([0, 1, 2, 12, 13, 14])
     assert [step.lost for step in steps] == [False, False, True, False, False]
@@ -88,6 +90,7 @@ def test_the_frame_after_a_leap_confirms_it() -> None:
     assert {step.segment for step in steps} == {0}
 
 
+@pytest.mark.usefixtures("all_frames_are_fit")
 def test_an_image_of_another_moment_is_no_leap() -> None:
     steps = follow([0, 1, 2, -7, 4, 5])
     assert [step.lost for step in steps] == [False, False, True, False, False]
@@ -95,55 +98,43 @@ def test_an_image_of_another_moment_is_no_leap() -> None:
     assert [step.alignment.status for step in steps[3:]] == [Status.OK, Status.OK]
 
 
+@pytest.mark.usefixtures("all_frames_are_fit")
 def test_two_images_of_other_moments_are_no_leap() -> None:
     steps = follow([0, 1, 2, -7, 19, 5, 6])
     assert [step.lost for step in steps] == [False, False, True, True, False, False]
     assert places(steps)[-2:] == [5, 6]
 
 
+@pytest.mark.usefixtures("all_frames_are_fit")
 def test_leap_after_leap() -> None:
     steps = follow([0, 1, 2, 12, 13, 30, 31, 45, 46])
     assert places(steps) == [1, 2, 2, 13, 13, 31, 31, 46]
 
 
-def real(data_dir: Path, clip: str, numbers: list[int]) -> tuple[list[Step], Any, Any]:
+def real(data_dir: Path, clip: str, numbers: list[int]) -> tuple[list[Step], Callable[[Step], tuple[float, float]]]:
     """`ga:fast` over frames of a clip under the stamps of its first ones; how far each step is from the truth."""
-    clip_ = TumSequence(data_dir / clip)
-    truth = clip_.ground_truth
+    sequence = TumSequence(data_dir / clip)
+    truth, stamps, moments = sequence.ground_truth, sequence.timestamps, sequence.timestamps[numbers]
     assert truth is not None
-
-    class Restamped:
-        name, camera, timestamps = clip_.name, clip_.camera, clip_.timestamps[: len(numbers)]
-        ground_truth = None
-
-        def __len__(self) -> int:
-            return len(numbers)
-
-        def __getitem__(self, index: int) -> Frame:
-            frame, stamp = clip_[numbers[index]], float(self.timestamps[index])
-            assert frame.depth_timestamp is not None
-            delay = frame.depth_timestamp - frame.timestamp
-            return Frame(frame.grey, frame.depth, stamp, depth_timestamp=stamp + delay)
-
-        def check(self) -> None:
-            pass
-
-    sequence: Any = Restamped()
-    steps = list(track(sequence, odometry=Odometry(sequence.camera, presets.preset("ga", "fast"))))
-    moments = clip_.timestamps[numbers]
+    odometry, steps = Odometry(sequence.camera, preset("ga", "fast")), []
+    for number, stamp in zip(numbers, stamps, strict=False):
+        frame = sequence[number]
+        assert frame.depth_timestamp is not None
+        delay = frame.depth_timestamp - frame.timestamp
+        step = odometry.register(replace(frame, timestamp=stamp, depth_timestamp=stamp + delay), stamp)
+        steps += [step] if step is not None else []
 
     def off(step: Step) -> tuple[float, float]:
-        before = int(np.argmin(np.abs(sequence.timestamps - step.reference_timestamp)))
+        before = int(np.argmin(np.abs(stamps - step.reference_timestamp)))
         poses = truth.interpolate(moments[[before, step.index]])[0]
-        result: Alignment = step.alignment
-        error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(result.target_T_reference)
+        error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
         return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle(error[None, :3, :3])[0]))
 
-    return steps, sequence, off
+    return steps, off
 
 
 def test_missing_frames_that_were_stamped_anew(data_dir: Path) -> None:
-    steps, _, off = real(data_dir, "fr1_xyz", [*range(15), *range(25, 30)])
+    steps, off = real(data_dir, "fr1_xyz", [*range(15), *range(25, 30)])
     leap, landed, after = steps[14], steps[15], steps[16:]
     assert leap.lost and Status.IMPLAUSIBLE_MOTION in leap.alignment.statuses
     assert not landed.lost and Status.IMPLAUSIBLE_MOTION in landed.alignment.statuses
@@ -153,7 +144,7 @@ def test_missing_frames_that_were_stamped_anew(data_dir: Path) -> None:
 
 def test_an_image_of_six_frames_before(data_dir: Path) -> None:
     """A second search, begun from what most of the image asks for, is judged by the run's own speed all the same."""
-    steps, _, off = real(data_dir, "fr1_desk", [*range(15, 23), 17, *range(24, 28)])
+    steps, off = real(data_dir, "fr1_desk", [*range(15, 23), 17, *range(24, 28)])
     stale, after = steps[7], steps[8:]
     assert stale.lost and Status.IMPLAUSIBLE_MOTION in stale.alignment.statuses
     assert all(off(step)[0] < 0.01 and step.alignment.status is Status.OK for step in after)
