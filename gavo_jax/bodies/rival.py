@@ -39,12 +39,10 @@ DROPPED_EARLY, LEAST_DOUBT = 5, 20.0
 """Frames after which it is dropped if the first one's motion is within its covariance as often as not."""
 DECIDED, FORGOTTEN = -1, 30
 """No frames: it is clear whose motion the first one's is. And so many after which it counts as clear."""
-REMEMBERED = 3
-"""Frames whose contradictions are averaged, about."""
 LARGEST = 100.0
-"""Of a squared Mahalanobis distance, so that one frame can't decide."""
+"""Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ;"""
 CONTRADICTED = 30.0
-"""Mean of these from which on the far part contradicts the first motion;"""
+"""and from which on the far part contradicts the first motion;"""
 CLEAR, DOUBTFUL = 0.75, 0.5
 """as a share of the largest, together with the far part's margin: from the first on the rival is taken, from the second
 on the first one's motion may be a body's."""
@@ -52,7 +50,7 @@ MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
 """Margins in the whole image and in its far part that decide if they hold for so many frames,"""
 LANDSLIDE = 0.6
 """and one in the whole image that does at once."""
-EXACT, VAGUE = 0.012, 0.02
+EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
 """Metres: deviation of the rival's translation up to which it can be taken, and from which on it tells nothing."""
 
 
@@ -72,8 +70,6 @@ class Rival(NamedTuple):
     """and by the rival's."""
     age: Any
     """Frames since the anchor; -1 where there is no rival."""
-    contradiction: Any
-    """Mean of the squared Mahalanobis distances of the last frames."""
     ahead: Any
     """Frames for which the margins have held."""
 
@@ -137,8 +133,8 @@ class WithRival:
         attempt = self.first.align(state.first, frame, clock)
         own: AwareState = attempt.state
         rival, open_for = state.rival, int(state.open_for)
-        if not rival.is_there and own.is_doubted and attempt.usable:
-            rival = self._rival_of(state.first)
+        if not rival.is_there and attempt.usable and (own.is_doubted or open_for >= 0):
+            rival = self._rival_of(state.first, standing_before=not own.is_doubted)
             open_for = max(open_for, 0) if rival.is_there else open_for
         open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
         if not rival.is_there:
@@ -159,26 +155,27 @@ class WithRival:
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = int(rival.age) + 1
-        new = min(_distance(attempt.result, other.result), LARGEST)
-        contradiction = float(rival.contradiction) + max(1 / age, 1 / REMEMBERED) * (new - float(rival.contradiction))
+        contradiction = _distance(first, second, attempt.result, other.result)
         apart, deviation = _between(first, second), _deviation(other)
         if not deviation < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
-        confirmed = attempt._replace(state=self._alone(attempt.state, DECIDED if rival.stands_before else open_for))
+        open_after = DECIDED if rival.stands_before else open_for
+        confirmed = attempt._replace(state=self._alone(attempt.state, open_after))
         if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
             return confirmed
-        ahead = 0
+        ahead, far, contradicts = 0, 0.0, contradiction > CONTRADICTED and _exceeds(apart, TOGETHER)
         if _exceeds(apart, APART):
             motions = np.stack([first, second]).astype(np.float32)
             margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
-            certainty = contradiction / LARGEST + far
-            contradicts = age >= FRAMES and contradiction > CONTRADICTED and certainty > CLEAR
-            if deviation < EXACT and (contradicts or ahead >= FRAMES or whole > LANDSLIDE):
-                return self._taken(other, rival, open_for)
-            if age >= FRAMES and certainty > DOUBTFUL and contradiction > DOUBTFUL * CONTRADICTED:
-                attempt = mistrusted(attempt)
+            if deviation < EXACT and (ahead >= FRAMES or whole > LANDSLIDE):
+                return self._taken(other, rival, open_for, open_after)
+        certainty = min(contradiction / LARGEST, 1.0) + far
+        if contradicts and deviation < EXACTER and certainty > CLEAR:
+            return self._taken(other, rival, open_for, open_after)
+        if age >= FRAMES and contradicts and certainty > DOUBTFUL:
+            attempt = mistrusted(attempt)
         if age >= DROPPED_EARLY and contradiction < LEAST_DOUBT:
             return confirmed
         if age > DROPPED_AFTER:
@@ -188,12 +185,11 @@ class WithRival:
             first_T_anchor=first.astype(np.float32),
             rival_T_anchor=second.astype(np.float32),
             age=np.int32(age),
-            contradiction=np.float32(contradiction),
             ahead=np.int32(ahead),
         )
         return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
 
-    def _taken(self, other: Attempt, rival: Rival, open_for: int, open_after: int = DECIDED) -> Attempt:
+    def _taken(self, other: Attempt, rival: Rival, open_for: int, open_after: int) -> Attempt:
         """The rival's attempt in place of the first one's, by the way from where its camera was believed to be."""
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
@@ -206,18 +202,20 @@ class WithRival:
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
         nothing = np.zeros(self.first.retina.size, bool)
         return Rival(
-            blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.float32(0), np.int32(0)
+            blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.int32(0)
         )
 
     def _alone(self, state: AwareState, open_for: int) -> RivalledState:
         """A state without a rival."""
         return RivalledState(state, self._nobody, np.int32(open_for))
 
-    def _rival_of(self, state: AwareState) -> Rival:
-        """The motion of what the last frame shows behind all that stands before other surfaces, from here on."""
+    def _rival_of(self, state: AwareState, standing_before: bool = False) -> Rival:
+        """The motion of what the last frame shows behind all that stands before other surfaces, from here on; nobody if
+        only such surfaces are asked for, and there are none.
+        """
         retina, anchor = self.first.retina, _view(state)
         near, stands_before = nearer_part(inverse_depth_of(anchor))
-        if not np.any(near):
+        if not np.any(near) or (standing_before and not stands_before):
             return self._nobody
         number = np.int32(state.scene.roll.last + 1)
         roll = Roll.empty(retina.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
@@ -240,10 +238,14 @@ def _view(state: AwareState) -> View:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 
-def _distance(first: Alignment, second: Alignment) -> float:
-    """Squared Mahalanobis distance of two results of independent points."""
-    step = log(np.asarray(first.target_T_reference) @ inverse(np.asarray(second.target_T_reference)))
-    covariance = np.asarray(first.covariance, np.float64) + np.asarray(second.covariance, np.float64)
+def _distance(
+    first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"], own: Alignment, other: Alignment
+) -> float:
+    """Squared Mahalanobis distance of two motions since the anchor, each as exact as its last result: both are found
+    against a keyframe.
+    """
+    step = log(first @ inverse(second))
+    covariance = np.asarray(own.covariance, np.float64) + np.asarray(other.covariance, np.float64)
     return float(step @ np.linalg.solve(covariance, step))
 
 

@@ -217,7 +217,7 @@ class DoubtingDepth:
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt
         again = self.alone.align(state, without_depth(frame), clock)
-        if not again.usable:
+        if not again.usable or again.unknown:  # a motion that is only guessed says nothing about depth
             return attempt
         result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
         return again._replace(result=result, fit=False)

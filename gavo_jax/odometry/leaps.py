@@ -55,13 +55,13 @@ def align_leaping(
     if leap is not None and (attempt.usable or leaps):
         since = frame.timestamp - leap.timestamp
         again = aligner.align(state, frame, clock._replace(elapsed=np.float32(leap.seconds + since)))
-        if again.usable and _goes_on(aligner, state, clock, leap, since, again):
+        if again.usable and not again.unknown and _goes_on(aligner, state, clock, leap, since, again):
             return again._replace(result=with_finding(again.result, AlignmentStatus.IMPLAUSIBLE_MOTION)), None
     if not leaps:
         return attempt, None
     seconds = _seconds(aligner, state, clock, attempt)
     again = aligner.align(state, frame, clock._replace(elapsed=np.float32(seconds)))
-    if not again.usable:
+    if not again.usable or again.unknown:
         return attempt, None
     return attempt, Leap(np.asarray(again.result.target_T_reference, np.float64), seconds, frame.timestamp)
 
