@@ -30,7 +30,7 @@ SAME = 5.0
 """Depth evidence up to which a pixel shows the surface that was seen at its place before."""
 FADING = 0.92
 """Part of a suspicion that stays from frame to frame."""
-RELEASED = -0.7
+RELEASED = -0.57
 """Belief from which on a surface is at rest beyond doubt, and suspected no more."""
 TIED = 0.5
 """Two neighbours lie on one surface from this tie on; see `_links`."""

@@ -27,6 +27,7 @@ from gavo_jax.mapping.motions import log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 TOGETHER = (0.008, np.radians(0.5))
@@ -138,16 +139,16 @@ class WithRival:
             open_for = max(open_for, 0) if rival.is_there else open_for
         open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
         if not rival.is_there:
-            return attempt._replace(state=self._alone(own, open_for))
+            return _open(attempt, open_for)._replace(state=self._alone(own, open_for))
         other = self.second.align(rival.state, frame, clock)
         if not attempt.usable:  # that motion has come to an end, and the rival's goes on; whose it was stays open
             if other.usable and _deviation(other) < EXACT:
                 return self._taken(other, rival, open_for, open_for)
-            return attempt._replace(state=RivalledState(own, rival, np.int32(open_for)))
+            return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if other.usable:
             return self._decide(attempt, other, rival, open_for)
         again = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
-        return attempt._replace(state=RivalledState(own, again, np.int32(open_for)))
+        return _open(attempt, open_for)._replace(state=RivalledState(own, again, np.int32(open_for)))
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:
         """Which of two attempts at a frame stands for it, and whether the rival is kept."""
@@ -231,6 +232,12 @@ class WithRival:
         return self._nobody._replace(
             state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=np.int32(0)
         )
+
+
+def _open(attempt: Attempt, open_for: int) -> Attempt:
+    """The attempt; its motion is unknown where it may be a body's, as the ones before may have been."""
+    doubted = open_for >= 0 and AlignmentStatus.MOVING_BODY in attempt.result.statuses
+    return attempt._replace(unknown=1) if doubted else attempt
 
 
 def _view(state: AwareState) -> View:
