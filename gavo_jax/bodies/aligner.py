@@ -155,6 +155,11 @@ class BodyAware:
                 carried = 0 if attempt is found_none else int(scene.carried) + 1
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
+        is_vague = attempt.usable and not carried and _deviation(attempt) > GOES_ON[0]
+        if is_vague and np.any(before) and not self.is_eager:
+            attempt = self._completed(state, clock, attempt)
+            look = self._look(state, attempt)
+            found = _bodies(look.belief, before)
         return self._remember(state, frame, clock, attempt, look, found, carried)
 
     def _remember(
@@ -314,6 +319,11 @@ def mistrusted(attempt: Attempt) -> Attempt:
     findings = int(result.findings) | bit(AlignmentStatus.MOVING_BODY)
     status = AlignmentStatus.MOVING_BODY if result.status == AlignmentStatus.OK else result.status
     return attempt._replace(result=result._replace(status=status, findings=findings))
+
+
+def _deviation(attempt: Attempt) -> float:
+    """Of an attempt's translation, metres."""
+    return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
 def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:
