@@ -164,7 +164,8 @@ class WithRival:
         confirmed = attempt._replace(state=self._alone(attempt.state, open_after))
         if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
             return confirmed
-        ahead, far, contradicts = 0, 0.0, contradiction > CONTRADICTED and _exceeds(apart, TOGETHER)
+        far, ahead = 0.0, 0
+        contradicts = contradiction > CONTRADICTED and _exceeds(apart, TOGETHER if rival.stands_before else APART)
         if _exceeds(apart, APART):
             motions = np.stack([first, second]).astype(np.float32)
             margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
@@ -202,9 +203,7 @@ class WithRival:
         """No rival, in the shapes and types of every one."""
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
         nothing = np.zeros(self.first.retina.size, bool)
-        return Rival(
-            blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.int32(0)
-        )
+        return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.int32(0))
 
     def _alone(self, state: AwareState, open_for: int) -> RivalledState:
         """A state without a rival."""

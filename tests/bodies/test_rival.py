@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment
-from gavo_jax.bodies.aligner import BodyAware
+from gavo_jax.bodies.aligner import BodyAware, mistrusted
 from gavo_jax.bodies.rival import RivalledState, WithRival
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.bodies.surfaces import nearer_part, standing_before
 from gavo_jax.bodies.votes import vote
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.mapping.motions import exp
@@ -165,6 +165,19 @@ class Scripted:
         return Attempt(state, result, usable)
 
 
+class Doubted:
+    """Stands for a search whose motions may be a body's."""
+
+    def __init__(self, first: Any) -> None:
+        self.first = first
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.first, name)
+
+    def align(self, state: Any, frame: Any, clock: Any) -> Attempt:
+        return mistrusted(self.first.align(state, frame, clock))
+
+
 def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
     """Nothing stands before anything else in the first frames, so that there is no rival to tell."""
     frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
@@ -182,6 +195,51 @@ def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> No
         assert attempt.unknown == 0 and not state.rival.is_there
     taken = aligner.align(state._replace(rival=seen.rival), frame, clock)
     assert taken.unknown == 6 and int(taken.state.open_for) < 0
+
+
+def rivalled(
+    first: list[tuple[bool, float, float]], second: list[tuple[bool, float, float]]
+) -> tuple[WithRival, Frame]:
+    """An aligner whose two searches' attempts are told beforehand, and a frame in which boxes stand before a wall."""
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    aligner = WithRival(Scripted(aware, *first))  # pyright: ignore[reportArgumentType]
+    object.__setattr__(aligner, "second", Scripted(aware, *second))
+    return aligner, SyntheticSequence(frames=1, camera=CAMERA)[0]
+
+
+CLOCK = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+
+
+def test_motions_that_part_slowly_are_told_apart_by_how_far_they_are_apart_since_the_anchor() -> None:
+    """A centimetre a frame at a deviation of 1 mm each: no pair tells, two do."""
+    aligner, frame = rivalled([(True, 0.01, 9e-4)] * 3, [(True, 0.0, 9e-4)] * 3)
+    first = aligner.align(aligner.start(frame), frame, CLOCK)
+    assert first.state.rival.is_there and AlignmentStatus.MOVING_BODY not in first.result.statuses
+    second = aligner.align(first.state, frame, CLOCK)
+    assert not second.state.rival.is_there and AlignmentStatus.MOVING_BODY in second.result.statuses
+    assert np.asarray(second.result.target_T_reference)[0, 3] == pytest.approx(-0.01, abs=1e-6)  # the way back and on
+
+
+def test_as_long_as_it_is_open_whose_motion_is_found_a_rival_is_asked_for_once_something_stands_before_the_rest() -> (
+    None
+):
+    aligner, frame = rivalled([(True, 0.0, 1e-3)] * 2, [(True, 0.0, 1e-3)] * 2)
+    state = aligner.start(frame)
+    alone = state._replace(rival=aligner._nobody)
+    assert aligner.align(alone, frame, CLOCK).state.rival.is_there
+    assert not aligner.align(alone._replace(open_for=np.int32(-1)), frame, CLOCK).state.rival.is_there
+
+
+@pytest.mark.parametrize(("open_for", "unknown"), [(3, 1), (-1, 0)])
+def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_is_unknown(open_for: int, unknown: int) -> None:
+    """A card that fills the image leaves it: the search hands itself over to the room, over some frames."""
+    aligner, frame = rivalled([(True, 0.0, 1e-3)], [])
+    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
+    first = aligner.first
+    object.__setattr__(aligner, "first", Doubted(first))
+    state = aligner.start(covered)._replace(open_for=np.int32(open_for))
+    assert aligner.align(state, covered, CLOCK).unknown == unknown
 
 
 @pytest.mark.parametrize(("missed", "unknown"), [(0, 0), (4, 4)])

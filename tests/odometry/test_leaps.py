@@ -15,6 +15,7 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.presets import preset
 from gavo_jax.status import AlignmentStatus as Status
@@ -103,6 +104,23 @@ def test_two_images_of_other_moments_are_no_leap() -> None:
     steps = follow([0, 1, 2, -7, 19, 5, 6])
     assert [step.lost for step in steps] == [False, False, True, True, False, False]
     assert places(steps)[-2:] == [5, 6]
+
+
+def test_a_motion_that_is_only_guessed_confirms_no_leap() -> None:
+    """Where bodies hide the scene the search goes on as before: that fits any time, and was taken for a leap."""
+
+    class Guessing(OnRails):
+        def align(self, state: tuple[float, float], frame: Frame, clock: Clock) -> Attempt:
+            attempt = super().align(state, frame, clock)
+            return attempt if float(clock.elapsed) < 1.5 * DT else attempt._replace(usable=True, unknown=1)
+
+    frame = Frame(np.full((2, 2), 9 * STEP, np.float32), np.full((2, 2), 5000, np.uint16), DT)
+    clock = Clock(np.float32(DT), np.float32(0), np.uint32(1))
+    attempt, leap = align_leaping(Guessing(), (0.0, SPEED), frame, clock, None)
+    assert not attempt.usable and leap is None
+    before = Leap(moved(-8 * STEP), 8 * DT, 0.0)
+    assert not align_leaping(Guessing(), (0.0, SPEED), frame, clock, before)[0].usable
+    assert align_leaping(OnRails(), (0.0, SPEED), frame, clock, before)[0].usable
 
 
 @pytest.mark.usefixtures("all_frames_are_fit")

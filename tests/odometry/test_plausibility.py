@@ -260,6 +260,19 @@ def test_a_frame_of_doubtful_depth_is_no_reference(frames: list[Frame], alone_us
     assert renewed == ([] if alone_usable else [MAX_DOUBTED - 1])
 
 
+def test_a_motion_that_is_only_guessed_says_nothing_of_depth() -> None:
+    """It fits any frame, so that the reference was never renewed as long as a plain body covered the image."""
+
+    class Guessing(Doubtful):
+        def align(self, state: Any, frame: Frame, clock: Any) -> Attempt:
+            attempt = super().align(state, frame, clock)
+            return attempt._replace(unknown=1) if attempt.usable else attempt
+
+    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
+    attempt = DoubtingDepth(Guessing(True), Guessing(True)).align(0.0, frame, None)  # pyright: ignore[reportArgumentType]
+    assert not attempt.usable and attempt.result.status is Status.DEPTH_MISMATCH
+
+
 @pytest.mark.parametrize(
     ("grey", "depth", "disagrees"), [(0.95, 0.3, True), (0.95, 0.9, False), (0.6, 0.3, False), (np.nan, np.nan, False)]
 )
