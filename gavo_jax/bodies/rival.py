@@ -52,7 +52,8 @@ MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
 LANDSLIDE = 0.6
 """and one in the whole image that does at once."""
 EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
-"""Metres: deviation of the rival's translation up to which it can be taken, and from which on it tells nothing."""
+"""Metres: deviation of the rival's translation up to which votes can have it taken, and the contradiction; and from which
+on it tells nothing."""
 
 
 class Rival(NamedTuple):
