@@ -146,7 +146,7 @@ class BodyAware:
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (np.any(before) or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
-        is_depth_wrong = not np.any(before) and depth_alone_disagrees(first.result.explained)
+        is_depth_wrong = np.mean(before) < LARGE and depth_alone_disagrees(first.result.explained)
         if is_asked and not self.is_eager and not is_depth_wrong:
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:

@@ -52,8 +52,8 @@ MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
 LANDSLIDE = 0.6
 """and one in the whole image that does at once."""
 EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
-"""Metres: deviation of the rival's translation up to which votes can have it taken, and the contradiction; and from which
-on it tells nothing."""
+"""Metres: deviation of the rival's translation up to which votes can have it taken, up to which the contradiction can,
+and from which on it tells nothing."""
 
 
 class Rival(NamedTuple):
@@ -143,7 +143,8 @@ class WithRival:
             return _open(attempt, open_for)._replace(state=self._alone(own, open_for))
         other = self.second.align(rival.state, frame, clock)
         if not attempt.usable:  # that motion has come to an end, and the rival's goes on; whose it was stays open
-            if other.usable and _deviation(other) < EXACT:
+            depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
+            if other.usable and _deviation(other) < EXACT and not depth_is_doubted:
                 return self._taken(other, rival, open_for, open_for)
             return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if other.usable:

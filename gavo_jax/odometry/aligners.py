@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
+from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
@@ -217,7 +218,7 @@ class DoubtingDepth:
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt
         again = self.alone.align(state, without_depth(frame), clock)
-        if not again.usable or again.unknown:  # a motion that is only guessed says nothing about depth
+        if not again.usable or is_guess(again):  # which fits any depth
             return attempt
         result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
         return again._replace(result=result, fit=False)
@@ -230,6 +231,11 @@ class DoubtingDepth:
 def without_depth(frame: Frame) -> Frame:
     """A frame of which only the image counts."""
     return replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def is_guess(attempt: Attempt) -> bool:
+    """Whether an attempt's motion is the last one, gone on with, of which the images tell nothing."""
+    return bool(np.all(np.diagonal(attempt.result.covariance) >= UNDETERMINED**2))
 
 
 AGREEMENT = (0.02, 0.02)

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gavo_jax.alignment.result import no_alignment, with_finding
+from gavo_jax.bodies.aligner import UNKNOWN
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA
 from gavo_jax.datasets.tum import TumSequence
@@ -47,6 +48,10 @@ class OnRails:
         result = no_alignment(Status.OK)._replace(target_T_reference=moved(-way))
         result = result if plausible else with_finding(result, Status.IMPLAUSIBLE_MOTION)
         return Attempt((self.place(frame), speed), result, plausible)
+
+
+def guessed(attempt: Attempt) -> Attempt:
+    return attempt._replace(usable=True, result=attempt.result._replace(covariance=UNKNOWN), unknown=1)
 
 
 def moved(x: float) -> NDArray[np.float64]:
@@ -112,7 +117,7 @@ def test_a_motion_that_is_only_guessed_confirms_no_leap() -> None:
     class Guessing(OnRails):
         def align(self, state: tuple[float, float], frame: Frame, clock: Clock) -> Attempt:
             attempt = super().align(state, frame, clock)
-            return attempt if float(clock.elapsed) < 1.5 * DT else attempt._replace(usable=True, unknown=1)
+            return attempt if float(clock.elapsed) < 1.5 * DT else guessed(attempt)
 
     frame = Frame(np.full((2, 2), 9 * STEP, np.float32), np.full((2, 2), 5000, np.uint16), DT)
     clock = Clock(np.float32(DT), np.float32(0), np.uint32(1))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment
+from gavo_jax.bodies.aligner import UNKNOWN
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -266,11 +267,12 @@ def test_a_motion_that_is_only_guessed_says_nothing_of_depth() -> None:
     class Guessing(Doubtful):
         def align(self, state: Any, frame: Frame, clock: Any) -> Attempt:
             attempt = super().align(state, frame, clock)
-            return attempt._replace(unknown=1) if attempt.usable else attempt
+            return attempt._replace(result=attempt.result._replace(covariance=UNKNOWN))
 
     frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
-    attempt = DoubtingDepth(Guessing(True), Guessing(True)).align(0.0, frame, None)  # pyright: ignore[reportArgumentType]
-    assert not attempt.usable and attempt.result.status is Status.DEPTH_MISMATCH
+    for kind, usable in ((Guessing, False), (Doubtful, True)):
+        attempt = DoubtingDepth(kind(True), kind(True)).align(0.0, frame, None)  # pyright: ignore[reportArgumentType]
+        assert attempt.usable == usable and attempt.result.status is Status.DEPTH_MISMATCH
 
 
 @pytest.mark.parametrize(
