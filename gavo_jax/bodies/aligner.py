@@ -155,7 +155,7 @@ class BodyAware:
                 carried = 0 if attempt is found_none else int(scene.carried) + 1
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
-        is_vague = attempt.usable and not carried and _deviation(attempt) > GOES_ON[0]
+        is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
         if is_vague and np.any(before) and not self.is_eager:
             attempt = self._completed(state, clock, attempt)
             look = self._look(state, attempt)
@@ -321,7 +321,7 @@ def mistrusted(attempt: Attempt) -> Attempt:
     return attempt._replace(result=result._replace(status=status, findings=findings))
 
 
-def _deviation(attempt: Attempt) -> float:
+def deviation(attempt: Attempt) -> float:
     """Of an attempt's translation, metres."""
     return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.bodies.aligner import UNKNOWN, BodyAware, mistrusted
+from gavo_jax.bodies.aligner import UNKNOWN, BodyAware, deviation, mistrusted
 from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.scene import AwareState
@@ -144,7 +144,7 @@ class WithRival:
         other = self.second.align(rival.state, frame, clock)
         if not attempt.usable:  # that motion has come to an end, and the rival's goes on; whose it was stays open
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
-            if other.usable and _deviation(other) < EXACT and not depth_is_doubted:
+            if other.usable and deviation(other) < EXACT and not depth_is_doubted:
                 return self._taken(other, rival, open_for, open_for)
             return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
         if other.usable:
@@ -159,8 +159,8 @@ class WithRival:
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = int(rival.age) + 1
         contradiction = _distance(first, second, attempt.result, other.result)
-        apart, deviation = _between(first, second), _deviation(other)
-        if not deviation < VAGUE:
+        apart, uncertainty = _between(first, second), deviation(other)
+        if not uncertainty < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
         open_after = DECIDED if rival.stands_before else open_for
         confirmed = attempt._replace(state=self._alone(attempt.state, open_after))
@@ -173,10 +173,10 @@ class WithRival:
             margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
-            if deviation < EXACT and (ahead >= FRAMES or whole > LANDSLIDE):
+            if uncertainty < EXACT and (ahead >= FRAMES or whole > LANDSLIDE):
                 return self._taken(other, rival, open_for, open_after)
         certainty = min(contradiction / LARGEST, 1.0) + far
-        if contradicts and deviation < EXACTER and certainty > CLEAR:
+        if contradicts and uncertainty < EXACTER and certainty > CLEAR:
             return self._taken(other, rival, open_for, open_after)
         if age >= FRAMES and contradicts and certainty > DOUBTFUL:
             attempt = mistrusted(attempt)
@@ -255,11 +255,6 @@ def _distance(
     step = log(first @ inverse(second))
     covariance = np.asarray(own.covariance, np.float64) + np.asarray(other.covariance, np.float64)
     return float(step @ np.linalg.solve(covariance, step))
-
-
-def _deviation(attempt: Attempt) -> float:
-    """Of an attempt's translation, metres."""
-    return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:

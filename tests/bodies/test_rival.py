@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from gavo_jax.alignment.result import Alignment, no_alignment
-from gavo_jax.bodies.aligner import BodyAware, mistrusted
+from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
+from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import RivalledState, WithRival
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.bodies.surfaces import nearer_part, standing_before
@@ -165,17 +165,18 @@ class Scripted:
         return Attempt(state, result, usable)
 
 
-class Doubted:
-    """Stands for a search whose motions may be a body's."""
+class Flagged:
+    """Stands for a search whose every result has a finding."""
 
-    def __init__(self, first: Any) -> None:
-        self.first = first
+    def __init__(self, first: Any, finding: AlignmentStatus) -> None:
+        self.first, self.finding = first, finding
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.first, name)
 
     def align(self, state: Any, frame: Any, clock: Any) -> Attempt:
-        return mistrusted(self.first.align(state, frame, clock))
+        attempt = self.first.align(state, frame, clock)
+        return attempt._replace(result=with_finding(attempt.result, self.finding))
 
 
 def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
@@ -236,8 +237,7 @@ def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_is_unknown(open_fo
     """A card that fills the image leaves it: the search hands itself over to the room, over some frames."""
     aligner, frame = rivalled([(True, 0.0, 1e-3)], [])
     covered = replace(frame, depth=np.full_like(frame.depth, 5000))
-    first = aligner.first
-    object.__setattr__(aligner, "first", Doubted(first))
+    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.MOVING_BODY))
     state = aligner.start(covered)._replace(open_for=np.int32(open_for))
     assert aligner.align(state, covered, CLOCK).unknown == unknown
 
@@ -280,6 +280,14 @@ def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation:
     if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be
         assert ended.result.target_T_reference[0, 3] == pytest.approx(0.03, abs=1e-6)
         assert AlignmentStatus.MOVING_BODY in ended.result.statuses
+
+
+def test_where_depth_is_in_doubt_the_rival_does_not_take_over() -> None:
+    """Wrong depth ends the first motion, and looks like a body to the rival; it is looked at without depth first."""
+    aligner, frame = rivalled([(True, 0.0, 1e-3), (False, 0.0, 1.0)], [(True, 0.01, 1e-3)] * 2)
+    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.DEPTH_MISMATCH))
+    both = aligner.align(aligner.start(frame), frame, CLOCK)
+    assert not aligner.align(both.state, frame, CLOCK).usable
 
 
 def result_of(covariance: np.ndarray) -> Alignment:
