@@ -140,24 +140,24 @@ class BodyAware:
         """Align, and look what moves."""
         scene = state.scene
         before = np.asarray(scene.roll.labels) > 0
+        known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
-        attempt, look = self._agreed(state, frame, clock, first)
-        found, carried = _bodies(look.belief, before), 0
+        seen, look = self._agreed(state, frame, clock, first)
+        attempt, found, carried = seen, _bodies(look.belief, before), 0
         arisen = np.mean((found > 0) & ~_near(before))
-        is_lost = not attempt.usable and (np.any(before) or np.any(found))
+        is_lost = not attempt.usable and (known or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
-        is_depth_wrong = np.mean(before) < LARGE and depth_alone_disagrees(first.result.explained)
+        is_depth_wrong = covered < LARGE and depth_alone_disagrees(first.result.explained)
         if is_asked and not self.is_eager and not is_depth_wrong:
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 found_none = attempt
-                attempt = self._go_on(state, clock, found_none, covered=float(np.mean(before)))
+                attempt = self._go_on(state, clock, found_none, covered)
                 carried = 0 if attempt is found_none else int(scene.carried) + 1
-            look = self._look(state, attempt)
-            found = _bodies(look.belief, before)
         is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
-        if is_vague and np.any(before) and not self.is_eager:
+        if is_vague and known and not self.is_eager:
             attempt = self._completed(state, clock, attempt)
+        if attempt is not seen:
             look = self._look(state, attempt)
             found = _bodies(look.belief, before)
         return self._remember(state, frame, clock, attempt, look, found, carried)

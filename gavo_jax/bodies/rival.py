@@ -139,18 +139,16 @@ class WithRival:
             rival = self._rival_of(state.first, standing_before=not own.is_doubted)
             open_for = max(open_for, 0) if rival.is_there else open_for
         open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
-        if not rival.is_there:
-            return _open(attempt, open_for)._replace(state=self._alone(own, open_for))
-        other = self.second.align(rival.state, frame, clock)
-        if not attempt.usable:  # that motion has come to an end, and the rival's goes on; whose it was stays open
+        other = self.second.align(rival.state, frame, clock) if rival.is_there else None
+        if other is not None and other.usable:
+            if attempt.usable:
+                return self._decide(attempt, other, rival, open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
-            if other.usable and deviation(other) < EXACT and not depth_is_doubted:
+            if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
                 return self._taken(other, rival, open_for, open_for)
-            return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
-        if other.usable:
-            return self._decide(attempt, other, rival, open_for)
-        again = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
-        return _open(attempt, open_for)._replace(state=RivalledState(own, again, np.int32(open_for)))
+        elif other is not None and attempt.usable:
+            rival = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
+        return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:
         """Which of two attempts at a frame stands for it, and whether the rival is kept."""

@@ -47,6 +47,11 @@ class Attempt(NamedTuple):
     unknown: int = 0
     """So many of the last motions, this one included, are guesses."""
 
+    @property
+    def is_found(self) -> bool:
+        """Whether the motion can be used and the images tell of it: a guess fits any depth and any time."""
+        return self.usable and not np.all(np.diagonal(self.result.covariance) >= UNDETERMINED**2)
+
 
 class Aligner(Protocol):
     """Finds the motion of a new frame."""
@@ -218,7 +223,7 @@ class DoubtingDepth:
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt
         again = self.alone.align(state, without_depth(frame), clock)
-        if not again.usable or is_guess(again):  # which fits any depth
+        if not again.is_found:
             return attempt
         result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
         return again._replace(result=result, fit=False)
@@ -231,11 +236,6 @@ class DoubtingDepth:
 def without_depth(frame: Frame) -> Frame:
     """A frame of which only the image counts."""
     return replace(frame, depth=np.zeros_like(frame.depth))
-
-
-def is_guess(attempt: Attempt) -> bool:
-    """Whether an attempt's motion is the last one, gone on with, of which the images tell nothing."""
-    return bool(np.all(np.diagonal(attempt.result.covariance) >= UNDETERMINED**2))
 
 
 AGREEMENT = (0.02, 0.02)

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import size
-from gavo_jax.odometry.aligners import Aligner, Attempt, is_guess
+from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.plausibility import SMALLEST_SHIFT, TOLERANCE, image_shift, possible_change
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.status import AlignmentStatus
@@ -55,13 +55,13 @@ def align_leaping(
     if leap is not None and (attempt.usable or leaps):
         since = frame.timestamp - leap.timestamp
         again = aligner.align(state, frame, clock._replace(elapsed=np.float32(leap.seconds + since)))
-        if again.usable and not is_guess(again) and _goes_on(aligner, state, clock, leap, since, again):
+        if again.is_found and _goes_on(aligner, state, clock, leap, since, again):
             return again._replace(result=with_finding(again.result, AlignmentStatus.IMPLAUSIBLE_MOTION)), None
     if not leaps:
         return attempt, None
     seconds = _seconds(aligner, state, clock, attempt)
     again = aligner.align(state, frame, clock._replace(elapsed=np.float32(seconds)))
-    if not again.usable or is_guess(again):
+    if not again.is_found:
         return attempt, None
     return attempt, Leap(np.asarray(again.result.target_T_reference, np.float64), seconds, frame.timestamp)
 

@@ -179,25 +179,6 @@ class Flagged:
         return attempt._replace(result=with_finding(attempt.result, self.finding))
 
 
-def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
-    """Nothing stands before anything else in the first frames, so that there is no rival to tell."""
-    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
-    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
-    search = Search(CAMERA, SETTINGS, jax.random.key(0))
-    aware = BodyAware(search, search)
-    aligner = WithRival(Scripted(aware, *[(True, 0.05, 1e-3)] * 7))  # pyright: ignore[reportArgumentType]
-    object.__setattr__(aligner, "second", Scripted(aware, (True, 0.0, 1e-3)))
-    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
-    state, seen = aligner.start(covered), aligner.start(frame)
-    assert not state.rival.is_there and seen.rival.is_there
-    for _ in range(6):
-        attempt = aligner.align(state, covered, clock)
-        state = attempt.state
-        assert attempt.unknown == 0 and not state.rival.is_there
-    taken = aligner.align(state._replace(rival=seen.rival), frame, clock)
-    assert taken.unknown == 6 and int(taken.state.open_for) < 0
-
-
 def rivalled(
     first: list[tuple[bool, float, float]], second: list[tuple[bool, float, float]]
 ) -> tuple[WithRival, Frame]:
@@ -210,6 +191,20 @@ def rivalled(
 
 
 CLOCK = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+
+
+def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
+    """Nothing stands before anything else in the first frames, so that there is no rival to tell."""
+    aligner, frame = rivalled([(True, 0.05, 1e-3)] * 7, [(True, 0.0, 1e-3)])
+    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
+    state, seen = aligner.start(covered), aligner.start(frame)
+    assert not state.rival.is_there and seen.rival.is_there
+    for _ in range(6):
+        attempt = aligner.align(state, covered, CLOCK)
+        state = attempt.state
+        assert attempt.unknown == 0 and not state.rival.is_there
+    taken = aligner.align(state._replace(rival=seen.rival), frame, CLOCK)
+    assert taken.unknown == 6 and int(taken.state.open_for) < 0
 
 
 def test_motions_that_part_slowly_are_told_apart_by_how_far_they_are_apart_since_the_anchor() -> None:
@@ -245,20 +240,15 @@ def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_is_unknown(open_fo
 @pytest.mark.parametrize(("missed", "unknown"), [(0, 0), (4, 4)])
 def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(missed: int, unknown: int) -> None:
     """A rival that could not be followed at first is asked for again; its anchor is then the later frame."""
-    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
-    search = Search(CAMERA, SETTINGS, jax.random.key(0))
-    aware = BodyAware(search, search)
-    aligner = WithRival(Scripted(aware, *[(True, 0.05, 1e-3)] * (missed + 1)))  # pyright: ignore[reportArgumentType]
-    second = Scripted(aware, *[(False, 0.0, 1.0)] * missed, (True, 0.0, 1e-3))
-    object.__setattr__(aligner, "second", second)
+    second = [(False, 0.0, 1.0)] * missed + [(True, 0.0, 1e-3)]
+    aligner, frame = rivalled([(True, 0.05, 1e-3)] * (missed + 1), second)
     state = aligner.start(frame)
     assert state.rival.is_there and int(state.open_for) == 0
-    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
     for _ in range(missed):
-        attempt = aligner.align(state, frame, clock)
+        attempt = aligner.align(state, frame, CLOCK)
         state = attempt.state
         assert state.rival.is_there and attempt.unknown == 0
-    taken = aligner.align(state, frame, clock)
+    taken = aligner.align(state, frame, CLOCK)
     assert not taken.state.rival.is_there and int(taken.state.open_for) < 0
     assert taken.unknown == unknown and AlignmentStatus.MOVING_BODY in taken.result.statuses
     assert taken.result.target_T_reference[0, 3] == pytest.approx(0.0, abs=1e-6)
@@ -266,15 +256,11 @@ def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(
 
 @pytest.mark.parametrize(("deviation", "usable"), [(1e-3, True), (0.02, False)])
 def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation: float, usable: bool) -> None:
-    frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
-    search = Search(CAMERA, SETTINGS, jax.random.key(0))
-    aware = BodyAware(search, search)
-    aligner = WithRival(Scripted(aware, (True, 0.0, 1e-3), (False, 0.0, 1.0)))  # pyright: ignore[reportArgumentType]
-    object.__setattr__(aligner, "second", Scripted(aware, (True, 0.01, 1e-3), (True, 0.02, deviation)))
-    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
-    both = aligner.align(aligner.start(frame), frame, clock)
+    first, second = [(True, 0.0, 1e-3), (False, 0.0, 1.0)], [(True, 0.01, 1e-3), (True, 0.02, deviation)]
+    aligner, frame = rivalled(first, second)
+    both = aligner.align(aligner.start(frame), frame, CLOCK)
     assert both.usable and both.state.rival.is_there and both.result.status == AlignmentStatus.OK
-    ended = aligner.align(both.state, frame, clock)
+    ended = aligner.align(both.state, frame, CLOCK)
     assert ended.usable == usable and ended.state.rival.is_there != usable
     assert int(ended.state.open_for) == 2, "nobody has said whose motion either is"
     if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be
