@@ -71,9 +71,11 @@ class Alignment(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """What is known of the result, in one sentence for people."""
-        words = self.status.sentence
-        return f"{words[:-1]}, above all {self.undetermined}." if self.undetermined else words
+        """What is known of the result, in a sentence or two for people."""
+        words, left_open = self.status.sentence, self.undetermined
+        if left_open and self.status is AlignmentStatus.LOW_TEXTURE:
+            return f"{words[:-1]}, above all {left_open}."
+        return f"{words} The images leave open: {left_open}." if left_open else words
 
 
 MAX_TRANSLATION_DEVIATION = 0.05

@@ -96,7 +96,7 @@ class Mapper:
             if is_found:
                 self._tie(keyframe)
             self._newest = None
-        elif frame is not None:
+        elif frame is not None and step.origin == "tracked":
             self._newest = frame, step, twist
 
     def find(self, frame: Frame) -> Found | None:
@@ -111,8 +111,8 @@ class Mapper:
 
     def is_due(self, step: Step) -> bool:
         """Whether a step's frame will become a keyframe."""
-        if step.lost or step.origin == "relocalised":
-            return not step.lost
+        if step.origin != "tracked":  # a guess ties nothing to the rest
+            return step.origin == "relocalised"
         return self.keyframes.is_due(step.world_T_camera, step.segment)
 
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:

@@ -94,6 +94,15 @@ def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:
     return steps
 
 
+def test_a_guessed_frame_becomes_no_keyframe():
+    """Others were found against it, and a way that nobody knows counted as one that is known."""
+    mapper, steps = Mapper(CAMERA), drifting(WALK, np.zeros(6))
+    mapper.watch(WALK[0], None)
+    for step in steps:
+        mapper.watch(WALK[step.index], replace(step, origin="guessed"))
+    assert [keyframe.index for keyframe in mapper.finish().keyframes] == [0]
+
+
 def test_loops_bring_the_end_back_to_where_it_was():
     pytest.importorskip("gtsam")
     mapper, steps = Mapper(CAMERA), drifting(WALK, np.array([2e-3, -1e-3, 1e-3, 0.0, 1e-3, 5e-4]))
