@@ -176,9 +176,8 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
     panels = _panels(figure, len(histories), one_scale=True)
     for axes, (level, history) in zip(panels, histories.items(), strict=True):
         error = _carry_on(history)
-        is_known = np.isfinite(error[:, -1])  # a search that sees nothing ends with an error of infinity
-        error = error[is_known] if is_known.any() else error
-        excess = 100.0 * (error[:, :-1] / np.maximum(error[:, -1:], 1e-12) - 1.0)
+        end = np.where(np.isfinite(error[:, -1:]), error[:, -1:], np.nan)  # infinite where a search sees nothing
+        excess = 100.0 * (error[:, :-1] / np.maximum(end, 1e-12) - 1.0)
         iterations = np.arange(1, excess.shape[1] + 1)
         _draw_band(axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of them")
         axes.set(title=f"level {level}", xlabel="iteration", yscale="log")
