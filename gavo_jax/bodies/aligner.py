@@ -50,8 +50,8 @@ GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
 """Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
-MAX_CARRIED = 15
-"""for so many frames."""
+MAX_CARRIED = 0.5
+"""for so many seconds."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
 SUSPICIOUS = 0.02
@@ -125,12 +125,12 @@ class BodyAware:
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
         tracker = self.search.blank_state()
-        return AwareState(tracker, self.retina.blank(), tracker.previous if self.tracks else None)
+        return AwareState(tracker, self.retina.blank(), tracker.previous)
 
     def start(self, frame: Frame) -> AwareState:
         """A scene in which nothing is known to move."""
         tracker = self.first.start(frame)
-        return AwareState(tracker, self.retina.first(tracker), tracker.previous if self.tracks else None)
+        return AwareState(tracker, self.retina.first(tracker), tracker.previous)
 
     def predict(self, state: AwareState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """Of the search."""
@@ -143,7 +143,7 @@ class BodyAware:
         known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
-        attempt, found, carried = seen, _bodies(look.belief, before), 0
+        attempt, found, carried = seen, _bodies(look.belief, before), 0.0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (known or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
@@ -153,7 +153,7 @@ class BodyAware:
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 found_none = attempt
                 attempt = self._go_on(state, clock, found_none, covered)
-                carried = 0 if attempt is found_none else int(scene.carried) + 1
+                carried = 0.0 if attempt is found_none else float(scene.carried + clock.elapsed)
         is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
         if is_vague and known and not self.is_eager:
             attempt = self._completed(state, clock, attempt)
@@ -170,7 +170,7 @@ class BodyAware:
         attempt: Attempt,
         look: Look,
         found: Integer[np.ndarray, "h w"],
-        carried: int,
+        carried: float,
     ) -> Attempt:
         """An attempt with its bodies and all that is known after it; from a motion in doubt nothing is learnt."""
         scene, retina = state.scene, self.retina
@@ -184,10 +184,10 @@ class BodyAware:
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
-        whole = tracker.previous if self.tracks else None
-        suspected = suspect(look.belief, found > 0, trusted=not is_doubted)
-        after = retina.renewed(scene, look)._replace(
-            roll=roll, carried=np.asarray(carried, np.int32), suspected=suspected
+        whole, elapsed = tracker.previous, float(clock.elapsed)
+        suspected = suspect(look.belief, found > 0, elapsed, trusted=not is_doubted)
+        after = retina.renewed(scene, look, elapsed)._replace(
+            roll=roll, carried=np.asarray(carried, np.float32), suspected=suspected
         )
         if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
             after = after._replace(known=look.belief.carried)
@@ -226,19 +226,29 @@ class BodyAware:
         """The motion that most of what was at rest agrees with.
 
         Those that may be the camera's are the one that was found, that of what it leaves unexplained, and that of what
-        the last motion, gone on with, explains. The best is searched for again without what moves by it.
+        the last motion, gone on with, explains; where nothing was known to move, what was found may be a wrong one, and
+        the search that begins from rest is another. The best is searched for again without what moves by it.
         """
         scene, tracker, retina = state.scene, state.tracker, self.retina
+        known = bool(np.any(np.asarray(scene.roll.labels)))
 
-        def search_without(mask: Array) -> Candidate:
-            attempt = self.search.align(retina.without(tracker, mask), frame, clock)
+        def candidate(attempt: Attempt) -> Candidate:
             return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
 
-        found = Candidate(first, retina.look_back(scene, first.state, first.result.target_T_reference))
+        def search_from(tracker: TrackerState) -> Candidate:
+            return candidate(self.search.align(tracker, frame, clock))
+
+        def search_without(mask: Array) -> Candidate:
+            return search_from(retina.without(tracker, mask))
+
+        found = candidate(first)
         predicted = retina.look_back(scene, first.state, self.predict(state, float(clock.elapsed)))
         tried = [found]
         if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
             tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]
+        if not first.usable and not known:
+            at_rest = tracker._replace(previous=state.whole, keyframe=state.whole, guess=jnp.zeros(6))
+            tried += [search_from(at_rest)]
         best = max(tried, key=lambda candidate: candidate.rank)
         for _ in range(ROUNDS):
             again = search_without((best.belief.moving > 0) | best.belief.hidden)
@@ -248,7 +258,7 @@ class BodyAware:
             best = again
             if gain < GAIN:
                 break
-        return _judged(best, tried, bool(np.any(np.asarray(scene.roll.labels))))
+        return _judged(best, tried, known)
 
     def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion

@@ -28,8 +28,8 @@ FAR = 12.0
 """Depth evidence beyond which what is seen is another surface and not the same one, moved."""
 SAME = 5.0
 """Depth evidence up to which a pixel shows the surface that was seen at its place before."""
-FADING = 0.92
-"""Part of a suspicion that stays from frame to frame."""
+FADING = 0.4
+"""Seconds in which a suspicion falls to 1/e."""
 RELEASED = -0.57
 """Belief from which on a surface is at rest beyond doubt, and suspected no more."""
 TIED = 0.5
@@ -114,16 +114,19 @@ def form_belief(
     )
 
 
-def suspect(belief: Belief, bodies: Bool[np.ndarray, "h w"], *, trusted: bool) -> Float[np.ndarray, "h w"]:
+def suspect(
+    belief: Belief, bodies: Bool[np.ndarray, "h w"], elapsed: float, *, trusted: bool
+) -> Float[np.ndarray, "h w"]:
     """What is suspected after a frame: its bodies, and what was suspected before.
 
     Args:
         belief: Of the frame's pixels.
         bodies: Where the frame shows bodies.
+        elapsed: Seconds since the frame before.
         trusted: Whether the camera's motion is; by a wrong one the scene seems to move, and nothing is learnt.
     """
     before = np.where(np.asarray(belief.known) < RELEASED, 0.0, np.asarray(belief.suspected))
-    return np.asarray(np.maximum(FADING * before, bodies) if trusted else before, np.float32)
+    return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies) if trusted else before, np.float32)
 
 
 def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:

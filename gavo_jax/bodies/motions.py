@@ -66,7 +66,6 @@ def find_motions(
 def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: Roll, number: int) -> Alignment:
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
-    assert state.whole is not None
     whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.passing) else state.whole
     motion = jnp.asarray(before.motions[place], jnp.float32)
     tracker = state.tracker._replace(

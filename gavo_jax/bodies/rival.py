@@ -70,6 +70,8 @@ class Rival(NamedTuple):
     """Motion since the anchor by the first search,"""
     rival_T_anchor: Float[np.ndarray, "4 4"]
     """and by the rival's."""
+    vaguest: Float[np.ndarray, "6 6"]
+    """Covariance of the rival's motion where it was known least well since the anchor."""
     age: Any
     """Frames since the anchor; -1 where there is no rival."""
     ahead: Any
@@ -148,6 +150,8 @@ class WithRival:
                 return self._taken(other, rival, open_for, open_for)
         elif other is not None and attempt.usable:
             rival = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
+        if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
+            rival = self._nobody
         return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:
@@ -156,7 +160,8 @@ class WithRival:
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = int(rival.age) + 1
-        contradiction = _distance(first, second, attempt.result, other.result)
+        vaguest = max(rival.vaguest, other.result.covariance, key=np.trace)
+        contradiction = _distance(first, second, np.asarray(attempt.result.covariance) + vaguest)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
@@ -164,15 +169,16 @@ class WithRival:
         confirmed = attempt._replace(state=self._alone(attempt.state, open_after))
         if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
             return confirmed
-        far, ahead = 0.0, 0
-        contradicts = contradiction > CONTRADICTED and _exceeds(apart, TOGETHER if rival.stands_before else APART)
-        if _exceeds(apart, APART):
+        far, ahead, is_asked = 0.0, 0, _exceeds(apart, APART)
+        if is_asked:
             motions = np.stack([first, second]).astype(np.float32)
             margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
-            if uncertainty < EXACT and (ahead >= FRAMES or whole > LANDSLIDE):
+            if uncertainty < EXACT and far > 0.0 and (ahead >= FRAMES or whole > LANDSLIDE):
                 return self._taken(other, rival, open_for, open_after)
+        contradicts = contradiction > CONTRADICTED and (far > 0.0 if is_asked else bool(rival.stands_before))
+        contradicts &= _exceeds(apart, TOGETHER)
         certainty = min(contradiction / LARGEST, 1.0) + far
         if contradicts and uncertainty < EXACTER and certainty > CLEAR:
             return self._taken(other, rival, open_for, open_after)
@@ -186,6 +192,7 @@ class WithRival:
             state=other.state,
             first_T_anchor=first.astype(np.float32),
             rival_T_anchor=second.astype(np.float32),
+            vaguest=np.asarray(vaguest, np.float32),
             age=np.int32(age),
             ahead=np.int32(ahead),
         )
@@ -203,7 +210,8 @@ class WithRival:
         """No rival, in the shapes and types of every one."""
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
         nothing = np.zeros(self.first.retina.size, bool)
-        return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, np.int32(-1), np.int32(0))
+        exact = np.zeros((6, 6), np.float32)
+        return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, exact, np.int32(-1), np.int32(0))
 
     def _alone(self, state: AwareState, open_for: int) -> RivalledState:
         """A state without a rival."""
@@ -224,7 +232,7 @@ class WithRival:
             known=np.asarray(near, np.float32),  # pyright: ignore[reportArgumentType]
             suspected=np.asarray(near, np.float32),
             roll=roll,
-            carried=np.zeros((), np.int32),
+            carried=np.zeros((), np.float32),
         )
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
         seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
@@ -245,14 +253,11 @@ def _view(state: AwareState) -> View:
 
 
 def _distance(
-    first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"], own: Alignment, other: Alignment
+    first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
 ) -> float:
-    """Squared Mahalanobis distance of two motions since the anchor, each as exact as its last result: both are found
-    against a keyframe.
-    """
+    """Squared Mahalanobis distance of two motions since the anchor."""
     step = log(first @ inverse(second))
-    covariance = np.asarray(own.covariance, np.float64) + np.asarray(other.covariance, np.float64)
-    return float(step @ np.linalg.solve(covariance, step))
+    return float(step @ np.linalg.solve(np.asarray(covariance, np.float64), step))
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:

@@ -24,8 +24,8 @@ from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
-OLD = 7
-"""Frames after which an older view takes the place of the one before,"""
+OLD = 0.22
+"""Seconds after which an older view takes the place of the one before,"""
 FAR_OFF = 0.7
 """or part of what is at rest that it sees, below which it does at once: over a long way, errors of the poses and other
 light look like bodies."""
@@ -44,10 +44,10 @@ class Scene(NamedTuple):
     """Of the last frame, of an older one and of one between them, [3]: what moves slowly shows in the older one."""
     views_T_last: Float[Array, "3 4 4"]
     """Motions from the last frame's camera into these."""
-    age: Integer[np.ndarray, ""]
-    """Frames since the one between them."""
-    carried: Integer[np.ndarray, ""]
-    """Frames for which the last motion has stood in for one that could not be found."""
+    age: Float[np.ndarray, ""]
+    """Seconds since the one between them."""
+    carried: Float[np.ndarray, ""]
+    """Seconds for which the last motion has stood in for one that could not be found."""
 
 
 class AwareState(NamedTuple):
@@ -56,8 +56,8 @@ class AwareState(NamedTuple):
     tracker: TrackerState
     """Its references have no points on bodies."""
     scene: Scene
-    whole: Reference | None = None
-    """The last frame's points with those on bodies; kept where bodies are tracked."""
+    whole: Reference
+    """The last frame's points with those on bodies."""
     is_doubted: Any = np.zeros((), bool)
     """Whether the last motion may be a body's, by a stricter measure than the status's."""
 
@@ -114,7 +114,7 @@ class Retina:
         """A scene before the first frame, in the shapes and types of every scene."""
         words: Any = np.zeros((3, *self.size), np.uint32)
         views = View(Target(words, words), jnp.zeros((3, 6)))
-        nothing: Any = np.zeros((), np.int32)
+        nothing: Any = np.zeros((), np.float32)
         unknown, still = jnp.zeros(self.size), jnp.tile(jnp.eye(4), (3, 1, 1))
         return Scene(unknown, unknown, Roll.empty(self.size), views, still, nothing, nothing)
 
@@ -125,7 +125,7 @@ class Retina:
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
-        keep = (1, 2) if int(scene.age) + 1 < OLD else (2, 0)
+        keep = (1, 2) if float(scene.age) + float(tracker.seconds) < OLD else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
             (tracker.previous_image, tracker.passing, tracker.seconds),
@@ -145,15 +145,16 @@ class Retina:
             levels=self.levels,
         )
 
-    def renewed(self, scene: Scene, look: Look) -> Scene:
-        """The scene with the new frame as its last one."""
+    def renewed(self, scene: Scene, look: Look, elapsed: float) -> Scene:
+        """The scene with the new frame as its last one, so many seconds later."""
         is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
-        age = OLD - 1 if is_far_off else (int(scene.age) + 1) % OLD
+        age = float(scene.age) + elapsed
+        age = OLD if is_far_off else age if age < OLD else 0.0
         return scene._replace(
             known=look.belief.known,
             views=look.views,
             views_T_last=look.views_T_here,
-            age=np.asarray(age, np.int32),
+            age=np.asarray(age, np.float32),
         )
 
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:

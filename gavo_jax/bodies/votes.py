@@ -18,6 +18,8 @@ from gavo_jax.program_cache import CachedProgram
 
 DECISIVE = 6.0
 """Difference of two costs from which on a block has its whole vote."""
+QUORUM = 0.5
+"""Part of the blocks that have to be in view of both for a margin to count in full."""
 FREEDOM = 5.0
 """Degrees of freedom of the t distribution that a pixel's cost is of (Kerl et al. 2013)."""
 
@@ -54,9 +56,12 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
         t = jnp.log1p((residual / scale) ** 2 / FREEDOM)
         cost += jnp.where(both, 0.5 * (FREEDOM + 1.0) * t, 0.0)
     seen = jnp.all(r.inside > 0, axis=0) & has
-    area = jnp.where(seen, surface_area(q), 0.0)
+    area = surface_area(q)
     far = jnp.where(near[::STRIDE, ::STRIDE].reshape(-1), 0.0, area)
-    first, second, area, far = block_sums(jnp.stack([*cost, area, far]), camera)
+    first, second, *areas = block_sums(jnp.stack([*cost, area, far, area * seen, far * seen]), camera)
     vote = jnp.clip((first - second) / DECISIVE, -1.0, 1.0)
-    whole, part = (jnp.sum(weight * vote) / jnp.maximum(jnp.sum(weight), 1e-6) for weight in (area, far))
-    return Margin(whole, part)
+
+    def margin(area: jax.Array, in_view: jax.Array) -> jax.Array:
+        return jnp.sum(in_view * vote) / jnp.maximum(jnp.sum(in_view), QUORUM * jnp.sum(area) + 1e-6)
+
+    return Margin(margin(areas[0], areas[2]), margin(areas[1], areas[3]))

@@ -26,7 +26,7 @@ from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
-from gavo_jax.odometry.aligners import Attempt, blank_of
+from gavo_jax.odometry.aligners import Attempt, Search, blank_of
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.presets import preset
@@ -245,9 +245,26 @@ def test_a_suspicion_fades_ends_where_all_is_at_rest_and_is_not_learnt_from_a_wr
     belief = beliefs(Carded(moves=False))[0]._replace(
         known=np.where(field(OTHER) > 0, -0.9, 0.5), suspected=np.ones((60, 80))
     )  # pyright: ignore
-    after = suspect(belief, body, trusted=True)
+    after = suspect(belief, body, 1 / 30, trusted=True)
     assert np.all(after[body] == 1) and not np.any(after[field(OTHER) > 0]) and 0.9 < after[0, 0] < 1
-    assert not np.any(suspect(belief._replace(suspected=np.zeros((60, 80))), body, trusted=False))  # pyright: ignore
+    assert suspect(belief, body, 0.2, trusted=True)[0, 0] == pytest.approx(after[0, 0] ** 6, rel=1e-5), "by the clock"
+    nobody = belief._replace(suspected=np.zeros((60, 80)))  # pyright: ignore
+    assert not np.any(suspect(nobody, body, 1 / 30, trusted=False))
+
+
+@pytest.mark.parametrize(("rate", "frames"), [(30, 7), (10, 3), (5, 2)])
+def test_the_oldest_view_is_of_about_a_quarter_of_a_second_ago_at_any_frame_rate(rate: int, frames: int) -> None:
+    """Counted in frames it lay two seconds back where there are five a second, and all the drift since was a body."""
+    retina = Retina(CAMERA, TRACKED)
+    tracker = Search(CAMERA, TRACKED, jax.random.key(0)).start(SyntheticSequence(frames=1, camera=CAMERA)[0])
+    tracker = tracker._replace(seconds=np.float32(1 / rate))
+    scene, kept = retina.first(tracker), []
+    for _ in range(frames):
+        before = scene.age
+        look = retina.look(scene, tracker, np.eye(4))
+        scene = retina.renewed(scene, look, 1 / rate)
+        kept.append(float(scene.age) > float(before))
+    assert kept == [True] * (frames - 1) + [False]
 
 
 def test_a_strong_body_before_a_plain_room_does_not_take_the_camera_along_from_the_first_frame_on() -> None:
@@ -272,12 +289,13 @@ def test_an_older_view_that_sees_little_of_the_image_goes_at_once(in_view: float
     odometry = Odometry(CAMERA, TRACKED)
     odometry.register(Carded()[0], 0.0)
     state, retina = odometry.progress.tracker.first, Retina(CAMERA, TRACKED)
+    state = state._replace(tracker=state.tracker._replace(seconds=np.float32(1 / 30)))
     look = retina.look(state.scene, state.tracker, np.eye(4))
     belief = look.belief._replace(in_view=jnp.array([1.0, in_view]))
-    scene = retina.renewed(state.scene, look._replace(belief=belief))
+    scene = retina.renewed(state.scene, look._replace(belief=belief), 1 / 30)
     older, between = scene.views_T_last[1], jnp.eye(4).at[0, 3].set(0.1)
     scene = scene._replace(views_T_last=scene.views_T_last.at[2].set(between))
-    after = retina.renewed(scene, retina.look(scene, state.tracker, np.eye(4)))
+    after = retina.renewed(scene, retina.look(scene, state.tracker, np.eye(4)), 1 / 30)
     np.testing.assert_allclose(after.views_T_last[1], between if goes else older, atol=1e-6)
 
 
