@@ -120,7 +120,8 @@ class Retina:
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
-        view = view_of(tracker.previous_image, self.levels, jnp.full(6, jnp.nan))
+        unknown = jnp.full(6, jnp.nan, jnp.float32)  # of the type of every scene's: another one takes another program
+        view = view_of(tracker.previous_image, self.levels, unknown)
         return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), view))
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:

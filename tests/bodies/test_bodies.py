@@ -273,9 +273,10 @@ def test_a_strong_body_before_a_plain_room_does_not_take_the_camera_along_from_t
     assert np.linalg.norm(run(Carded(), IGNORED)[0].world_T_camera[:3, 3]) > 0.03
 
 
-def test_no_frame_after_the_warm_up_waits_for_a_program() -> None:
+def test_no_frame_after_the_warm_up_waits_for_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kept programs are compiled once for each kind of input, wherever that lies."""
     sequence, odometry = Carded(), Odometry(CAMERA, TRACKED)
+    monkeypatch.setattr(program_cache, "_loaded", {})
     odometry.warm_up()
     before = set(program_cache._loaded)
     assert {"_look", "track_frame"} <= {function.__name__ for function, *_ in before}
