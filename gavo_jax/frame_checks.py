@@ -151,6 +151,16 @@ def check_frame(
     return (late if depth.status is AlignmentStatus.OK else depth), history
 
 
+def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:
+    """What speaks against an image [H, W] and its depth by themselves, without any frame before."""
+    rows = np.asarray(grey)[::ROW_STEP]
+    if not _is_finite(rows).all():
+        return (AlignmentStatus.NOT_FINITE,)
+    clipped = np.count_nonzero((rows <= BLACK) | (rows >= WHITE)) / rows.size
+    finding, _ = _check_depth(np.asarray(depth)[::ROW_STEP], depth_scale, History())
+    return tuple(status for status in (_check_image(rows, clipped), finding.status) if status)
+
+
 def _refused(status: AlignmentStatus) -> Finding:
     return Finding(status, Use.NOTHING)
 

@@ -76,7 +76,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
             reasons.append(str(error))
         finding, history = check_frame(frame, float(timestamp), sequence.camera, history)
         if finding.use is Use.NOTHING:
-            statuses[finding.status.name.lower()] += 1
+            statuses[str(finding.status)] += 1
         else:
             used += 1
         if isinstance(frame, Frame):

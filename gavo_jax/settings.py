@@ -143,7 +143,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         parts: `alignment` and `odometry`, likewise: what callers of version 0.1 hand over one by one.
 
     Raises:
-        TypeError: `value` is neither.
+        TypeError: `value` is neither, or the loss is no function.
     """
     if value is None:
         settings = Settings()
@@ -159,4 +159,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         warnings.warn(words, DeprecationWarning, stacklevel=3)
     if solver is not None:
         given["solver"] = solver
-    return replace(settings, **given)
+    settings = replace(settings, **given)
+    if not callable(settings.alignment.loss):
+        raise TypeError(f"loss: a function is needed, as in gavo_jax.LOSSES, not {settings.alignment.loss!r}")
+    return settings

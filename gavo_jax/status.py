@@ -36,6 +36,10 @@ class AlignmentStatus(enum.IntEnum):
         """One sentence for people."""
         return _SENTENCES[self]
 
+    def __str__(self) -> str:
+        """The name as it stands in files."""
+        return self.name.lower()
+
 
 _SENTENCES = {
     AlignmentStatus.OK: "The motion was found.",

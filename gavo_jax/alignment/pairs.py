@@ -16,11 +16,12 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
+from gavo_jax.frame_checks import check_images
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.status import AlignmentStatus, bit
 
 
 class Images(NamedTuple):
@@ -134,6 +135,20 @@ def moving_rows(
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
+def with_image_findings(result: Alignment, sides: Any, camera: Camera) -> Alignment:
+    """A batch's results on the host, with what speaks against each image by itself: depth may tell of a motion to a
+    black image, or numbers that are no metres agree with each other. Of a target the grey image is enough.
+    """
+    status, findings = np.array(result.status), np.array(result.findings)
+    pairs = zip(*(np.asarray(images) for side in sides for images in side), strict=True)
+    for k, (grey0, depth0, grey1, depth1) in enumerate(pairs):
+        found = set(check_images(grey1, depth1, camera.depth_scale)) - {AlignmentStatus.NO_DEPTH}
+        for finding in sorted(found.union(check_images(grey0, depth0, camera.depth_scale))):
+            status[k] = status[k] or finding
+            findings[k] |= bit(finding)
+    return result._replace(status=status, findings=findings)
+
+
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
     """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
     first `count` rows alone, where that is given.
@@ -195,7 +210,8 @@ def align(
     guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
     result = on_host(align_rows(sides, camera, settings, keys, with_features(guesses, sides, camera, settings)))
     delays = list(zip(depth_delays([reference], 1), depth_delays([target], 1), strict=True))
-    row = jax.tree.map(lambda leaf: leaf[0], moving_rows(result, sides, camera, settings, delays))
+    result = with_image_findings(moving_rows(result, sides, camera, settings, delays), sides, camera)
+    row = jax.tree.map(lambda leaf: leaf[0], result)
     return row._replace(status=AlignmentStatus(int(row.status)))
 
 
@@ -239,15 +255,18 @@ def align_batch(
     guesses = with_features(guesses, sides, camera, settings)
     result = on_host(align_rows(sides, camera, settings, keys, guesses))
     delays = list(zip(depth_delays(references, count), depth_delays(targets, count), strict=True))
-    return moving_rows(result, sides, camera, settings, delays)
+    return with_image_findings(moving_rows(result, sides, camera, settings, delays), sides, camera)
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
+    if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
+        raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
     grey, depth = (frame.grey, frame.depth) if isinstance(frame, Frame) else frame
     expected = (camera.height, camera.width)
     for name, image in (("grey", grey), ("depth", depth)):
         if np.shape(image) != expected:
-            raise GavoError(f"{name} image is of shape {np.shape(image)}, the camera's is {expected}")
+            hint = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
+            raise GavoError(f"{name} image is of shape {np.shape(image)}, the camera's is {expected}{hint}")
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)

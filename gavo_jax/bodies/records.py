@@ -63,7 +63,7 @@ class Body:
     @property
     def status(self) -> str:
         """In a word: that of its motion; `seen` where there is none."""
-        return "seen" if self.alignment is None else self.alignment.status.name.lower()
+        return "seen" if self.alignment is None else str(self.alignment.status)
 
 
 def in_world(

@@ -58,7 +58,7 @@ def align(options: Align) -> int:
         "error": found.error,
         "overlap": found.overlap,
         "covariance": found.covariance,
-        "status": found.status.name.lower(),
+        "status": str(found.status),
         "status_sentence": found.sentence,
         "camera_from": calibration.origin,
         "depth_units_per_metre": pair.depth_unit.file,

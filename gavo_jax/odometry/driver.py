@@ -357,7 +357,9 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
     for name, image in (("grey", frame.grey), ("depth", frame.depth)):
         kind = np.asarray(image).dtype
         if np.shape(image) != size or kind.kind not in "uif":
-            raise FrameError(f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed")
+            hint = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
+            given = f"{name} image is {kind} of shape {np.shape(image)}"
+            raise FrameError(f"{given}: numbers of shape {size} are needed{hint}")
     if not camera.is_distorted:
         return frame
     grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))

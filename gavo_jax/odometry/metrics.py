@@ -97,7 +97,7 @@ def compute_metrics(
         "frames": len(steps) + 1,
         "pairs": len(steps),
         "lost_pairs": sum(step.lost for step in steps),
-        "statuses": dict(Counter(step.alignment.status.name.lower() for step in steps)),
+        "statuses": dict(Counter(str(step.alignment.status) for step in steps)),
         "segments": 1 + (breaks := steps[-1].segment if steps else 0),
         "unknown_motions": breaks,
         "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),

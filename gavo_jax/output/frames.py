@@ -94,14 +94,14 @@ def frame_row(step: Step) -> list[Any]:
         f"{step.timestamp:.6f}",
         _digits(alignment.error),
         _digits(alignment.overlap),
-        alignment.status.name.lower(),
+        str(alignment.status),
         alignment.undetermined,
         int(step.lost),
         step.policy,
         *map(_digits, deviations),
         f"{step.milliseconds:.3f}",
         step.segment,
-        " ".join(status.name.lower() for status in alignment.statuses),
+        " ".join(str(status) for status in alignment.statuses),
         step.origin,
     ]
 

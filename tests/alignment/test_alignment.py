@@ -33,7 +33,7 @@ from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
-from gavo_jax.status import AlignmentStatus, as_findings, gravest
+from gavo_jax.status import AlignmentStatus, as_findings, bit, gravest
 
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
 Images = tuple[np.ndarray, np.ndarray]
@@ -370,6 +370,45 @@ def test_nothing_but_numbers_comes_out_of_nothing(sequence: SyntheticSequence, f
     result = run("gauss-newton", blind(black(frames[0])), blind(black(frames[1])), sequence.camera)
     assert np.isfinite(result.target_T_reference).all()
     assert result.status is not AlignmentStatus.OK
+
+
+def grey_of(value: int) -> Callable[[Images], Images]:
+    return lambda images: (np.full_like(images[0], value), images[1])
+
+
+def in_metres(images: Images) -> Images:
+    return images[0], (images[1] / CAMERA.depth_scale).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "finding"),
+    [
+        (grey_of(0), AlignmentStatus.BLANK),
+        (grey_of(255), AlignmentStatus.BLANK),
+        (in_metres, AlignmentStatus.DEPTH_UNITS),
+        (lambda images: (np.where(images[0] > 200, np.nan, images[0]), images[1]), AlignmentStatus.NOT_FINITE),
+    ],
+)
+def test_what_an_image_says_by_itself_is_told(
+    spoil: Callable[[Images], Images], finding: AlignmentStatus, small_frames: dict[int, Frame]
+) -> None:
+    """A white target and depth in metres where raw numbers belong were `ok`."""
+    before, after = ((small_frames[i].grey, small_frames[i].depth) for i in (0, 1))
+    for pair in ((before, spoil(after)), (spoil(before), spoil(after))):
+        result = align(*pair, CAMERA, NEWTON)
+        assert result.status is not AlignmentStatus.OK and finding in result.statuses
+    batch = align_batch([before, before], [after, spoil(after)], CAMERA, NEWTON)
+    assert batch.status[0] == AlignmentStatus.OK and int(batch.findings[1]) & bit(finding)
+
+
+def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> None:
+    frame = small_frames[0]
+    with pytest.raises(GavoError, match="pair \\(grey, depth\\), not ndarray"):
+        align(frame.grey, frame.depth, CAMERA, NEWTON)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="frame_of"):
+        align((np.repeat(frame.grey[..., None], 3, axis=2), frame.depth), frame, CAMERA, NEWTON)
+    with pytest.raises(TypeError, match="LOSSES"):
+        align(frame, frame, CAMERA, Settings(NEWTON.solver, AlignmentOptions(loss="huber")))  # pyright: ignore
 
 
 def test_wrong_sizes_are_refused(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
