@@ -34,6 +34,10 @@ MODELS = {
 SAME_CAMERA = 0.5
 """Pixels by which colour and depth camera of a scan may differ where depth is registered."""
 
+WIDEST_HALF, SQUARE = 1.5, (0.67, 1.5)
+"""Of a row of numbers without names: the principal point over the focal length at most, and how far pixels may be from
+square. Else the numbers are in another order."""
+
 MOST_SKEW = 0.5
 """Pixels: pixels whose rows and columns are so far from square to each other are no camera's of ours."""
 
@@ -126,8 +130,11 @@ def of_matrix(place: str, numbers: list[Any]) -> Table:
 
 def _read_open3d(path: Path, values: Table) -> Table:
     """Looks like Open3D's intrinsics."""
-    values = values.get("intrinsic", values)
-    return {**of_matrix(str(path), values["intrinsic_matrix"]), "width": values["width"], "height": values["height"]}
+    values = {**values, **values.get("intrinsic", {})}
+    lens = {"distortion": values["distortion"]} if np.any(values.get("distortion", 0)) else {}
+    scale = {"depth_scale": values["depth_scale"]} if "depth_scale" in values else {}
+    size = {"width": values["width"], "height": values["height"]}
+    return {**of_matrix(str(path), values["intrinsic_matrix"]), **size, **lens, **scale}
 
 
 def _read_replica(path: Path, values: Table) -> Table:
@@ -341,14 +348,23 @@ def _parse_numbers(path: Path, text: str) -> Table:
             return of_matrix(str(path), rows[0])
         if len(rows) == 1 and len(rows[0]) >= 4:
             fx, fy, cx, cy, *distortion = rows[0]
+            _check_order(path, fx, fy, cx, cy)
             lens = {"distortion": distortion} if distortion else {}
             return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
         matrix = np.array(rows)
         if matrix.shape not in ((3, 3), (4, 4), (3, 4)) or matrix[:3, 3:].any():
             raise ValueError
+    except GavoError:
+        raise
     except ValueError:
         raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy") from None
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
+
+
+def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None:
+    is_wide = cx > fx * WIDEST_HALF or cy > fy * WIDEST_HALF
+    if is_wide or not SQUARE[0] * fy < fx < SQUARE[1] * fy:
+        raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
 
 
 def _line(error: BaseException) -> str:

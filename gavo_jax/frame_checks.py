@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.alignment.judgement import MIN_DEPTH_SHARE
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.status import AlignmentStatus
@@ -63,6 +62,8 @@ class History(NamedTuple):
     """Frames in a row that were refused only for being unlike those before."""
 
 
+MIN_DEPTH_SHARE = 0.05
+"""Share of an image, or of a reference's points, with a reading, below which there is no depth to align by."""
 REMEMBERED = 15
 """Frames whose median says what is usual."""
 MAX_DOUBTS = 3

@@ -11,6 +11,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame
+from gavo_jax.status import AlignmentStatus
 
 Facts = dict[str, Any]
 
@@ -43,6 +44,7 @@ def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: 
         "frames": len(sequence),
         "frames_used": looked["used"],
         "frames_not_used": looked["not_used"],
+        "frames_doubted": looked["doubted"],
         "why_not": looked["reasons"],
         "left_out": list(getattr(sequence, "left_out", ())),
         **_times(stamps),
@@ -67,7 +69,7 @@ def _source(sequence: Sequence) -> Facts:
 def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
     """Decode every frame and check it as a run would, before anything is aligned."""
     history, statuses, reasons, delays, ranges, coverages = History(), Counter(), [], [], [], []
-    used, contrast = 0, []
+    used, contrast, doubted = 0, [], Counter()
     for index, timestamp in enumerate(sequence.timestamps):
         try:
             frame: Frame | FrameError = sequence[index]
@@ -79,6 +81,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
             statuses[str(finding.status)] += 1
         else:
             used += 1
+            doubted[str(finding.status)] += finding.status is not AlignmentStatus.OK
         if isinstance(frame, Frame):
             readings = frame.depth[::4, ::4][frame.depth[::4, ::4] > 0] / sequence.camera.depth_scale
             coverages.append(readings.size / frame.depth[::4, ::4].size)
@@ -93,6 +96,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
     return {
         "used": used,
         "not_used": dict(statuses),
+        "doubted": dict(+doubted),
         "reasons": reasons[:MAX_REASONS],
         "delay": _spread(delays),
         "image": {"mean": mean, "standard_deviation": deviation},

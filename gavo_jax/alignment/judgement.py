@@ -14,6 +14,7 @@ from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying, unswayed
 from gavo_jax.alignment.visits import Level, Search
+from gavo_jax.frame_checks import MIN_DEPTH_SHARE
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
 from gavo_jax.objective.estimates import ExplainedShare, estimate_scales, explained_share
@@ -22,8 +23,6 @@ from gavo_jax.se3 import departure_from_rigid, exp, log
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.status import AlignmentStatus, as_findings, bit, gravest
 
-MIN_DEPTH_SHARE = 0.05
-"""Share of the reference's points with a reading below which a pair is `NO_DEPTH`."""
 MIN_CONTRAST = 2.0
 """Grey levels: a smaller standard deviation over the reference makes a pair `LOW_TEXTURE`."""
 MIN_FINAL_OVERLAP = 0.3

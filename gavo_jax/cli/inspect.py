@@ -30,6 +30,7 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     refused = "".join(f", {count} {status}" for status, count in facts["frames_not_used"].items())
     lines.append(("frames used", f"{facts['frames_used']} of {facts['frames']}{refused}"))
     lines += [("not used", line) for line in facts["why_not"]]
+    lines += [("used in part", f"{count} {status}") for status, count in facts["frames_doubted"].items()]
     lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
     lines += _recorded(facts["recorded_camera"])
     lines += [("depth", _depth(facts))]

@@ -24,8 +24,9 @@ FARTHEST_FINE = 12.0
 
 METRES, MILLIMETRES = 1.0, 1000.0
 
-METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 60.0), (100.0, 60000.0)
-"""Median depth of a file of floats that is taken as one of metres, or of millimetres."""
+METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 60.0), (300.0, 60000.0)
+"""Median depth of a file of floats that is taken as one of metres, or of millimetres; between them, and a little above,
+lie centimetres."""
 
 
 class DepthUnit(NamedTuple):

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, camera_from_table
+from gavo_jax.camera_files import Calibration, Size, camera_from_table
 from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
@@ -48,6 +48,9 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
+
+REGISTERED = re.compile("registered|aligned")
+"""In the name of a topic of depth that is registered to colour, whatever frame its messages name."""
 
 NOWHERE: tuple[int, int] = (2**62, 2**62)
 """Behind every message: where a stream stands before it is entered."""
@@ -211,9 +214,15 @@ class BagSequence:
     def _label(self, topic: int, stamp: float) -> str:
         return f"{self._bag.path}: {self._topics[topic].name} at {stamp:.6f}"
 
+    def _size(self) -> Size:
+        """Width and height of the first colour image."""
+        color = self._topics[0]
+        height, width = color_of(color.kind, self._bag.first(color.name), color.name).shape[:2]
+        return width, height
+
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
-        found = reading.calibration(own, None, MILLIMETRES)  # units of 16UC1, by REP 118
+        found = reading.calibration(own, self._size, MILLIMETRES)  # units of 16UC1, by REP 118
         return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
 
 
@@ -389,11 +398,15 @@ class _Bag:
         camera = self._camera(name, info, color)
         other = self._info(depth)
         moved = None if other is None else self._camera(*other, depth)
-        if moved is not None and _is_same(moved, camera):
-            return Calibration(camera, origin=name, states_depth_scale=False)
         if other is None or moved is None:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
-        color_T_depth = between(self._transforms(), info.header.frame_id, other[1].header.frame_id)
+        frames = (info.header.frame_id, other[1].header.frame_id)
+        is_registered = frames[0] == frames[1] or not all(frames) or REGISTERED.search(depth)
+        if _is_same(moved, camera) and is_registered:
+            return Calibration(camera, origin=name, states_depth_scale=False)
+        color_T_depth = between(self._transforms(), *frames)
+        if color_T_depth is not None and _is_same(moved, camera) and np.allclose(color_T_depth, np.eye(4)):
+            return Calibration(camera, origin=name, states_depth_scale=False)
         if color_T_depth is None:
             raise GavoError(
                 f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie: "

@@ -18,8 +18,11 @@ from gavo_jax.datasets.images import without_invalid
 COMMON = (5000.0, 1000.0, 1.0)
 """Units per metre of files: of the TUM benchmark, millimetres, metres."""
 
-SHIFTED = 8000.0
-"""Of SUN3D: millimetres, moved up by three bits. Only steps speak for it."""
+SHIFTED, TENTHS = 8000.0, 10000.0
+"""Of SUN3D, millimetres moved up by three bits; tenths of a millimetre. Only steps speak for these."""
+
+CENTIMETRES = 100.0
+"""Units per metre that nothing but a much too small median speaks for."""
 
 LOOKED_AT = 3
 """Frames."""
@@ -37,8 +40,8 @@ KINECT_NEAREST = 0.35
 KINECT_VIEW = (0.76, 0.93)
 """Focal length over the image's width of such cameras."""
 
-PLAUSIBLE = (0.02, 150.0)
-"""Metres: a median depth outside is that of no scene."""
+PLAUSIBLE = (0.15, 150.0)
+"""Metres: a median depth outside is hardly that of a scene."""
 
 USUAL = (0.2, 10.0)
 """Metres: a median depth that a unit has to lead to if it is to be proposed for one that is not plausible."""
@@ -100,17 +103,19 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
     """
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
     by_steps = sample.kinect_scale if is_kinect or looks_so else None
-    far = [other for other in (*COMMON, SHIFTED) if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
-    others = [other for other in far if other != SHIFTED]
-    seen = [other for other in others if sample.near / other > KINECT_NEAREST]
-    for other in far:
-        if sample.near / other > KINECT_NEAREST and by_steps is not None and abs(by_steps / other - 1) < STEP_TOLERANCE:
-            return other
+    every = (*COMMON, SHIFTED, TENTHS, CENTIMETRES)
+    far = [other for other in every if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
+    seen = [other for other in far if sample.near / other > KINECT_NEAREST]
+    if by_steps is not None:
+        nearest = min(seen, key=lambda other: abs(by_steps / other - 1), default=scale)
+        if nearest != scale and abs(by_steps / nearest - 1) < STEP_TOLERANCE:
+            return nearest
     if is_kinect and sample.median / scale < KINECT_NEAREST:
-        return max(seen, default=None)
+        return max((other for other in seen if other in (*COMMON, CENTIMETRES)), default=None)
     if PLAUSIBLE[0] < sample.median / scale < PLAUSIBLE[1]:
         return None
-    likely = [other for other in others if sample.median / other > USUAL[0]]
+    usual = [other for other in far if sample.median / other > USUAL[0]]
+    likely = [other for other in usual if other in COMMON] or [other for other in usual if other == CENTIMETRES]
     return min(likely, key=lambda other: abs(np.log(sample.median / other / USUAL_MEDIAN)), default=None)
 
 
@@ -177,6 +182,8 @@ NAMES = {
     1000.0: "millimetres",
     5000.0: "the TUM benchmark's 5000 to a metre",
     SHIFTED: "SUN3D's 8000 to a metre",
+    TENTHS: "tenths of a millimetre",
+    CENTIMETRES: "centimetres",
 }
 """Common units in words."""
 

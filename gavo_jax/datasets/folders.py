@@ -36,7 +36,8 @@ RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
-DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth")
+DEPTH_FOLDERS = ("aligned_depth", "depth_registered", "depth", "depths")
+"""The first one counts: beside depth that is registered to colour another one is that of its own camera."""
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img")
 """In the names of colour images that lie beside depth; the latter where the former say nothing."""
@@ -200,11 +201,17 @@ class Replica(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """A row of sixteen numbers for each frame."""
+        """A row of sixteen numbers for each frame: by its number, or in order where there are as many as images."""
         rows = data_rows(path / "traj.txt")
         if not rows:
             raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
-        return {number: pose for number, (place, row) in enumerate(rows) if (pose := pose_of(place, row)) is not None}
+        numbers = sorted(cls.find(path).color)
+        named = numbers if len(numbers) == len(rows) else range(len(rows))
+        return {
+            number: pose
+            for number, (place, row) in zip(named, rows, strict=True)
+            if (pose := pose_of(place, row)) is not None
+        }
 
 
 class PlainFolder(FileSequence):

@@ -92,7 +92,13 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
     if image.dtype.kind in "ui" and image.max() <= NO_READING:
         return np.maximum(image, 0).astype(np.uint16)  # of 16 bits, whatever they are kept in
-    return image.astype(np.float32)
+    return to_float32(image)
+
+
+def to_float32(image: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """In single precision; what is too large for it is infinite."""
+    with np.errstate(over="ignore"):
+        return image.astype(np.float32)
 
 
 def to_8_bits(image: Shaped[np.ndarray, "h w *channels"], white: int) -> UInt8[np.ndarray, "h w *channels"]:

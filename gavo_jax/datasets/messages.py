@@ -9,7 +9,7 @@ import numpy as np
 
 from gavo_jax.camera_makes import camera_info_distortion
 from gavo_jax.datasets.base import FrameError
-from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth
+from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth, to_float32
 
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 
@@ -49,8 +49,8 @@ DEPTH_HEADER = 12
 """Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
 
 
-INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity)\d*(?:[/_]|$)")
-"""In the name of a topic of 16-bit images that are brightness, and no depth."""
+INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|disparity|confidence)\d*(?:[/_]|$)")
+"""In the name of a topic of numbers that are brightness, pixels or a probability, and no depth."""
 
 
 def is_depth(kind: str, message: Any, topic: str) -> bool:
@@ -94,7 +94,7 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
                 f"{name}: encoding {message.encoding[:40]!r} is no depth: {', '.join(DEPTH_ENCODINGS)} are"
             )
         pixels = _pixels(message, name)
-        return pixels if pixels.dtype == np.uint16 else pixels.astype(np.float32)
+        return pixels if pixels.dtype == np.uint16 else to_float32(pixels)
     data = bytes(message.data)
     if "compressedDepth" not in message.format:
         return decode_depth(data, name)

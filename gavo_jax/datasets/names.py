@@ -23,8 +23,12 @@ INTERVALS = (2e-3, 10.0)
 DEVICE_INTERVALS = (2e-3, 1.0)
 """The same, where nothing but the steps speaks for a unit: of stamps since a device was switched on."""
 
-MILLISECONDS, JITTER = (5, 200), 2
-"""Steps between whole numbers that may be milliseconds, if they differ, and by no more than so much."""
+MILLISECONDS, JITTER = (5, 200), 0.3
+"""Steps between whole numbers that may be milliseconds, if they have no common factor and most lie within this share
+of the median: of every so many frames the numbers have one, and of frames that somebody chose the steps differ more."""
+
+MOST_STEPS = 0.7
+"""Share of the steps that are most of them."""
 
 MOST_DIGITS = 15
 """What is longer is no number of a frame: floats do not tell it from its neighbours."""
@@ -152,7 +156,8 @@ def _dates(names: Sequence[str]) -> list[float] | None:
 def _decimals(names: Sequence[str]) -> list[float] | None:
     found = _at_the_end(names, r"\d+\.\d+")
     seconds = [float(number) for number in found]
-    return seconds if found and _is_between(seconds, INTERVALS) else None
+    are_distinct = len(set(seconds)) == len(set(found))  # of 1.1 and 1.10 the second is the tenth of something
+    return seconds if found and are_distinct and _is_between(seconds, INTERVALS) else None
 
 
 def _counts(names: Sequence[str]) -> list[float] | None:
@@ -168,10 +173,19 @@ def unit_of(counts: Sequence[float]) -> float | None:
     of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
     usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]
     device = [unit for unit in UNITS[2:] if _is_between([unit * count for count in counts], DEVICE_INTERVALS)]
-    steps = np.diff(sorted(counts))
-    if len(steps) > 1 and MILLISECONDS[0] <= steps.min() < steps.max() <= min(steps.min() + JITTER, MILLISECONDS[1]):
+    if _are_milliseconds(np.diff(sorted(counts))):
         device.append(UNITS[1])
     return next(iter((*usual, *device, *of_clock)), None)
+
+
+def _are_milliseconds(steps: np.ndarray) -> bool:
+    if len(steps) < 2:
+        return False
+    middle = np.median(steps)
+    usual = steps[np.abs(steps - middle) <= JITTER * middle]
+    if len(usual) < MOST_STEPS * len(steps) or not MILLISECONDS[0] <= steps.min() <= middle <= MILLISECONDS[1]:
+        return False
+    return np.gcd.reduce(usual.astype(np.int64)) == 1
 
 
 def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:

@@ -203,7 +203,7 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
         if len(fields) != 4:
             raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
-        pairs.append(pair[::-1] if "depth" in fields[1] else pair)
+        pairs.append(pair[::-1] if fields[1].count("depth") > fields[3].count("depth") else pair)
     color, depth = (_in_time(path, [pair[at] for pair in pairs]) for at in (0, 1))
     return color, depth
 

@@ -109,6 +109,13 @@ def test_inspect_says_what_a_source_is(gavo, clip):
     assert "5000 to a metre" in lines["depth"] and "8 of 8 frames covered" in lines["ground truth"]
 
 
+def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
+    for file in sorted((clip / "depth").iterdir())[1:]:
+        file.write_bytes(sorted((clip / "depth").iterdir())[0].read_bytes())
+    done = gavo("inspect", clip)
+    assert done.status == 0 and "frames used: 8 of 8\nused in part: 7 frozen\n" in done.out
+
+
 def test_inspect_as_json_counts_what_cannot_be_used(gavo, clip):
     rows = (clip / "rgb.txt").read_text().splitlines()
     torn, frozen = (clip / rows[at].split()[1] for at in (4, 7))

@@ -264,6 +264,43 @@ def test_one_camera_is_one_for_all_rounding(tmp_path):
     assert isinstance(sequence, BagSequence) and sequence.calibration.depth is None
 
 
+@pytest.mark.parametrize("said", [True, False])
+def test_two_cameras_alike_that_lie_apart_are_two(tmp_path, said):
+    """A driver that nobody calibrated gives both the same numbers."""
+    recorder = Recorder(tmp_path / "alike", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/cam/rgb/image_raw", stamp, BGRS[0], "bgr8")
+        recorder.info("/cam/rgb/camera_info", stamp, CAMERA, frame="rgb")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/cam/depth/camera_info", stamp, CAMERA, frame="depth")
+    apart = np.eye(4)
+    apart[0, 3] = -0.025
+    if said:
+        recorder.fixed(1.0, {("rgb", "depth"): ([-0.025, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])})
+    recorder.close()
+    if said:
+        sequence = open_source(tmp_path / "alike")
+        assert isinstance(sequence, BagSequence) and (calibration := sequence.calibration).color_T_depth is not None
+        np.testing.assert_allclose(calibration.color_T_depth, apart, atol=1e-9)
+    else:
+        with pytest.raises(GavoError, match="of another camera"):
+            open_source(tmp_path / "alike")
+
+
+def test_a_camera_of_numbers_alone_has_the_recordings_size(tmp_path):
+    recorder = Recorder(tmp_path / "bare", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/cam/rgb/image_raw", stamp, BGRS[0], "bgr8")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.image("/cam/disparity", stamp, METRES[0].astype(np.float32), "32FC1")
+    recorder.close()
+    (tmp_path / "k.txt").write_text("131 131 79.5 59.5")
+    camera = open_source(
+        tmp_path / "bare", Reading(camera=str(tmp_path / "k.txt"), color_topic="/cam/rgb/image_raw")
+    ).camera
+    assert (camera.width, camera.height) == (160, 120)
+
+
 def test_what_a_recording_lacks_is_said(tmp_path):
     recorder = Recorder(tmp_path / "two", "sqlite")
     recorder.image("/left", 1.0, GREYS[0], "mono8")

@@ -79,6 +79,19 @@ def test_a_factor_of_a_thousand_is_told_by_the_range(scale, said, sensor):
     assert better == (scale if sensor is kinect else better) and better in (1000, 5000)
 
 
+@pytest.mark.parametrize("said", [1000.0, 5000.0])
+def test_a_kinects_steps_tell_of_tenths_of_a_millimetre(said):
+    image = kinect(depths(1.0, 3.0), 10000.0)
+    assert proposed(image, said, OWN, False) == proposed(image, said, FR1, True) == 10000
+    assert proposed(image, 10000.0, OWN, False) is None
+
+
+def test_centimetres_read_as_millimetres():
+    image = smooth(depths(0.8, 2.0), 100.0)
+    assert proposed(image, 1000.0, OWN, False) == proposed(image, 1000.0, FR1, True) == 100
+    assert proposed(image, 100.0, OWN, False) is None
+
+
 def test_metres_read_as_millimetres():
     metres = depths(1.0, 3.0).astype(np.float32)
     assert proposed(metres, 1000.0, FR1, True) == 1

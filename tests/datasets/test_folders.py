@@ -1,6 +1,7 @@
 """Folders of every dataset: recognised by what lies in them, and read to the same frames."""
 
 import dataclasses
+import json
 import os
 import shutil
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, MATRIX, METRES, POSES, image, kinect, raw
 
 from gavo_jax.camera import Camera
+from gavo_jax.camera_files import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.files import Reading
@@ -53,6 +55,54 @@ def test_every_layout_gives_the_same_frames(folder, name):
         np.testing.assert_array_equal(frame.depth > 0, DEPTHS[i] > 0)
     part = sequence[1:4:2]
     np.testing.assert_array_equal(part[1].depth, sequence[3].depth)
+
+
+def test_poses_of_a_room_that_is_numbered_from_one_begin_with_its_first_image(folder):
+    wrote(folder, "replica")
+    for kind, ending in (("frame", "jpg"), ("depth", "png")):
+        for i in reversed(range(4)):
+            path = folder / f"results/{kind}{i:06}.{ending}"
+            path.rename(path.with_name(f"{kind}{i + 1:06}.{ending}"))
+    truth = open_source(folder).ground_truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.timestamps, np.arange(1, 5) / 30)
+    np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
+
+
+def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder):
+    wrote(folder, "plain")
+    (folder / "aligned_depth").mkdir()
+    for file in (folder / "depth").iterdir():
+        image(folder / "aligned_depth" / file.name, np.full((120, 160), 2.0, np.float32))
+    sequence = open_source(folder)
+    assert (sequence[0].depth == 2.0 * sequence.camera.depth_scale).all()
+
+
+def test_floats_that_may_be_centimetres_are_refused(folder):
+    wrote(folder, "plain")
+    for i, metres in enumerate(METRES):
+        image(folder / f"depth/{i}.tiff", (40 * metres).astype(np.float32))
+    with pytest.raises(GavoError, match="in neither metres nor millimetres: say --depth-scale"):
+        assert open_source(folder).camera
+
+
+def test_what_open3d_says_of_depth_and_lens_counts(folder):
+    """Its recorder writes both; 4000 to a metre were taken for millimetres."""
+    wrote(folder, "open3d")
+    path = folder / "camera_intrinsic.json"
+    said = json.loads(path.read_text()) | {"depth_scale": 4000.0, "distortion": [0.1, -0.2, 0.0, 0.0]}
+    path.write_text(json.dumps(said))
+    calibration = load_calibration(path)
+    assert calibration.color.depth_scale == 4000 and calibration.color.distortion[:2] == (0.1, -0.2)
+    path.write_text(json.dumps(said | {"distortion": [0.0] * 5}))
+    assert not any(load_calibration(path).color.distortion)
+
+
+@pytest.mark.parametrize("row", ["318.6 255.3 517.3 516.5", "517.3 318.6 516.5 255.3"])
+def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
+    (tmp_path / "k.txt").write_text(row)
+    with pytest.raises(GavoError, match="hardly fx fy cx cy"):
+        load_calibration(tmp_path / "k.txt", (640, 480))
 
 
 @pytest.mark.parametrize("name", ["seven_scenes", "replica", "scannet"])
@@ -175,7 +225,9 @@ def test_images_without_a_number_are_left_out_by_name(folder):
 def test_folders_of_other_names_say_which_are_known(folder):
     wrote(folder, "plain")
     (folder / "rgb").rename(folder / "left")
-    with pytest.raises(GavoError, match=r"left/: .*; colour is looked for in color, colour, rgb, .* depth in depth, "):
+    with pytest.raises(
+        GavoError, match=r"left/: .*; colour is looked for in color, colour, rgb, .* depth in aligned_depth, "
+    ):
         open_source(folder)
 
 
