@@ -171,7 +171,7 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         raise GavoError(f"unknown method {method!r}: not one of {', '.join(methods())}")
     if method in _registered:
         if name != "default":
-            raise GavoError(f"method {method!r} has no preset {name!r}: default alone")
+            raise GavoError(f"method {method!r} has no preset {name!r}, only default")
         return _registered[method]
     if name == "paper":
         return Settings(

@@ -180,7 +180,8 @@ def _parse_methods(text: str) -> list[str]:
     known = (*presets.methods(), *PEERS)
     for name in names:
         if name not in known:
-            raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}")
+            hint = "; the preset is said once, by --preset" if name.partition(":")[0] in known else ""
+            raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}{hint}")
         if names.count(name) > 1:
             raise GavoError(f"--methods: {name} is given twice")
     return names

@@ -125,7 +125,8 @@ class View:
     viewer: Literal["spawn", "web", "save"] = "web"
     """As in `gavo run`; save writes view.rrd into DIR."""
     search: bool = True
-    """Track the frames once more, so that the particles are seen; without, paths and images are there at once."""
+    """Whether the frames are tracked once more, so that the particles are seen; else paths and images are there at
+    once."""
 
 
 @dataclass(frozen=True)

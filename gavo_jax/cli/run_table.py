@@ -120,5 +120,5 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
         return "The ground truth covers no two of these frames, so no errors."
     lasts = float(np.ptp(trajectory.timestamps))
     if lasts < 1:
-        return f"No drift over 1 s: the frames last {lasts:.2f} s; the errors per frame and over all stand for it."
-    return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart; the other errors stand for it."
+        return f"No drift over 1 s: the frames last {lasts:.2f} s; see the errors per frame and of the whole run."
+    return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart: see the other errors."

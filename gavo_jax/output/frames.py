@@ -10,7 +10,7 @@ import numpy as np
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
-from gavo_jax.output.files import CONFIG, FRAMES, TRAJECTORY, read_json
+from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY, read_json
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -30,6 +30,7 @@ then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
     """The steps of a run as its trajectory.txt and frames.csv tell them.
 
+    Motions are those between the poses as they were found: of odometry.txt, where loops have corrected them since.
     Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame without a pose has
     the one before it.
 
@@ -41,18 +42,20 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
         GavoError: a file cannot be read or is damaged.
     """
     poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
-    by_stamp = {f"{stamp:.6f}": i for i, stamp in enumerate(poses.timestamps)}
+    found = Trajectory.read_tum(folder / ODOMETRY) if (folder / ODOMETRY).exists() else poses
+    by_stamp, found_at = ({f"{t:.6f}": i for i, t in enumerate(one.timestamps)} for one in (poses, found))
     steps: list[Step] = []
-    place = 0
+    place = now = 0
     for number, row in enumerate(csv.DictReader(read_text(folder / FRAMES).splitlines()), start=2):
         try:
             stamp = float(row["timestamp"])
             if row["timestamp"] in by_stamp:
                 place = by_stamp[row["timestamp"]]
                 stamp = float(poses.timestamps[place])
-            world_T_camera = poses.world_T_camera[place]
-            reference = poses.world_T_camera[by_stamp.get(row["reference_timestamp"], place)]
-            steps.append(_read_step(row, stamp, world_T_camera, inverse(world_T_camera) @ reference))
+            now = found_at.get(row["timestamp"], now)
+            before = found_at.get(row["reference_timestamp"], now)
+            target_T_reference = inverse(found.world_T_camera[now]) @ found.world_T_camera[before]
+            steps.append(_read_step(row, stamp, poses.world_T_camera[place], target_T_reference))
         except (KeyError, TypeError, ValueError):
             raise GavoError(f"{folder / FRAMES}:{number}: not a row of a run") from None
     return steps

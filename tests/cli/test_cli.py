@@ -20,10 +20,10 @@ from gavo_jax.cli.align import in_words
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.output import tracked
-from gavo_jax.output.frames import FRAME_COLUMNS
+from gavo_jax.output.frames import FRAME_COLUMNS, read_run
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import Trajectory
+from gavo_jax.trajectory import Trajectory, inverse
 
 METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_translation_rmse_m_per_s
 rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
@@ -127,6 +127,14 @@ def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
     loops = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
     assert len(loops) == metrics["loops"] + metrics["loops_refused"]
     assert {row["origin"] for row in read_rows(out)} == {"tracked"}
+    found, corrected = (Trajectory.read_tum(out / "odometry.txt") for _ in range(2))
+    corrected.world_T_camera[:, :3, 3] *= 2
+    shutil.copytree(out, tmp_path / "corrected")
+    corrected.write_tum(tmp_path / "corrected" / "trajectory.txt")
+    step = read_run(tmp_path / "corrected").steps[20]
+    motion = inverse(found.world_T_camera[21]) @ found.world_T_camera[20]
+    np.testing.assert_allclose(step.alignment.target_T_reference, motion, atol=1e-6)  # what the search found
+    np.testing.assert_allclose(step.world_T_camera, corrected.world_T_camera[21], atol=1e-6)
     assert gavo(*command, "--resume").status == 0
     assert gavo(*command[:-1]).status == 0 and not (out / "odometry.txt").exists() and not (out / "loops.csv").exists()
 

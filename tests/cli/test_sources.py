@@ -252,7 +252,7 @@ def test_a_short_clip_has_the_errors_that_it_can_have_and_says_why(gavo, clip):
     assert "RPE over 1 frame" in done.out and "absolute error" in done.out and "drift: " not in done.out
     assert "\u2013" not in done.out
     sentences = [line for line in done.out.splitlines() if line.startswith("No drift over 1 s")]
-    assert sentences == ["No drift over 1 s: the frames last 0.23 s; the errors per frame and over all stand for it."]
+    assert sentences == ["No drift over 1 s: the frames last 0.23 s; see the errors per frame and of the whole run."]
 
 
 @pytest.mark.parametrize("truth", [True, False])
