@@ -30,7 +30,7 @@ def main() -> gavo.Alignment:
     first, second = sequence.ground_truth.world_T_camera
     exact = np.linalg.inv(second) @ first
     off = 1e3 * np.linalg.norm(pair.target_T_reference[:3, 3] - exact[:3, 3])
-    print(f"{pair.status.name}: {off:.2f} mm off the exact motion, error {float(pair.error):.2f}")
+    print(f"{pair.status}: {off:.2f} mm off the exact motion, error {float(pair.error):.2f}")
     return pair
 
 

@@ -13,7 +13,7 @@ def main() -> gavo.Alignment:
     sequence = gavo.SyntheticSequence(frames=2)
     pair = gavo.align(sequence[0], sequence[1], sequence.camera)
 
-    print(f"{pair.status.name}: {pair.sentence}")
+    print(f"{pair.status}: {pair.sentence}")
     print(f"error {float(pair.error):.2f} squared grey levels, {float(pair.overlap):.0%} of the points in view")
     print("target_T_reference:")
     print(np.round(np.asarray(pair.target_T_reference), 5))

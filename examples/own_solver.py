@@ -66,7 +66,7 @@ def main() -> gavo.Alignment:
     pair = gavo.align(sequence[0], sequence[1], sequence.camera, DifferentialEvolution())
     first, second = sequence.ground_truth.world_T_camera
     off = 1e3 * np.linalg.norm(pair.target_T_reference[:3, 3] - (np.linalg.inv(second) @ first)[:3, 3])
-    print(f"{pair.status.name}: {off:.2f} mm off the exact motion, error {float(pair.error):.2f}")
+    print(f"{pair.status}: {off:.2f} mm off the exact motion, error {float(pair.error):.2f}")
     gavo.register("differential-evolution", DifferentialEvolution())
     assert isinstance(gavo.preset("differential-evolution").solver, gavo.solvers.Solver)
     return pair

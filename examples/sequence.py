@@ -15,7 +15,7 @@ def main(folder: str | None = None, frames: int = 30) -> gavo.OdometryRun:
 
     def tell(step: gavo.Step) -> None:
         x, y, z = step.world_T_camera[:3, 3]
-        print(f"{step.timestamp:.3f} s  {step.alignment.status.name.lower():12} camera at {x:+.3f} {y:+.3f} {z:+.3f} m")
+        print(f"{step.timestamp:.3f} s  {step.alignment.status!s:12} camera at {x:+.3f} {y:+.3f} {z:+.3f} m")
 
     run = gavo.run_odometry(sequence, gavo.preset("ga", "fast"), seed=0, on_step=tell)
     for key, value in run.metrics.items():
