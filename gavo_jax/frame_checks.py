@@ -14,6 +14,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.datasets.depth_unit import PLAUSIBLE
 from gavo_jax.status import AlignmentStatus
 
 
@@ -153,13 +154,19 @@ def check_frame(
 
 
 def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:
-    """What speaks against an image [H, W] and its depth by themselves, without any frame before."""
-    rows = np.asarray(grey)[::ROW_STEP]
+    """What speaks against an image [H, W] and its depth by themselves, without any frame before. A scene may be near
+    then: of a whole run a depth of less than `DEPTH_RANGE` is told as well.
+    """
+    rows, depths = (np.asarray(image)[::ROW_STEP] for image in (grey, depth))
     if not _is_finite(rows).all():
         return (AlignmentStatus.NOT_FINITE,)
     clipped = np.count_nonzero((rows <= BLACK) | (rows >= WHITE)) / rows.size
-    finding, _ = _check_depth(np.asarray(depth)[::ROW_STEP], depth_scale, History())
-    return tuple(status for status in (_check_image(rows, clipped), finding.status) if status)
+    found, readings = [_check_image(rows, clipped)], depths[(depths > 0) & _is_finite(depths)]
+    if readings.size < MIN_DEPTH_SHARE * depths.size:
+        found.append(AlignmentStatus.NO_DEPTH)
+    elif not PLAUSIBLE[0] < float(np.median(readings[::ROW_STEP])) / depth_scale < PLAUSIBLE[1]:
+        found.append(AlignmentStatus.DEPTH_UNITS)
+    return tuple(status for status in found if status is not AlignmentStatus.OK)
 
 
 def _refused(status: AlignmentStatus) -> Finding:

@@ -68,6 +68,8 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     rows += [(f"pairs: {status}", str(count), "") for status, count in counted if status != "ok"]
     if "loops" in metrics:
         rows += [("loops that count", str(metrics["loops"]), ""), ("loops refused", str(metrics["loops_refused"]), "")]
+    if metrics.get("guessed_pairs"):
+        rows.append(("pairs whose motion is a guess", str(metrics["guessed_pairs"]), ""))
     if metrics.get("unknown_motions"):
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
     rows += _of_bodies(folder / BODIES)

@@ -21,6 +21,8 @@ class Metrics(TypedDict):
     frames: int
     pairs: int
     lost_pairs: int
+    guessed_pairs: int
+    """Pairs that are not lost and whose motion the images do not tell: the last one, gone on with behind a body."""
     statuses: dict[str, int]
     """Pairs of each status."""
     segments: int
@@ -97,6 +99,7 @@ def compute_metrics(
         "frames": len(steps) + 1,
         "pairs": len(steps),
         "lost_pairs": sum(step.lost for step in steps),
+        "guessed_pairs": sum(step.origin == "guessed" and not step.lost for step in steps),
         "statuses": dict(Counter(str(step.alignment.status) for step in steps)),
         "segments": 1 + (breaks := steps[-1].segment if steps else 0),
         "unknown_motions": breaks,

@@ -204,7 +204,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "plain: folders of other names": (
         "plain",
         lambda clip: (clip / "depth").rename(clip / "range"),
-        ["clip: a folder of camera.yaml, range/, rgb/", "depth in depth, depths"],
+        ["clip: a folder of camera.yaml, range/, rgb/", "depth in aligned_depth"],
     ),
     "plain: numbers longer than any float": (
         "plain",

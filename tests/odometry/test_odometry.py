@@ -29,7 +29,8 @@ from gavo_jax.image.warp import Points
 from gavo_jax.objective.points import make_references, move_reference
 from gavo_jax.odometry.aligners import Attempt, DoubtingDepth, Recovering, Search
 from gavo_jax.odometry.driver import Odometry, Step, track
-from gavo_jax.odometry.run import OdometryRun, run_odometry
+from gavo_jax.odometry.metrics import compute_metrics
+from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
 from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
@@ -139,6 +140,7 @@ METRICS = {
     "frames",
     "pairs",
     "lost_pairs",
+    "guessed_pairs",
     "rpe_translation_rmse_m_per_s",
     "rpe_rotation_rmse_deg_per_s",
     "rpe_translation_rmse_m_per_frame",
@@ -649,6 +651,9 @@ def test_behind_a_stretch_of_guesses_a_new_segment_starts(unknown: tuple[int, ..
     assert [step.origin for step in steps if step is not None] == ["guessed" if n else "tracked" for n in unknown]
     assert not any(step.lost for step in steps if step is not None)
     assert odometry.progress.world_T_camera[0, 3] == pytest.approx(-0.01 * len(unknown))
+    kept = [step for step in steps if step is not None]
+    metrics = compute_metrics(trajectory_of(0.0, kept), None, kept, 1.0, 0.0)
+    assert metrics["guessed_pairs"] == sum(n > 0 for n in unknown) and metrics["lost_pairs"] == 0
 
 
 def test_the_wide_search_stands_behind_the_default_one() -> None:
