@@ -129,10 +129,7 @@ def check_frame(
     grey = np.asarray(frame.grey)[::ROW_STEP]
     repeated, checksum = history.checksum, zlib.crc32(grey.tobytes())
     history = history._replace(checksum=checksum)
-    if not _is_finite(grey).all():
-        return _refused(AlignmentStatus.NOT_FINITE), history
-    clipped = np.count_nonzero((grey <= BLACK) | (grey >= WHITE)) / grey.size
-    status = _check_image(grey, clipped)
+    status, clipped = _check_image(grey)
     if status is not AlignmentStatus.OK:
         return _refused(status), history
     thumbnail = grey[::ROW_STEP, :: ROW_STEP**2].astype(int)
@@ -158,10 +155,10 @@ def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tup
     then: of a whole run a depth of less than `DEPTH_RANGE` is told as well.
     """
     rows, depths = (np.asarray(image)[::ROW_STEP] for image in (grey, depth))
-    if not _is_finite(rows).all():
-        return (AlignmentStatus.NOT_FINITE,)
-    clipped = np.count_nonzero((rows <= BLACK) | (rows >= WHITE)) / rows.size
-    found, readings = [_check_image(rows, clipped)], depths[(depths > 0) & _is_finite(depths)]
+    status, _ = _check_image(rows)
+    if status is AlignmentStatus.NOT_FINITE:
+        return (status,)
+    found, readings = [status], _readings(depths)
     if readings.size < MIN_DEPTH_SHARE * depths.size:
         found.append(AlignmentStatus.NO_DEPTH)
     elif not PLAUSIBLE[0] < float(np.median(readings[::ROW_STEP])) / depth_scale < PLAUSIBLE[1]:
@@ -200,17 +197,20 @@ def _with_timestamp(history: History, timestamp: float) -> History:
     return history._replace(timestamp=timestamp, intervals=intervals)
 
 
-def _check_image(grey: np.ndarray, clipped: float) -> AlignmentStatus:
-    """Status of an image by itself."""
+def _check_image(grey: np.ndarray) -> tuple[AlignmentStatus, float]:
+    """Status of an image by itself, and its share of clipped pixels."""
+    if not _is_finite(grey).all():
+        return AlignmentStatus.NOT_FINITE, 0.0
+    clipped = np.count_nonzero((grey <= BLACK) | (grey >= WHITE)) / grey.size
     values = grey.astype(np.float32)
     values -= values.mean()
     variance = float(np.vdot(values, values)) / values.size
     if variance < MIN_CONTRAST**2 or clipped > MAX_CLIPPED:
-        return AlignmentStatus.BLANK
+        return AlignmentStatus.BLANK, clipped
     neighbours = float(np.einsum("ij,ij->", values[:, 1:], values[:, :-1])) / values[:, 1:].size
     if neighbours < MIN_CORRELATION * variance:
-        return AlignmentStatus.NOISE
-    return AlignmentStatus.OK
+        return AlignmentStatus.NOISE, clipped
+    return AlignmentStatus.OK, clipped
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
@@ -225,7 +225,7 @@ def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:
     """Coverage and range of depth against what was usual."""
-    readings = depth[(depth > 0) & _is_finite(depth)]
+    readings = _readings(depth)
     coverage = readings.size / depth.size
     if coverage < MIN_DEPTH_SHARE:
         return Finding(AlignmentStatus.NO_DEPTH, Use.TARGET), history
@@ -247,6 +247,10 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
     return Finding(AlignmentStatus.OK, Use.ALL), history
+
+
+def _readings(depth: np.ndarray) -> np.ndarray:
+    return depth[(depth > 0) & _is_finite(depth)]
 
 
 def _is_finite(image: np.ndarray) -> np.ndarray:

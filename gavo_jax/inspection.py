@@ -81,7 +81,8 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
             statuses[str(finding.status)] += 1
         else:
             used += 1
-            doubted[str(finding.status)] += finding.status is not AlignmentStatus.OK
+            if finding.status is not AlignmentStatus.OK:
+                doubted[str(finding.status)] += 1
         if isinstance(frame, Frame):
             readings = frame.depth[::4, ::4][frame.depth[::4, ::4] > 0] / sequence.camera.depth_scale
             coverages.append(readings.size / frame.depth[::4, ::4].size)
@@ -96,7 +97,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
     return {
         "used": used,
         "not_used": dict(statuses),
-        "doubted": dict(+doubted),
+        "doubted": dict(doubted),
         "reasons": reasons[:MAX_REASONS],
         "delay": _spread(delays),
         "image": {"mean": mean, "standard_deviation": deviation},

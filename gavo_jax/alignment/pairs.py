@@ -13,7 +13,7 @@ from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Frame, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
@@ -265,8 +265,8 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     expected = (camera.height, camera.width)
     for name, image in (("grey", grey), ("depth", depth)):
         if np.shape(image) != expected:
-            hint = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
-            raise GavoError(f"{name} image is of shape {np.shape(image)}, the camera's is {expected}{hint}")
+            fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
+            raise GavoError(fault + what_helps(name, image))
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)

@@ -148,10 +148,10 @@ class WithRival:
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
                 return self._taken(other, rival, open_for, open_for)
-        elif other is not None and attempt.usable:
-            rival = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
         if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
             rival = self._nobody
+        elif other is not None:
+            rival = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
         return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:

@@ -126,7 +126,7 @@ class Retina:
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
-        keep = (1, 2) if float(scene.age) + float(tracker.seconds) < OLD else (2, 0)
+        keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
             (tracker.previous_image, tracker.passing, tracker.seconds),
@@ -149,8 +149,7 @@ class Retina:
     def renewed(self, scene: Scene, look: Look, elapsed: float) -> Scene:
         """The scene with the new frame as its last one, so many seconds later."""
         is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
-        age = float(scene.age) + elapsed
-        age = OLD if is_far_off else age if age < OLD else 0.0
+        age = OLD if is_far_off else _age_after(scene, elapsed)
         return scene._replace(
             known=look.belief.known,
             views=look.views,
@@ -161,6 +160,12 @@ class Retina:
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
         return without_points(tracker, self.planes, mask, self.levels)
+
+
+def _age_after(scene: Scene, elapsed: float) -> float:
+    """Of the view between the last frame and the older one; 0 where that has become the older one."""
+    age = float(scene.age) + elapsed
+    return age if age < OLD else 0.0
 
 
 @partial(CachedProgram, static=("levels",), returns=(Look,))

@@ -58,10 +58,11 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     seen = jnp.all(r.inside > 0, axis=0) & has
     area = surface_area(q)
     far = jnp.where(near[::STRIDE, ::STRIDE].reshape(-1), 0.0, area)
-    first, second, *areas = block_sums(jnp.stack([*cost, area, far, area * seen, far * seen]), camera)
+    sums = block_sums(jnp.stack([*cost, area, far, area * seen, far * seen]), camera)
+    first, second, area, far, area_seen, far_seen = sums
     vote = jnp.clip((first - second) / DECISIVE, -1.0, 1.0)
 
-    def margin(area: jax.Array, in_view: jax.Array) -> jax.Array:
-        return jnp.sum(in_view * vote) / jnp.maximum(jnp.sum(in_view), QUORUM * jnp.sum(area) + 1e-6)
+    def margin(seen: jax.Array, every: jax.Array) -> jax.Array:
+        return jnp.sum(seen * vote) / jnp.maximum(jnp.sum(seen), QUORUM * jnp.sum(every) + 1e-6)
 
-    return Margin(margin(areas[0], areas[2]), margin(areas[1], areas[3]))
+    return Margin(margin(area_seen, area), margin(far_seen, far))

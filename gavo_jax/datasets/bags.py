@@ -49,9 +49,6 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
 
-REGISTERED = re.compile("registered|aligned")
-"""In the name of a topic of depth that is registered to colour, whatever frame its messages name."""
-
 NOWHERE: tuple[int, int] = (2**62, 2**62)
 """Behind every message: where a stream stands before it is entered."""
 
@@ -400,13 +397,14 @@ class _Bag:
         moved = None if other is None else self._camera(*other, depth)
         if other is None or moved is None:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
-        frames = (info.header.frame_id, other[1].header.frame_id)
-        is_registered = frames[0] == frames[1] or not all(frames) or REGISTERED.search(depth)
-        if _is_same(moved, camera) and is_registered:
-            return Calibration(camera, origin=name, states_depth_scale=False)
+        frames, are_alike = (info.header.frame_id, other[1].header.frame_id), _is_same(moved, camera)
+        one = Calibration(camera, origin=name, states_depth_scale=False)
+        is_registered = frames[0] == frames[1] or not all(frames) or any(word in depth for word in DEPTH_NAMES)
+        if are_alike and is_registered:
+            return one
         color_T_depth = between(self._transforms(), *frames)
-        if color_T_depth is not None and _is_same(moved, camera) and np.allclose(color_T_depth, np.eye(4)):
-            return Calibration(camera, origin=name, states_depth_scale=False)
+        if are_alike and color_T_depth is not None and np.allclose(color_T_depth, np.eye(4)):
+            return one
         if color_T_depth is None:
             raise GavoError(
                 f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie: "

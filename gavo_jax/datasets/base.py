@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -14,6 +14,11 @@ from gavo_jax.trajectory import Trajectory
 
 class FrameError(GavoError):
     """A single frame that cannot be read: a fault of that frame, not of the whole sequence."""
+
+
+def what_helps(name: str, image: Any) -> str:
+    """The end of a sentence that refuses a frame's image for its shape: what to do with colour in the place of grey."""
+    return "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
 
 
 class TimestampError(FrameError):

@@ -107,8 +107,8 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
     far = [other for other in every if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
     seen = [other for other in far if sample.near / other > KINECT_NEAREST]
     if by_steps is not None:
-        nearest = min(seen, key=lambda other: abs(by_steps / other - 1), default=scale)
-        if nearest != scale and abs(by_steps / nearest - 1) < STEP_TOLERANCE:
+        nearest = min(seen, key=lambda other: abs(by_steps / other - 1), default=None)
+        if nearest is not None and abs(by_steps / nearest - 1) < STEP_TOLERANCE:
             return nearest
     if is_kinect and sample.median / scale < KINECT_NEAREST:
         return max((other for other in seen if other in (*COMMON, CENTIMETRES)), default=None)

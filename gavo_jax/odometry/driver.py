@@ -18,7 +18,7 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
@@ -357,9 +357,8 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
     for name, image in (("grey", frame.grey), ("depth", frame.depth)):
         kind = np.asarray(image).dtype
         if np.shape(image) != size or kind.kind not in "uif":
-            hint = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
-            given = f"{name} image is {kind} of shape {np.shape(image)}"
-            raise FrameError(f"{given}: numbers of shape {size} are needed{hint}")
+            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
+            raise FrameError(fault + what_helps(name, image))
     if not camera.is_distorted:
         return frame
     grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))
