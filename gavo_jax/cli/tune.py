@@ -46,7 +46,8 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     for choice in front:
         values = override(presets.preset(tuning.method, tuning.preset), choice.settings)
         save_settings(folder / f"trial-{choice.trial}.toml", values, tuning.method, tuning.preset)
-    say(f"front in {folder / FRONT}; its settings: gavo run --settings {folder}/trial-{front[0].trial}.toml")
+    say(f"front in {folder / FRONT}; to use its settings:")
+    say(f"gavo run --settings {folder}/trial-{front[0].trial}.toml")
     return 0
 
 

@@ -4,6 +4,7 @@ All of it passes through `printable`: names of files and sequences are other peo
 """
 
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -21,8 +22,15 @@ UNKNOWN = "–"
 
 
 def say(line: str) -> None:
-    """Print a line on standard output."""
-    print(printable(line), flush=True)
+    """Print a line on standard output: on a terminal between words to its width, elsewhere as one line for programs."""
+    line = printable(line)
+    print(_wrapped(line) if sys.stdout.isatty() else line, flush=True)
+
+
+def _wrapped(line: str) -> str:
+    """A line as several that fit the terminal; a path is never broken."""
+    width = Console().width
+    return textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def tell(line: str) -> None:
@@ -42,7 +50,8 @@ class PairProgress:
 
     def say(self, line: str) -> None:
         """Print a line above the bar; also where there is no bar."""
-        self._progress.console.print(Text(printable(line)), soft_wrap=True)
+        console, line = self._progress.console, printable(line)
+        console.print(Text(_wrapped(line) if console.is_terminal else line), soft_wrap=True)
 
 
 @contextmanager

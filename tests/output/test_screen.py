@@ -1,5 +1,6 @@
 """Tables on the screen."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.output.bodies import BODY_COLUMNS
-from gavo_jax.output.screen import known_columns, number, print_table
+from gavo_jax.output.screen import known_columns, number, print_table, say
 from gavo_jax.trajectory import Trajectory
 
 
@@ -68,3 +69,21 @@ def test_a_run_tells_of_the_bodies_it_saw(
         )
     else:
         assert "bodies that moved" not in told
+
+
+LONG = "clip: a folder of frames, 40 frames of 640x480; camera fx 517.3 fy 516.5 cx 318.6 cy 255.3 (file); depth in mm"
+
+
+def test_lines_fit_a_terminal_and_stay_whole_for_programs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    say(LONG)
+    assert capsys.readouterr().out == LONG + "\n"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    path = "/" + "x" * 90
+    say(LONG)
+    say(f"files in {path}")
+    printed = capsys.readouterr().out
+    assert max(len(line) for line in printed.splitlines() if path not in line) <= 80
+    assert " ".join(printed.split()) == f"{LONG} files in {path}"
