@@ -1,6 +1,6 @@
 """The result of aligning a pair of frames."""
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -70,9 +70,20 @@ class Alignment(NamedTuple):
         return (" with " if np.sum(is_open) == 1 else ", ").join(words)
 
     @property
+    def frozen(self) -> Literal["", "image", "depth"]:
+        """What of a frame that is `FROZEN` is the last one's once more; else empty. Nothing is aligned with an image
+        that is, so that there is no error then.
+        """
+        if AlignmentStatus.FROZEN not in self.statuses:
+            return ""
+        return "depth" if np.isfinite(self.error) else "image"
+
+    @property
     def sentence(self) -> str:
         """What is known of the result, in a sentence or two for people."""
         words, left_open = self.status.sentence, self.undetermined
+        if self.status is AlignmentStatus.FROZEN:
+            words = f"The {self.frozen} is the last one once more."
         if left_open and self.status is AlignmentStatus.LOW_TEXTURE:
             return f"{words[:-1]}, above all {left_open}."
         return f"{words} The images leave open: {left_open}." if left_open else words

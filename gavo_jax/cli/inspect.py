@@ -10,6 +10,15 @@ from gavo_jax.inspection import inspect_sequence
 from gavo_jax.output.files import describe
 from gavo_jax.output.screen import say, waiting
 
+NOTES = {
+    "gap": "frames are missing before it; it is used in full",
+    "frozen": "its depth is the last one once more; the image alone is used",
+    "no_depth": "too few depth readings: it is aligned with a frame before, and none with it",
+    "partial_depth": "much of the usual depth is missing: it is aligned with a frame before, and none with it",
+    "depth_units": "its depth may be in other units; it is used in full",
+}
+"""What a run makes of frames that it uses and doubts, by status."""
+
 
 def inspect(options: Inspect) -> int:
     """Look at every chosen frame and print what there is to say, for people or as JSON."""
@@ -30,7 +39,7 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     refused = "".join(f", {count} {status}" for status, count in facts["frames_not_used"].items())
     lines.append(("frames used", f"{facts['frames_used']} of {facts['frames']}{refused}"))
     lines += [("not used", line) for line in facts["why_not"]]
-    lines += [("used in part", f"{count} {status}") for status, count in facts["frames_doubted"].items()]
+    lines += [(f"of these, {count} {status}", NOTES[status]) for status, count in facts["frames_doubted"].items()]
     lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
     lines += _recorded(facts["recorded_camera"])
     lines += [("depth", _depth(facts))]

@@ -19,7 +19,7 @@ from gavo_jax.odometry.metrics import (
     MILLISECONDS,
     ROTATION_DRIFT,
 )
-from gavo_jax.output.files import BODIES, TRAJECTORY
+from gavo_jax.output.files import BODIES, FRAMES, TRAJECTORY
 from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.trajectory import Trajectory
 
@@ -65,7 +65,11 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
         rows += _of_trajectory(trajectory, metrics)
     rows += [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
     counted = metrics.get("statuses", {}).items()
-    rows += [(f"pairs: {status}", str(count), "") for status, count in counted if status != "ok"]
+    for status, count in counted:
+        if status == "frozen":
+            rows += _of_frozen(folder / FRAMES, count)
+        elif status != "ok":
+            rows.append((f"pairs: {status}", str(count), ""))
     if "loops" in metrics:
         rows += [("loops that count", str(metrics["loops"]), ""), ("loops refused", str(metrics["loops_refused"]), "")]
     if metrics.get("guessed_pairs"):
@@ -77,6 +81,15 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     if reason := why_no_drift(metrics, trajectory, has_truth):
         say(reason if known else f"{reason} The table has what the trajectory itself tells.")
     say(f"files in {folder}")
+
+
+def _of_frozen(path: Path, count: int) -> list[Row]:
+    """How many of the pairs that are frozen are so for their image, and how many for their depth."""
+    with path.open(encoding="utf-8", newline="") as file:
+        errors = [float(row["error"]) for row in csv.DictReader(file) if row["status"] == "frozen"]
+    depth = int(np.isfinite(errors).sum())  # nothing is aligned with a repeated image
+    rows = (("image", count - depth), ("depth", depth))
+    return [(f"pairs: frozen, the {what} repeats", str(number), "") for what, number in rows if number]
 
 
 def _of_bodies(path: Path) -> list[Row]:

@@ -113,7 +113,16 @@ def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
     for file in sorted((clip / "depth").iterdir())[1:]:
         file.write_bytes(sorted((clip / "depth").iterdir())[0].read_bytes())
     done = gavo("inspect", clip)
-    assert done.status == 0 and "frames used: 8 of 8\nused in part: 7 frozen\n" in done.out
+    assert done.status == 0 and "frames used: 8 of 8\nof these, 7 frozen: its depth is the last one" in done.out
+
+
+def test_inspect_does_not_say_that_a_frame_after_a_gap_is_used_in_part(gavo, clip):
+    lists = [clip / "rgb.txt", clip / "depth.txt"]
+    for path in lists:
+        rows = path.read_text().splitlines()
+        path.write_text("\n".join(rows[:-4] + rows[-1:]) + "\n")
+    done = gavo("inspect", clip)
+    assert done.status == 0 and "of these, 1 gap: frames are missing before it; it is used in full\n" in done.out
 
 
 def test_inspect_as_json_counts_what_cannot_be_used(gavo, clip):

@@ -71,6 +71,19 @@ def test_a_run_tells_of_the_bodies_it_saw(
         assert "bodies that moved" not in told
 
 
+def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))).write_tum(tmp_path / "trajectory.txt")
+    (tmp_path / "frames.csv").write_text("status,error\nfrozen,nan\nok,4.5\nfrozen,4.5\nfrozen,nan\n")
+    print_run("run", {"statuses": {"frozen": 3, "ok": 1, "gap": 1}}, tmp_path, has_truth=False)
+    [table] = boxes(capsys.readouterr().out)
+    told = {row[0]: row[1] for row in table if row[0].startswith("pairs:")}
+    assert told == {
+        "pairs: frozen, the image repeats": "2",
+        "pairs: frozen, the depth repeats": "1",
+        "pairs: gap": "1",
+    }
+
+
 LONG = "clip: a folder of frames, 40 frames of 640x480; camera fx 517.3 fy 516.5 cx 318.6 cy 255.3 (file); depth in mm"
 
 
