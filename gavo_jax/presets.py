@@ -5,6 +5,9 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
+import jax
+import numpy as np
+
 from gavo_jax.errors import GavoError
 from gavo_jax.objective.losses import l2
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
@@ -173,6 +176,31 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         if name != "default":
             raise GavoError(f"method {method!r} has no preset {name!r}, only default")
         return _registered[method]
+    return _own(method, name)
+
+
+def names_of(settings: Settings) -> tuple[str | None, str | None]:
+    """The method and the preset that settings go by; `preset` the other way round.
+
+    Settings that differ from every preset have none, and the method of their solver. A solver of one's own that was not
+    registered is no method.
+    """
+    known = {(method, name): _own(method, name) for method in METHODS for name in PRESETS}
+    known |= {(method, "default"): own for method, own in _registered.items()}
+    for names, one in known.items():
+        if _equal(one, settings):
+            return names
+    return next((method for method in METHODS if type(settings.solver) is type(_DEFAULT[method])), None), None
+
+
+def _equal(one: Settings, other: Settings) -> bool:
+    """Whether settings are the same, arrays among them included."""
+    leaves, others = jax.tree.leaves(one), jax.tree.leaves(other)
+    return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, leaves, others))
+
+
+def _own(method: str, name: str) -> Settings:
+    """The settings of one of `METHODS`."""
     if name == "paper":
         return Settings(
             _paper_solver(method),

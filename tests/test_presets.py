@@ -1,7 +1,9 @@
 """Names of methods: ours, and those of others."""
 
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 
+import numpy as np
 import pytest
 
 from gavo_jax import presets
@@ -26,6 +28,17 @@ def test_a_registered_method_has_a_name_and_one_preset():
     assert presets.preset("quick") == Settings(QUICK)
     with pytest.raises(GavoError, match="no preset 'fast'"):
         presets.preset("quick", "fast")
+
+
+def test_settings_know_the_names_they_go_by():
+    named = [(method, name) for method in presets.METHODS for name in presets.PRESETS]
+    assert [presets.names_of(presets.preset(*names)) for names in named] == named
+    assert presets.names_of(Settings(QUICK)) == ("gauss-newton", None)
+    presets.register("quick", QUICK)
+    assert presets.names_of(Settings(QUICK)) == ("quick", "default")
+    fast = presets.preset("ga", "fast")
+    weights = replace(fast, alignment=replace(fast.alignment, depth_weight=np.full(5, 0.1, np.float32)))
+    assert presets.names_of(weights) == ("ga", None)
 
 
 @pytest.mark.parametrize("name", ["ga", "", "Quick", "a b", "--help"])

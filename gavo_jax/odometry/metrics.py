@@ -43,10 +43,16 @@ class Metrics(TypedDict):
 
 
 class RunMetrics(Metrics):
-    """The same, and what was run."""
+    """The same, and what was run, as in metrics.json."""
 
     sequence: str
+    method: str | None
+    """None for a solver of one's own that has no name; see `register`."""
+    preset: str | None
+    """None for settings that are no preset's."""
     seed: int
+    complete: bool
+    """Whether every frame was tracked: not where `on_lost` ended the run."""
 
 
 DRIFT: Final = "rpe_translation_rmse_m_per_s"

@@ -16,6 +16,7 @@ from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
 from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
+from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -110,7 +111,15 @@ def run_odometry(
     def figures(of: Trajectory) -> Metrics:
         return compute_metrics(of, sequence.ground_truth, steps, seconds, compile_seconds)
 
-    metrics: RunMetrics = {"sequence": sequence.name, "seed": seed, **figures(trajectory)}
+    method, preset = names_of(settings)
+    metrics: RunMetrics = {
+        "sequence": sequence.name,
+        "method": method,
+        "preset": preset,
+        "seed": seed,
+        "complete": len(steps) == len(sequence) - 1,
+        **figures(trajectory),
+    }
     if loops is None:
         return OdometryRun(trajectory, steps, metrics, sequence)
     metrics.update(errors_before(figures(causal)) | loop_figures(loops))  # pyright: ignore[reportCallIssue, reportArgumentType]

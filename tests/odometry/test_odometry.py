@@ -162,6 +162,7 @@ def test_metrics(plain_run: OdometryRun, sequence: SyntheticSequence) -> None:
     assert METRICS <= set(metrics)
     assert (metrics["frames"], metrics["pairs"], metrics["lost_pairs"]) == (FRAMES, FRAMES - 1, 0)
     assert metrics["sequence"] == "synthetic" and metrics["seed"] == 0
+    assert metrics["method"] == "gauss-newton" and metrics["preset"] is None and metrics["complete"]
     assert metrics["distance_error_final_m"] == pytest.approx(errors(plain_run, sequence)[-1], abs=1e-6)
     assert 0 < known(metrics["rpe_translation_rmse_m_per_frame"]) < 0.01
     assert metrics["rpe_translation_rmse_m_per_s"] is None, "the sequence is shorter than a second"
@@ -226,7 +227,7 @@ def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
     result = run(Altered(sequence, unreadable(5)), replace(PLAIN, on_lost="stop"))
     assert [step.index for step in result.steps] == [1, 2, 3, 4, 5]
     assert result.steps[-1].lost
-    assert result.metrics["frames"] == 6
+    assert result.metrics["frames"] == 6 and not result.metrics["complete"]
 
 
 def test_a_covered_lens_is_survived(sequence: SyntheticSequence) -> None:
