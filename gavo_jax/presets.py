@@ -148,6 +148,11 @@ def methods() -> tuple[str, ...]:
     return (*METHODS, *_registered)
 
 
+def plugin_names() -> tuple[str, ...]:
+    """Names of the methods that installed packages bring; their code is not loaded."""
+    return tuple(sorted(entry.name for entry in entry_points(group=PLUGINS)))
+
+
 @cache
 def _register_plugins() -> None:
     for entry in entry_points(group=PLUGINS):

@@ -6,8 +6,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
-Method = Annotated[str, arg(metavar="{ga,pso,gauss-newton,adam,…}")]
-"""A name that presets.methods() knows: other packages may bring some."""
+from gavo_jax import presets
+from gavo_jax.peers import PEERS
+
+METHODS = (*presets.METHODS, *presets.plugin_names())
+"""Names for the help; methods() knows them, too, and loads the packages that bring some."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
 
@@ -45,10 +48,12 @@ class Source:
 class Search:
     """How."""
 
-    method: Method = "ga"
-    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam, or what other packages bring."""
+    method: Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")] = "ga"
+    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those of
+    installed packages."""
     preset: PresetName = "default"
-    """Settings: the project's own, the paper's, for speed, for large motions."""
+    """Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has all of them;
+    a method of another package has default alone."""
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
     """Settings from a TOML file, or from config.json of an earlier run; the method and preset that it names count."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
@@ -104,8 +109,14 @@ class Run(Search, Source):
 class Compare(Source):
     """Run several methods, other libraries' too, over the same frames: one table, comparison.json, figures."""
 
-    methods: Annotated[str, arg(metavar="NAME,NAME,…")] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
-    """Methods of `gavo run` and odometries of other libraries (opencv-…, open3d-…), with commas between."""
+    methods: Annotated[
+        str,
+        arg(
+            metavar="NAME,NAME,…",
+            help="Methods of `gavo run` and odometries of other libraries, with commas between: "
+            f"{', '.join((*METHODS, *PEERS))}.",
+        ),
+    ] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
     preset: PresetName = "default"
     """Settings of the project's own methods."""
     seeds: Annotated[int, arg(metavar="N")] = 1

@@ -481,6 +481,22 @@ def test_help_and_version(gavo):
     assert gavo("--version").out.startswith("gavo-jax ")
 
 
+def test_help_lists_every_method_a_package_brings_and_loads_none(tmp_path):
+    """The package is broken: that is told where its method is used, and not by the help."""
+    info = tmp_path / "quick-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: quick\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[gavo_jax.solvers]\nquick = no_such_package:SOLVER\n")
+    places = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": places, "COLUMNS": "80"}
+    for command, names in (("run", "{ga,pso,gauss-newton,adam,quick}"), ("compare", "adam, quick, opencv-rgb")):
+        done = subprocess.run(
+            [sys.executable, "-m", "gavo_jax", command, "--help"], capture_output=True, text=True, env=environment
+        )
+        assert done.returncode == 0, done.stderr
+        assert names in " ".join(done.stdout.replace("│", "").split())
+
+
 def test_module_is_the_command():
     done = subprocess.run(
         [sys.executable, "-m", "gavo_jax", "run", "nowhere", "--camera", "fr1"],
