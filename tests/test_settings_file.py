@@ -2,11 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import optax
 import pytest
 
 from gavo_jax import presets
+from gavo_jax.cli.options import Run
+from gavo_jax.cli.selection import settings_line
 from gavo_jax.errors import GavoError
 from gavo_jax.objective.losses import huber
 from gavo_jax.output.files import describe
@@ -92,6 +95,17 @@ def test_every_preset_comes_back_from_its_file(method, name, tmp_path):
     config = {"options": {"method": method, "preset": name, "seed": 3}, "device": "cpu", **described}
     (tmp_path / "config.json").write_text(json.dumps(config))
     assert load_settings(tmp_path / "config.json") == (method, name, settings)
+
+
+def test_a_run_says_what_it_takes_of_an_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    earlier = Run(sequence=str(tmp_path), seed=3, frames=40)
+    path.write_text(json.dumps({"options": describe(earlier)}))
+    same = replace(earlier, settings=path, output=tmp_path / "out", viewer="web")
+    assert settings_line(same) == f"only the settings of {path} are used; frames and seed are the same"
+    line = settings_line(Run(settings=path, frames=40))
+    assert line and line.endswith(f"are used; sequence synthetic (there {tmp_path}), seed 0 (there 3)")
+    assert settings_line(earlier) is None and settings_line(replace(earlier, settings=tmp_path / "some.toml")) is None
 
 
 def test_a_file_says_what_differs(tmp_path):

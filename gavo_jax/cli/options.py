@@ -10,7 +10,8 @@ from gavo_jax import presets
 from gavo_jax.peers import PEERS
 
 METHODS = (*presets.METHODS, *presets.plugin_names())
-"""Names for the help; methods() knows them, too, and loads the packages that bring some."""
+Method = Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")]
+"""A name that presets.methods() knows; the help does without the code of the packages that bring some."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
 
@@ -48,7 +49,7 @@ class Source:
 class Search:
     """How."""
 
-    method: Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")] = "ga"
+    method: Method = "ga"
     """Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those of
     installed packages."""
     preset: PresetName = "default"

@@ -10,7 +10,7 @@ import jax
 from gavo_jax.cli.map_file import check_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence
+from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence, settings_line, with_whole_paths
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
@@ -86,6 +86,8 @@ def run(options: Run) -> int:
                 if mapper is not None:
                     mapper.replay(sequence, folder.steps())
             say(summary(sequence))
+            if line := settings_line(options):
+                say(line)
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
@@ -175,13 +177,8 @@ def _with_shortcuts(settings: Settings, options: Run) -> Settings:
 
 def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, Any]:
     """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
-    places = {
-        name: str(Path(place).resolve())
-        for name, place in (("sequence", options.sequence), ("camera", options.camera), ("settings", options.settings))
-        if place is not None and Path(place).exists()
-    }
     return {
-        "options": replace(options, **places),
+        "options": with_whole_paths(options),
         "sequence": {
             "name": sequence.name,
             "frames": len(sequence),

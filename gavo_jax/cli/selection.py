@@ -1,14 +1,17 @@
 """From options to frames: which sequence, which of its frames, by which camera."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from gavo_jax import presets
-from gavo_jax.cli.options import Search, Source
+from gavo_jax.cli.options import Run, Search, Source
 from gavo_jax.datasets.actors import MOST_BODIES
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError
+from gavo_jax.output.files import describe, read_json
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
 MAX_SEED = 2**32 - 1
@@ -70,6 +73,39 @@ def choose_settings(search: Search) -> NamedSettings:
     else:
         named = load_settings(search.settings, search.method, search.preset)
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
+
+
+FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_scale", "rate", "moving", "seed")
+"""Options of a run that are no settings."""
+
+
+def settings_line(options: Run) -> str | None:
+    """Say of an earlier run's config.json that its settings alone are used, and which frames and seed it had instead of
+    these; None where the settings are of no run.
+    """
+    path = options.settings
+    if path is None or path.suffix != ".json":
+        return None
+    earlier, now = read_json(path).get("options"), describe(with_whole_paths(options))
+    if not isinstance(earlier, dict):
+        return None
+    differing = {name: earlier[name] for name in FRAMES_AND_SEED if name in earlier and earlier[name] != now[name]}
+    words = [f"{name.replace('_', '-')} {_said(now[name])} (there {_said(there)})" for name, there in differing.items()]
+    return f"only the settings of {path} are used; {', '.join(words) or 'frames and seed are the same'}"
+
+
+def _said(value: Any) -> str:
+    return "not given" if value is None else str(value)
+
+
+def with_whole_paths(options: Run) -> Run:
+    """The options with paths that hold from any folder."""
+    places = {
+        name: str(Path(place).resolve())
+        for name, place in (("sequence", options.sequence), ("camera", options.camera), ("settings", options.settings))
+        if place is not None and Path(place).exists()
+    }
+    return replace(options, **places)  # pyright: ignore[reportArgumentType]
 
 
 def check_seed(seed: int) -> None:

@@ -446,7 +446,7 @@ def test_compare_refuses_methods(gavo, clip, methods):
 
 def test_names_of_options_are_those_of_the_presets():
     shown = options.Method.__metadata__[0].metavar  # pyright: ignore[reportAttributeAccessIssue]
-    assert shown == "{" + ",".join(METHODS) + ",…}"
+    assert shown == "{" + ",".join(METHODS) + "}"
     assert get_args(options.PresetName) == PRESETS
 
 
