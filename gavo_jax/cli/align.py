@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import sys
 from functools import partial
 
@@ -29,7 +28,7 @@ from gavo_jax.datasets.registry import open_source, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
-from gavo_jax.output.files import describe
+from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.trajectory import inverse
 
@@ -63,7 +62,7 @@ def align(options: Align) -> int:
         "camera_from": calibration.origin,
         "depth_units_per_metre": pair.depth_unit.file,
     }
-    print(json.dumps(describe(answer), indent=2, allow_nan=False))
+    print(json_text(answer))
     if sys.stdout.isatty():
         say(in_words(found))
     return 0

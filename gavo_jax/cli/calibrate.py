@@ -1,6 +1,5 @@
 """`gavo calibrate`: what a recording does not say of its camera, found from its images, as a camera file."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
-from gavo_jax.output.files import describe
+from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import print_table, say, waiting
 
 
@@ -38,7 +37,7 @@ def calibrate(options: Calibrate) -> int:
     calibration = calibration_of(sequence, estimate)
     write_camera_file(output, calibration, ("found from the images alone by gavo calibrate", *_comments(estimate)))
     if options.json:
-        print(json.dumps(describe(_facts(estimate)), indent=2, allow_nan=False))
+        print(json_text(_facts(estimate)))
         return 0
     rows = [(name, *_cells(found)) for name, found in estimate.found.items()]
     print_table(f"camera of {sequence.name}, by {estimate.pairs} pairs of frames", ("", "", "±", "unit"), rows)

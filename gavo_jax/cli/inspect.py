@@ -1,13 +1,12 @@
 """`gavo inspect`: what a source is, and which of its frames a run would use."""
 
-import json
 from typing import Any
 
 from gavo_jax.cli.options import Inspect
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.depth_unit import name_of_unit
 from gavo_jax.inspection import inspect_sequence
-from gavo_jax.output.files import describe
+from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 
 NOTES = {
@@ -26,7 +25,7 @@ def inspect(options: Inspect) -> int:
     with waiting(f"looking at {len(sequence)} frames …"):
         facts = inspect_sequence(sequence)
     if options.json:
-        print(json.dumps(describe(facts), indent=2, allow_nan=False))
+        print(json_text(facts))
     else:
         for what, words in _lines(facts):
             say(f"{what}: {words}")

@@ -5,6 +5,7 @@ import enum
 import json
 import math
 import platform
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -82,6 +83,16 @@ def describe(value: Any) -> Any:
     return name_of(value) or getattr(value, "__name__", str(value))
 
 
+ROW = re.compile(r'\[\n\s*([^][{}"]*?)\n\s*\]')
+"""A list of numbers as `json` writes it, one a line. No string has a line break that is not escaped."""
+
+
+def json_text(value: Any, ensure_ascii: bool = True) -> str:
+    """A value (see `describe`) as JSON that people can read: each list of numbers, as a row of a matrix, is a line."""
+    text = json.dumps(describe(value), indent=2, allow_nan=False, ensure_ascii=ensure_ascii)
+    return ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
+
+
 def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
     """The places where two JSON values differ: dotted name, one value, the other."""
     if isinstance(before, dict) and isinstance(after, dict):
@@ -136,4 +147,4 @@ def write_json(path: Path, value: Any) -> None:
     Raises:
         GavoError: the file cannot be written.
     """
-    write_lines(path, [json.dumps(describe(value), indent=2, allow_nan=False)])
+    write_lines(path, [json_text(value)])

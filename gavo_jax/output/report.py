@@ -2,13 +2,12 @@
 
 import base64
 import html
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gavo_jax.errors import GavoError
-from gavo_jax.output.files import describe
+from gavo_jax.output.files import json_text
 from gavo_jax.trajectory import write_lines
 
 REPORT = "report.html"
@@ -75,7 +74,7 @@ def write_report(
     Raises:
         GavoError: a figure cannot be read or is neither SVG nor PNG, or the report cannot be written.
     """
-    settings = json.dumps(describe(configuration), indent=2, ensure_ascii=False)
+    settings = json_text(configuration, ensure_ascii=False)
     body = [
         f"<h1>{html.escape(title)}</h1>",
         *([f"<p>{html.escape(introduction)}</p>"] if introduction else []),

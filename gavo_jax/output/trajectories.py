@@ -1,6 +1,5 @@
 """A trajectory in the formats of other programs: TUM, KITTI, EuRoC's CSV, JSON, and a ROS 2 bag of poses."""
 
-import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.errors import PARTIAL, GavoError
-from gavo_jax.output.files import TRAJECTORY, remove_files
+from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, write_lines
 
 FILES = {
@@ -127,7 +126,7 @@ def write_json(trajectory: Trajectory, path: Path) -> None:
         )
     ]
     whole = {"frame": "world_T_camera", "units": {"timestamp": "s", "translation": "m"}, "poses": poses}
-    write_lines(path, [json.dumps(whole, indent=1, allow_nan=False)])
+    write_lines(path, [json_text(whole)])
 
 
 def write_bag(trajectory: Trajectory, path: Path) -> None:

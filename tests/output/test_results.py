@@ -11,7 +11,7 @@ import pytest
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
-from gavo_jax.output.files import describe, prepare_folder, write_json
+from gavo_jax.output.files import describe, json_text, prepare_folder, write_json
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.status import AlignmentStatus
@@ -77,6 +77,15 @@ def test_describe_is_strict_json():
         "function": "sqrt",
         "flag": True,
     }
+
+
+def test_a_list_of_numbers_is_one_line_of_json():
+    value = {"matrix": [[1.5, -2e-9], [None, True]], "words": ["[\n 1 ]", "[ 2 ]"], "none": [], "of": [{"a": [1, 2]}]}
+    text = json_text(value)
+    assert json.loads(text) == value
+    lines = [line.strip() for line in text.splitlines()]
+    assert "[1.5, -2e-09]," in lines and "[null, true]" in lines and '"a": [1, 2]' in lines
+    assert json_text({"name": "ü"}, ensure_ascii=False).splitlines()[1] == '  "name": "ü"'
 
 
 def test_json_is_whole_or_absent(tmp_path):
