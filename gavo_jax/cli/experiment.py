@@ -42,12 +42,13 @@ SUMMARY_COLUMNS = (
     "ms/frame",
     "together",
 )
-COMPARISON_COLUMNS = ("", "pairs", "ratio", "p")
+COMPARISON_COLUMNS = ("", "paired runs", "ratio", "p")
 MEANINGS = {
     "m/s": "m/s, deg/s: drift (relative pose error over 1 s, RMSE), median over the runs.",
     "from": "from, to: quartiles of the m/s.",
     "printed": "printed: the m/s that a publication prints.",
     "m/frame": "m/frame: relative pose error from frame to frame, RMSE, median over the runs.",
+    "lost": "lost: frame pairs without a usable motion, of the worst run.",
     "ms/frame": "ms/frame: time, decoding included, median over the runs.",
     "together": "together: most runs that shared the machine and its time.",
 }
@@ -204,7 +205,7 @@ def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
     for name, label in dict.fromkeys((run.part.name, run.label) for run in plan.runs):
         group = [run for run in plan.runs if (run.part.name, run.label) == (name, label)]
         rows.append((f"{name}: {label}", len(group), sum(run.id in ours for run in group), group[0].pairs))
-    print_table(f"experiment {plan.name}", ("", "runs", "to do", "pairs"), rows)
+    print_table(f"experiment {plan.name}", ("", "runs", "to do", "frame pairs"), rows)
     for line in plan.skipped:
         say(line)
     seconds = estimate_seconds(runs, table.read() if table.done() else [], slots)

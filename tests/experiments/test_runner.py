@@ -109,9 +109,11 @@ def test_command(small, tmp_path, capsys):
     assert main(["experiment", str(small), "--output", str(out), "--dry-run"]) == 0
     planned = capsys.readouterr().out
     assert "4 runs, 0 of them done; 4 to do in 3 batches, 1 compiled programs" in planned and not out.exists()
+    assert " frame pairs " in planned
     assert main(["experiment", str(small), "--output", str(out)]) == 0
     printed, news = capsys.readouterr()
     assert "0.04000" in printed and "Wilcoxon" in printed
+    assert " paired runs " in printed and "lost: frame pairs without" in printed
     assert news.splitlines()[0] == f"synthetic: {LABEL}: 2 done"
     assert (out / "report.html").stat().st_size and (out / "drift.svg").stat().st_size
     assert main(["experiment", "report", str(out), "--markdown"]) == 0
