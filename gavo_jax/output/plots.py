@@ -45,30 +45,33 @@ def available() -> bool:
 
 SMALLEST_EXCESS = 1e-3
 """Per cent; a smaller excess is drawn as this."""
-CAPTION_WIDTH = 18
-"""Letters of a caption an inch of the figure."""
+CAPTION_WIDTH, CAPTION_SIZE = 15, 8.5
+"""Letters of a caption an inch of the figure, and their size in points: read where a page shows the figure smaller."""
+PANEL_WIDTH = 2.5
+"""Inches, where each level has a panel."""
 
 CAPTIONS = {
-    "trajectory": "Estimated camera positions, all seen from their first camera; a square marks the start.",
+    "trajectory": "Camera positions in the frame of the first camera; the square is the start.",
     "distance_error": "Distance error of each frame: distance between the estimated and the true position of the "
     "camera, both relative to the first pose; the truth is interpolated at the frames' stamps.",
-    "drift": "Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, fixed delta); translation "
-    "in m/s, rotation in deg/s. Bars: median over the runs; whiskers, where they are given: smallest and largest.",
-    "convergence": "By how much the best error E so far exceeds the last one of the same level, over the iterations of "
-    "its search: median over the pairs of the run, and the range of their middle 80 %. Levels from coarse to fine. An "
-    f"excess below {SMALLEST_EXCESS:g} % is drawn as that.",
+    "drift": "Drift: relative pose error over 1 s, root mean square (TUM evaluate_rpe.py, fixed delta). Blue: this "
+    "project's methods; hatched: other libraries.",
+    "convergence": "By how many per cent the best error E so far exceeds the last one of its level, over the "
+    "iterations of each level, from coarse to fine. What is below "
+    f"{SMALLEST_EXCESS:g} % is drawn at {SMALLEST_EXCESS:g} %.",
     "population": "Root of E over the iterations of each level's search of the run's last pair: best and median of the "
     "population, and the range of its middle 80 %. Levels from coarse to fine; their errors are not comparable.",
     "landscape": "Root of E around the motion that was found, along the eigenvectors of its covariance with the "
-    "largest and the smallest variance; a step of 1 is 1 mm and 1 mrad. Gaps: too little of the view is left.",
+    "largest and the smallest variance: translation v and rotation w, in the axes of the reference camera. Gaps: too "
+    "little of the view is left.",
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
 """By the name of the figure's files."""
-WITH_TRUTH = (
-    " The truth is interpolated at the frames' stamps and laid on the first estimate's first pose that it covers."
-)
+WITH_TRUTH = " Ground truth: interpolated at the frames' stamps, from the first estimate's first pose that it covers."
 """Of the trajectories' caption."""
+SEVERAL_RUNS = " Bars: median over the runs; whiskers: smallest and largest."
+"""Of the drift's caption."""
 MORE_THAN_THE_PAIR = " The motion was found with {}, too: the minimum of this pair alone may lie millimetres away."
 """Of the landscape's caption."""
 SMALL = 0.1
@@ -124,7 +127,7 @@ def plot_trajectories(
     across = 0 if high[0] - low[0] >= high[2] - low[2] else 2
     views = ((0, 2), (across, 1))
     half = _half_widths(high - low, views)
-    figure = _figure(10.0, 4.4 * half[1] / half[0] + 1.4, "trajectory", "" if true_path is None else WITH_TRUTH)
+    figure = _figure(8.5, 3.5 * half[1] / half[0] + 1.7, "trajectory", "" if true_path is None else WITH_TRUTH)
     titles = ("From above", "From behind" if across == 0 else "From the right")
     for axes, (i, j), title in zip(figure.subplots(1, 2), views, titles, strict=True):
         if true_path is not None:
@@ -136,10 +139,11 @@ def plot_trajectories(
         middle = scale * (low + high)[[i, j]] / 2
         axes.set(xlabel=f"{AXES[i]} ({unit})", ylabel=f"{AXES[j]} ({unit})", title=title, aspect="equal")
         axes.set(xlim=middle[0] + scale * half[0] * SIDES, ylim=middle[1] + scale * half[1] * SIDES)
+        axes.locator_params(nbins=5)
         axes.grid(alpha=0.3)
         if unit == "mm":
             _draw_scale(axes, unit)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize="small")
+    _legend(figure)
     return figure
 
 
@@ -148,8 +152,8 @@ UPWARDS = np.array([1.0, -1.0, 1.0])
 AXES = ("x, right", "−y, up", "z, forward")
 SIDES = np.array([-1.0, 1.0])
 HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-MARGIN = 1.15
-"""Of a panel's sides over those of what it holds."""
+MARGIN = 1.3
+"""Of a panel's sides over those of what it holds: the start at an edge leaves room for its name."""
 
 
 def _half_widths(extent: Float[np.ndarray, " 3"], views: Sequence[tuple[int, int]]) -> Float[np.ndarray, " 2"]:
@@ -172,19 +176,21 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
         histories: best E so far after every iteration, by level in the order of the search; NaN where a search had
             ended: its last error is carried on.
     """
-    figure = _figure(3.0 * len(histories), 3.6, "convergence")
+    figure = _figure(PANEL_WIDTH * len(histories), 3.8, "convergence")
     panels = _panels(figure, len(histories), one_scale=True)
     for axes, (level, history) in zip(panels, histories.items(), strict=True):
         error = _carry_on(history)
         end = np.where(np.isfinite(error[:, -1:]), error[:, -1:], np.nan)  # infinite where a search sees nothing
         excess = 100.0 * (error[:, :-1] / np.maximum(end, 1e-12) - 1.0)
         iterations = np.arange(1, excess.shape[1] + 1)
-        _draw_band(axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of them")
+        _draw_band(
+            axes, iterations, np.maximum(excess, SMALLEST_EXCESS), "median of the pairs", "middle 80 % of the pairs"
+        )
         axes.set(title=f"level {level}", xlabel="iteration", yscale="log")
         axes.minorticks_off()
         axes.yaxis.set_major_formatter(_excess)
     figure.axes[0].set_ylabel("excess of E (%)")
-    figure.axes[0].legend(fontsize="small")
+    _legend(figure)
     return figure
 
 
@@ -200,16 +206,17 @@ def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> 
         errors: E of every candidate after every iteration, by level in the order of the search; NaN rows where the
             search had ended, +inf where a candidate is worthless.
     """
-    figure = _figure(3.0 * len(errors), 3.6, "population")
+    figure = _figure(PANEL_WIDTH * len(errors), 3.8, "population")
     for axes, (level, error) in zip(_panels(figure, len(errors)), errors.items(), strict=True):
         error = error[~np.isnan(error).all(axis=1)]
         rmse = np.sqrt(np.where(np.isfinite(error), error, np.nan))
         iterations = np.arange(1, len(rmse) + 1)
         _draw_band(axes, iterations, rmse.T, "median", "middle 80 %")
         axes.plot(iterations, np.nanmin(rmse, axis=1), color=COLORS[1], linestyle="--", marker="s", label="best")
-        axes.set(title=f"level {level}, {error.shape[1]} candidates", xlabel="iteration")
+        axes.set_title(f"level {level}, {error.shape[1]} candidates", fontsize="medium")
+        axes.set(xlabel="iteration")
     figure.axes[0].set_ylabel("√E (grey levels)")
-    figure.axes[0].legend(fontsize="small")
+    _legend(figure)
     return figure
 
 
@@ -230,8 +237,9 @@ def plot_landscape(landscape: Landscape, pair: str = "", more: Sequence[str] = (
             style |= {"linewidth": 1.5}
             rmse = np.sqrt(np.where(np.isfinite(errors[i]), errors[i], np.nan))
             axes.plot(landscape.steps * 1e3, rmse, label=f"level {level}", **style, markevery=_marks(len(rmse)))
-        numbers = ", ".join(f"{value:.2f}" for value in landscape.directions[i])
-        axes.set(title=title, xlabel=f"step (mm, mrad) along\n(v, w) = ({numbers})", ylim=(0, None))
+        v, w = (", ".join(f"{value:.2f}" for value in half) for half in np.split(landscape.directions[i], 2))
+        step = f"step s, with v = s ({v}) mm\nand w = s ({w}) mrad".replace("-", "−")
+        axes.set(title=title, xlabel=step, ylim=(0, None))
     figure.axes[0].set_ylabel("√E (grey levels)")
     figure.axes[0].legend(fontsize="small")
     return figure
@@ -272,7 +280,8 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
         ours: which of the methods are the project's own.
     """
     rows = max(len(methods) for methods in clips.values())
-    figure = _figure(9.0, (0.9 + 0.2 * rows) * len(clips) + 0.6, "drift")
+    several = any(len(runs) > 1 for methods in clips.values() for runs in methods.values())
+    figure = _figure(9.0, (0.9 + 0.2 * rows) * len(clips) + 0.6, "drift", SEVERAL_RUNS if several else "")
     panels = figure.subplots(len(clips), 2, squeeze=False)
     for (clip, methods), pair in zip(clips.items(), panels, strict=True):
         for column, (axes, label) in enumerate(zip(pair, ("translation (m/s)", "rotation (deg/s)"), strict=True)):
@@ -341,8 +350,15 @@ def _figure(width: float, height: float, name: str, more: str = "") -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.supxlabel(textwrap.fill(CAPTIONS[name] + more, int(CAPTION_WIDTH * width)), fontsize=7, x=0.01, ha="left")
+    figure.supxlabel(
+        textwrap.fill(CAPTIONS[name] + more, int(CAPTION_WIDTH * width)), fontsize=CAPTION_SIZE, x=0.01, ha="left"
+    )
     return figure
+
+
+def _legend(figure: Figure) -> None:
+    """Name what the first panel shows, above all panels: within one it would cover curves."""
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize="small")
 
 
 def _number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
@@ -448,8 +464,8 @@ def _panels(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
 def _draw_band(axes: Any, x: Any, samples: Float[np.ndarray, "samples n"], middle: str, range_: str) -> None:
     """Draw the median of samples with the range of their middle 80 %."""
     low, median, high = np.nanquantile(samples, [0.1, 0.5, 0.9], axis=0)
-    axes.fill_between(x, low, high, facecolor=COLORS[5], alpha=0.35, edgecolor=COLORS[0], linewidth=0.5, label=range_)
     axes.plot(x, median, color=COLORS[0], marker="o", markersize=3, label=middle)
+    axes.fill_between(x, low, high, facecolor=COLORS[5], alpha=0.35, edgecolor=COLORS[0], linewidth=0.5, label=range_)
 
 
 def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarray, "pairs iterations"]:
@@ -459,11 +475,14 @@ def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarra
 
 
 def _draw_scale(axes: Any, unit: str) -> None:
-    """Draw a bar of a round length, a fifth to a half of the panel, into its lower left corner."""
+    """Draw a bar of a round length, a fifth to a half of the panel, into the lower corner that is farther from the
+    start.
+    """
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     power = 10.0 ** np.floor(np.log10(right - left))
     length = max(digit * power for digit in (0.1, 0.2, 0.5, 1.0, 2.0) if digit * power <= 0.5 * (right - left))
-    start, up = left + 0.06 * (right - left), low + 0.06 * (high - low)
+    free = 0.88 * (right - left) - length if left + right > 0 else 0.0
+    start, up = left + 0.06 * (right - left) + free, low + 0.06 * (high - low)
     axes.plot([start, start + length], [up, up], color="black", linewidth=2, solid_capstyle="butt")
     axes.annotate(
         f"{length:g} {unit}", (start + length / 2, up), (0, 3), textcoords="offset points", ha="center", fontsize=7

@@ -1,5 +1,7 @@
 """Figures: what they show, and what they are written to."""
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -49,6 +51,14 @@ def sideways(length: float) -> Trajectory:
     trajectory = straight(0.0)
     world_T_camera = trajectory.world_T_camera.copy()
     world_T_camera[:, 0, 3], world_T_camera[:, 1, 3] = (np.linspace(0, end, 30) for end in (length, 0.1 * length))
+    return Trajectory(trajectory.timestamps, world_T_camera)
+
+
+def diagonal(length: float) -> Trajectory:
+    """A camera that moves upwards, forward, and to the right."""
+    trajectory = straight(length)
+    world_T_camera = trajectory.world_T_camera.copy()
+    world_T_camera[:, :2, 3] = np.linspace(0, length, 30)[:, None] * [1.0, -0.5]
     return Trajectory(trajectory.timestamps, world_T_camera)
 
 
@@ -150,15 +160,16 @@ def test_a_saved_figure_is_filled_to_its_edges(tmp_path):
     figure = plots.plot_convergence({1: np.array([[4.0, 2.0, 1.0]]), 2: np.array([[9.0, 2.0, 1.0]])})
     picture, vector = plots.save(figure, tmp_path, "convergence")
     ink = np.argwhere(np.asarray(cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)) < 128)
-    size = np.array([0.9 * 3.6, 6.0]) * 120  # inches by dots; the caption leaves room at the right
+    size = np.array([0.9 * 3.8, 5.0]) * 120  # inches by dots; the caption leaves room at the right
     assert np.all(ink.min(axis=0) < 0.06 * size) and np.all(ink.max(axis=0) > 0.94 * size)
     frames = [axes.get_window_extent() for axes in figure.axes]
     assert frames[0].x1 < frames[1].x0 and frames[1].x1 > 0.94 * figure.bbox.width
-    assert 'width="432pt" height="259.2pt"' in vector.read_text()
+    assert 'width="360pt" height="273.6pt"' in vector.read_text()
 
 
-def labels(axes) -> list[str]:
-    return [text.get_text() for text in axes.get_legend().get_texts()]
+def labels(figure) -> list[str]:
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
 
 
 def test_every_figure_carries_its_definition_and_units():
@@ -178,7 +189,7 @@ def test_every_figure_carries_its_definition_and_units():
     assert set(figures) == set(plots.CAPTIONS)
     for name, figure in figures.items():
         caption = " ".join(str(figure.get_supxlabel()).split())
-        assert caption == plots.CAPTIONS[name]
+        assert caption.startswith(plots.CAPTIONS[name])
         for axes in figure.axes:
             assert axes.get_xlabel(), name
 
@@ -194,10 +205,11 @@ def test_convergence_carries_the_last_error_on_and_counts_from_it():
 
 def test_population_shows_best_median_and_spread_of_what_was_searched():
     error = np.array([[100.0, 16.0, np.inf], [9.0, 4.0, 1.0], [np.nan] * 3])
-    (axes,) = plots.plot_population({3: error}).axes
+    figure = plots.plot_population({3: error})
+    (axes,) = figure.axes
     lines = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in axes.get_lines()}
     assert lines["best"] == [4.0, 1.0] and lines["median"] == [7.0, 2.0]
-    assert labels(axes) == ["middle 80 %", "median", "best"]
+    assert labels(figure) == ["median", "middle 80 %", "best"]
 
 
 def test_landscape_leaves_gaps_where_a_motion_is_worthless():
@@ -215,6 +227,36 @@ def test_landscape_says_what_else_the_motion_was_found_with_only_where_there_was
     assert "with a keyframe, too" in " ".join(with_keyframe.get_supxlabel().split())
     assert with_keyframe.get_suptitle() == "frames 3 and 4"
     assert "keyframe" not in plots.plot_landscape(landscape).get_supxlabel()
+
+
+def test_the_directions_of_a_landscape_have_units():
+    landscape = Landscape(np.linspace(-0.1, 0.1, 5), np.eye(6)[[1, 5]], {1: np.full((2, 5), 4.0)})
+    worst, best = (axes.get_xlabel() for axes in plots.plot_landscape(landscape).axes)
+    assert worst == "step s, with v = s (0.00, 1.00, 0.00) mm\nand w = s (0.00, 0.00, 0.00) mrad"
+    assert "(0.00, 0.00, 1.00) mrad" in best
+
+
+@pytest.mark.parametrize("trajectory", [straight(0.38), sideways(1.0), diagonal(0.02), diagonal(-0.5)])
+def test_names_and_numbers_of_a_trajectorys_panels_have_room(trajectory):
+    """No two ticks' numbers touch, and the start's name lies inside the panel and clear of the scale bar."""
+    figure = plots.plot_trajectories({"ga": trajectory}, None)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        shown = [text for text in axes.get_xticklabels() if axes.get_xlim()[0] < text.get_position()[0]]
+        boxes = [text.get_window_extent() for text in shown if text.get_position()[0] < axes.get_xlim()[1]]
+        assert all(one.x1 + 8 < other.x0 for one, other in itertools.pairwise(boxes))
+        (start,) = (text for text in axes.texts if text.get_text() == "start")
+        name, panel = start.get_window_extent(), axes.get_window_extent()
+        assert panel.x0 < name.x0 < name.x1 < panel.x1 and panel.y0 < name.y0
+        others = [text.get_window_extent() for text in axes.texts if text is not start]
+        bars = [line.get_window_extent() for line in axes.lines if str(line.get_label()).startswith("_")]
+        assert not any(name.overlaps(other) for other in others + bars)
+
+
+def test_a_drift_of_single_runs_has_neither_median_nor_whiskers():
+    runs = np.array([[0.01, 1.0], [0.05, 3.0]])
+    several, single = (plots.plot_drift({"clip": {"ga": some}}, ["ga"]).get_supxlabel() for some in (runs, runs[:1]))
+    assert "median" in several and "median" not in single
 
 
 def test_drift_bars_are_medians_and_others_are_hatched():
