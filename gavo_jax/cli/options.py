@@ -21,7 +21,7 @@ class Source:
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
     """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package. For
-    `gavo run` also realsense: the first camera of that line, live."""
+    `gavo run` also realsense: live frames of the first Intel RealSense camera that is connected."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
     """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML or ROS or
     Kalibr, OpenCV, Open3D."""
