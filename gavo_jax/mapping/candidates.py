@@ -10,19 +10,19 @@ from gavo_jax.mapping.keyframes import NEAREST, Keyframe
 from gavo_jax.mapping.motions import size
 from gavo_jax.trajectory import inverse
 
-MOST = 2
+MOST = 4
 """Candidates of one keyframe, which bounds the work."""
 LOOKED_AT = 48
 """Earlier keyframes, those that see most of what the new one sees, that are compared with it: this bounds the work."""
 FEW_POINTS = 60
 """Points that tell which these are."""
-MIN_SECONDS = 1.0
+MIN_SECONDS = 0.2
 """Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
 """Predicted share of either one's points that the other sees,"""
 MIN_LIKENESS = 0.88
 """and correlation of what both see."""
-APART = 3
+APART = 2
 """Keyframes between two candidates: neighbours would say the same twice."""
 ANOTHER_GUESS = (0.02, 0.02)
 """Metres and radians by which a guess has to differ from one that led to nothing."""

@@ -11,7 +11,7 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.image.settling import still
-from gavo_jax.mapping.candidates import find_candidates
+from gavo_jax.mapping.candidates import APART, MIN_SECONDS, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
@@ -70,9 +70,9 @@ def test_images_are_bounded_and_the_likest_are_candidates():
     assert max(k.index for k in kept) == 24
     found = find_candidates(keyframes.all[24], kept[:-1], keyframes.camera)
     assert found and all(c.likeness > 0.88 and c.overlap >= 0.5 for c in found)
-    assert all(c.later.timestamp - c.earlier.timestamp >= 1.0 for c in found)
+    assert all(c.later.timestamp - c.earlier.timestamp >= MIN_SECONDS for c in found)
     numbers = sorted(c.earlier.number for c in found)
-    assert all(b - a >= 3 for a, b in zip(numbers, numbers[1:], strict=False))
+    assert all(b - a >= APART for a, b in zip(numbers, numbers[1:], strict=False))
 
 
 def test_shifts_of_many_are_those_of_any_two():
@@ -235,6 +235,6 @@ def test_what_is_heavy_is_held_for_a_stated_number_of_keyframes():
     assert len(kept) == 6 and len(others) > 4 and mapper.edges
     assert weight(others, seen) < 2000 * len(others)
     assert weight(mapper.edges, seen) < 1000 * len(mapper.edges)
-    assert weight(vars(mapper), seen) < 2000
+    assert weight(vars(mapper), seen) < 4000  # the place that was found last
     pixels = CAMERA.width * CAMERA.height
     assert heavy < len(kept) * 16 * pixels
