@@ -149,7 +149,7 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
     def whole(key: str) -> int:
         value = values[key]
         if isinstance(value, bool) or not isinstance(value, int) or not 16 <= value <= MAX_SIDE:
-            raise GavoError(f"{path}: {part}{key}: must be a whole number from 16 to {MAX_SIDE}")
+            raise GavoError(f"{path}: {part}{key}: must be a whole number from 16 to {MAX_SIDE}, not {shown(value)}")
         return value
 
     width, height = whole("width"), whole("height")

@@ -153,9 +153,10 @@ def _read_ros(path: Path, values: Table) -> Table:
     def numbers(entry: Any) -> list[Any]:
         return list(entry["data"] if isinstance(entry, dict) else entry or [])
 
+    sizes = {"width": first("image_width", "width"), "height": first("image_height", "height")}
     return {
         **of_matrix(str(path), numbers(first("camera_matrix", "K", "k"))),
-        **{"width": first("image_width", "width"), "height": first("image_height", "height")},
+        **{key: value for key, value in sizes.items() if value is not None},
         **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
         **{key: values[key] for key in ("depth_scale", "readout") if key in values},
     }

@@ -169,14 +169,18 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
         ("500 510 319.5 239.5\n", NONE),
         ("500 0 319.5 0 510 239.5 0 0 1\n", NONE),
         ("[[500, 0, 319.5],\n [0, 510, 239.5],\n [0, 0, 1]]\n", NONE),
+        (json.dumps({"K": ROWS}), NONE),
         ("# fx fy cx cy\n500, 510, 319.5, 239.5, 0.1, -0.2, 0.001, -0.002\n", BROWN),
     ],
 )
 def test_numbers_alone_need_the_images_size(tmp_path, text, camera):
-    (tmp_path / "intrinsics.txt").write_text(text)
-    assert load_calibration(tmp_path / "intrinsics.txt", (640, 480)).color == camera
-    with pytest.raises(GavoError, match=r"intrinsics\.txt: width: missing"):
-        load_calibration(tmp_path / "intrinsics.txt")
+    path = tmp_path / ("intrinsics.json" if text.startswith("{") else "intrinsics.txt")
+    path.write_text(text)
+    assert load_calibration(path, (640, 480)).color == camera
+    with pytest.raises(GavoError, match=f"{path.name}: width: missing"):
+        load_calibration(path)
+    with pytest.raises(GavoError, match=f"{path.name}: width: must be a whole number from 16 to 8192, not 8"):
+        load_calibration(path, (8, 8))
 
 
 @pytest.mark.parametrize("make", ["ros", "open3d"])
