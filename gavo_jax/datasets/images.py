@@ -27,11 +27,6 @@ MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
 
 PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01", b"\x93NUMPY"
 
-TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
-
-ORIENTATION = 274
-"""The tag of a TIFF that says how a camera was held."""
-
 EXR_WARNING = "Exception raised reading pixel data"
 """In what OpenEXR prints of a torn file."""
 
@@ -151,8 +146,6 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         _check_png(data, name)
     elif not _is_known(data):
         raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
-    if data.startswith(TIFF_SIGNATURES):
-        data = _not_turned(data)
     image = _decoded(data, flags)
     if image is None and flags == AS_COLOR:
         image = _decoded(data, AS_STORED)  # what is whole, but no colour, is to be told by its kind
@@ -176,7 +169,8 @@ SIGNATURES = (
     PNG_SIGNATURE,
     b"\xff\xd8\xff",
     b"BM",
-    *TIFF_SIGNATURES,
+    b"II*\0",
+    b"MM\0*",
     b"II+\0",
     b"MM\0+",
     b"RIFF",
@@ -252,18 +246,6 @@ def _check_png(data: bytes, name: str) -> None:
             return
         at = end + 4
     raise FrameError(f"{name}: torn PNG image (no end): get the file anew")
-
-
-def _not_turned(data: bytes) -> bytes:
-    """A TIFF whose tag of orientation says that nothing is to be turned: OpenCV turns the pixels whatever its flags."""
-    order = "<" if data.startswith(b"II") else ">"
-    with contextlib.suppress(struct.error):  # of a torn file, which OpenCV refuses
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, at)
-        for entry in range(at + 2, at + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == ORIENTATION:
-                return data[: entry + 8] + struct.pack(f"{order}H", 1) + data[entry + 10 :]
-    return data
 
 
 def _decode_npy(data: bytes, name: str) -> np.ndarray:

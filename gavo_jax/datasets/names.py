@@ -8,9 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.datasets.clock import UNITS, clock_unit
 from gavo_jax.datasets.files import unpaired
 from gavo_jax.errors import GavoError
+
+UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Seconds of what whole numbers may count."""
+
+EPOCH = (946684800.0, 4102444800.0)
+"""Seconds since 1970 of the years 2000 to 2100, from which stamps of a clock are."""
 
 INTERVALS = (2e-3, 10.0)
 """Seconds between two frames."""
@@ -165,13 +170,12 @@ def unit_of(counts: Sequence[float]) -> float | None:
     """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
     if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
-    of_clock = clock_unit(counts)
-    if of_clock and _is_between([of_clock * count for count in counts], INTERVALS):
-        return of_clock
+    of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
+    usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]
     device = [unit for unit in UNITS[2:] if _is_between([unit * count for count in counts], DEVICE_INTERVALS)]
     if _are_milliseconds(np.diff(sorted(counts))):
         device.append(UNITS[1])
-    return device[0] if device else of_clock
+    return next(iter((*usual, *device, *of_clock)), None)
 
 
 def _are_milliseconds(steps: np.ndarray) -> bool:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.clock import clock_unit
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 
@@ -38,7 +37,7 @@ Seconds = Callable[[np.ndarray], np.ndarray]
 
 
 def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] | None = None) -> Trajectory | None:
-    """The true trajectory that lies in a folder, if one does; its stamps may be in ms, µs or ns since 1970.
+    """The true trajectory that lies in a folder, if one does.
 
     Args:
         folder: of the frames.
@@ -50,9 +49,7 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
     """
     if (folder / TRUTH).exists():
         truth = Trajectory.read_tum(folder / TRUTH)
-        if seconds and _are_whole(truth):
-            return replace(truth, timestamps=seconds(truth.timestamps))
-        return replace(truth, timestamps=(clock_unit(truth.timestamps) or 1.0) * truth.timestamps)
+        return replace(truth, timestamps=seconds(truth.timestamps)) if seconds and _are_whole(truth) else truth
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None

@@ -16,16 +16,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
-from gavo_jax.datasets.images import (
-    MAX_BYTES,
-    decode_color,
-    decode_depth,
-    read_color,
-    read_depth,
-    white_of,
-    without_invalid,
-    without_words_on,
-)
+from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid, without_words_on
 from gavo_jax.errors import GavoError
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
@@ -87,19 +78,6 @@ def test_colour_of_any_format(tmp_path, depth_file, ending):
     tolerance = 12 if ending in (".jpg", ".webp") else 0
     assert np.abs(frame.grey - expected).max() <= tolerance and frame.grey.dtype == np.uint8
     assert frame.color is not None and np.abs(frame.color[..., ::-1].astype(int) - BGR).mean() <= tolerance
-
-
-@pytest.mark.parametrize("turn", range(1, 9))
-def test_an_orientation_tag_of_a_tiff_does_not_turn_it(turn):
-    for image, decode in ((BGR, decode_color), (RAW, decode_depth)):
-        data = cv2.imencode(".tiff", image)[1].tobytes()
-        (at,) = struct.unpack_from("<I", data, 4)
-        (count,) = struct.unpack_from("<H", data, at)
-        tags = [data[at + 2 + 12 * n :][:12] for n in range(count)] + [struct.pack("<HHIHH", 274, 3, 1, turn, 0)]
-        tags.sort(key=lambda tag: struct.unpack_from("<H", tag))
-        table = struct.pack("<H", len(tags)) + b"".join(tags) + bytes(4)
-        turned = data[:4] + struct.pack("<I", len(data)) + data[8:] + table
-        np.testing.assert_array_equal(decode(turned, "image.tiff"), image)
 
 
 @pytest.mark.parametrize(
