@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import struct
 import tempfile
 import threading
@@ -29,6 +30,15 @@ PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x
 
 EXR_WARNING = "Exception raised reading pixel data"
 """In what OpenEXR prints of a torn file."""
+
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+
+JPEG_WORDS = ("Corrupt JPEG data", "Premature end of JPEG", "for sequential JPEG", "JFIF revision")
+"""In what libjpeg prints of a file that it decodes all the same."""
+
+JPEG_LOSS = re.compile(r"[Pp]remature end|bad (?:Huffman|arithmetic)|instead of RST|before marker 0xd[0-7]")
+"""In those of its words that tell of pixels that are not the camera's; bytes too many at the end, which many cameras
+leave there, are none."""
 
 NO_READING = 65535
 """Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
@@ -146,7 +156,7 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         _check_png(data, name)
     elif not _is_known(data):
         raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
-    image = _decoded(data, flags)
+    image = _decoded_jpeg(data, flags, name) if data.startswith(JPEG_SIGNATURE) else _decoded(data, flags)
     if image is None and flags == AS_COLOR:
         image = _decoded(data, AS_STORED)  # what is whole, but no colour, is to be told by its kind
     if image is None:
@@ -165,9 +175,18 @@ def _decoded(data: bytes, flags: int) -> np.ndarray | None:
         return None
 
 
+def _decoded_jpeg(data: bytes, flags: int, name: str) -> np.ndarray | None:
+    """Refuse a JPEG of which a part is damaged: libjpeg makes up the rest, and tells nobody but standard error."""
+    with _without_lines(*JPEG_WORDS) as said:
+        image = _decoded(data, flags)
+    if any(map(JPEG_LOSS.search, said)):
+        raise FrameError(f"{name}: damaged JPEG image, of which a part is lost: get the file anew")
+    return image
+
+
 SIGNATURES = (
     PNG_SIGNATURE,
-    b"\xff\xd8\xff",
+    JPEG_SIGNATURE,
     b"BM",
     b"II*\0",
     b"MM\0*",
@@ -202,27 +221,40 @@ def _quiet() -> Iterator[None]:
 @contextlib.contextmanager
 def without_words_on(name: str) -> Iterator[None]:
     """Leave out the lines that OpenEXR prints while it reads a file; what others print in that time comes after it."""
-    with _ASIDE, tempfile.TemporaryFile() as said_2, contextlib.ExitStack() as later:
-        with contextlib.suppress(OSError):  # there may be no standard error
-            kept = os.dup(2)
-            os.dup2(said_2.fileno(), 2)
-            later.callback(_restore, kept, said_2, name.encode())
-        said_1 = io.StringIO()
+    with _without_lines(name):
+        said = io.StringIO()
         try:
-            with contextlib.redirect_stdout(said_1):
+            with contextlib.redirect_stdout(said):
                 yield
         finally:
-            if others := [line for line in said_1.getvalue().splitlines(True) if EXR_WARNING not in line]:
+            if others := [line for line in said.getvalue().splitlines(True) if EXR_WARNING not in line]:
                 print(*others, sep="", end="")
 
 
-def _restore(kept: int, said: IO[bytes], name: bytes) -> None:
-    """Put standard error in its place again, and pass on what was said that does not name a file."""
+@contextlib.contextmanager
+def _without_lines(*words: str) -> Iterator[list[str]]:
+    """Leave out the lines on standard error, where libraries write past Python, that hold one of some words.
+
+    The list that is yielded has them afterwards; what others write in that time comes after it.
+    """
+    left_out: list[str] = []
+    with _ASIDE, tempfile.TemporaryFile() as said, contextlib.ExitStack() as later:
+        with contextlib.suppress(OSError):  # there may be no standard error
+            kept = os.dup(2)
+            os.dup2(said.fileno(), 2)
+            later.callback(_restore, kept, said, words, left_out)
+        yield left_out
+
+
+def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[str]) -> None:
+    """Put standard error in its place again, and pass on what was said but for lines with some words."""
     os.dup2(kept, 2)
     os.close(kept)
     said.seek(0)
     for line in said:
-        if name not in line:
+        if any(word.encode() in line for word in words):
+            left_out.append(line.decode(errors="replace"))
+        else:
             os.write(2, line)
 
 

@@ -273,6 +273,27 @@ def test_a_torn_image_is_one_line_and_its_library_says_nothing(tmp_path, capfd, 
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
+def test_a_jpeg_whose_middle_is_damaged_is_not_made_up(tmp_path, capfd, options):
+    """Cut and closed, or overwritten by zeros: libjpeg fills the rest with grey, and prints a line of its own."""
+    whole = cv2.imencode(".jpg", np.tile(BGR, (8, 8, 1)), options)[1].tobytes()
+    middle = len(whole) // 2
+    for content in (whole[:middle] + b"\xff\xd9", whole[:middle] + bytes(3000) + whole[middle + 3000 :]):
+        (tmp_path / "color.jpg").write_bytes(content)
+        with pytest.raises(FrameError, match=r"color\.jpg: .*damaged.*image"):
+            read_color(tmp_path / "color.jpg")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_bytes_too_many_at_the_end_of_a_jpeg_are_no_damage(tmp_path, capfd):
+    """As cameras leave them there."""
+    (tmp_path / "color.jpg").write_bytes(JPEG[:-2] + bytes(3) + JPEG[-2:] + bytes(20))
+    np.testing.assert_array_equal(
+        read_color(tmp_path / "color.jpg"), cv2.imdecode(np.frombuffer(JPEG, np.uint8), cv2.IMREAD_COLOR)
+    )
+    assert capfd.readouterr() == ("", "")
+
+
 def test_what_others_say_while_a_library_is_kept_quiet_is_not_lost(capfd):
     with without_words_on("/x.exr"):
         os.write(2, b"/x.exr: torn\nmine\n")
