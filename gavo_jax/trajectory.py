@@ -18,6 +18,9 @@ MAX_GAP = 0.1
 MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
+MAX_STAMP = 1e19
+"""The same of a time stamp, which may count nanoseconds since 1970."""
+
 
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
@@ -286,7 +289,7 @@ def _parse_tum_row(place: str, fields: list[str]) -> list[float]:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found text") from None
     if not all(map(math.isfinite, values)):
         raise GavoError(f"{place}: holds a value that is not finite")
-    if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_MAGNITUDE**2:
+    if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_STAMP:
         raise GavoError(f"{place}: holds an absurdly large value")
     if math.hypot(*values[4:]) < 1e-6:
         raise GavoError(f"{place}: its quaternion is zero, which is no rotation")

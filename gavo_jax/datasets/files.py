@@ -233,15 +233,6 @@ def own_camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
 
 
-def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
-    """What of the colour and depth images makes no frame, a line each."""
-    return [
-        f"{count - frames} {one} images: no {other} image {why}"
-        for count, one, other in zip(images, ("colour", "depth"), ("depth", "colour"), strict=True)
-        if count > frames
-    ]
-
-
 def preset_by_name(folder: Path) -> Calibration:
     """The preset that a folder's name speaks of, or the trajectory in it.
 

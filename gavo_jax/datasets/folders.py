@@ -24,10 +24,9 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_most,
-    unpaired,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
-from gavo_jax.datasets.names import Found, by_number, images_among, stamps
+from gavo_jax.datasets.names import Found, by_number, images_among, stamps, unpaired
 from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse

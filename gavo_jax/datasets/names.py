@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.datasets.files import unpaired
 from gavo_jax.errors import GavoError
 
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)
@@ -59,6 +58,15 @@ class Found(NamedTuple):
         if self.others:
             lines.append(f"{len(self.others)} images: no number in their names, as {self.others[0].name}")
         return lines
+
+
+def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
+    """What of the colour and depth images makes no frame, a line each."""
+    return [
+        f"{count - frames} {one} images: no {other} image {why}"
+        for count, one, other in zip(images, ("colour", "depth"), ("depth", "colour"), strict=True)
+        if count > frames
+    ]
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:

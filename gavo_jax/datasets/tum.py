@@ -21,9 +21,8 @@ from gavo_jax.datasets.files import (
     preset_by_name,
     resolve_folder,
     size_of_most,
-    unpaired,
 )
-from gavo_jax.datasets.names import unit_of
+from gavo_jax.datasets.names import unit_of, unpaired
 from gavo_jax.datasets.truth import truth_in
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import associate

@@ -85,6 +85,17 @@ def test_frames_of_a_log_that_were_lost_have_no_pose(folder):
     np.testing.assert_allclose(truth_of(folder).timestamps, (1 + np.array([0, 1, 3])) / 30)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
+def test_truth_in_the_unit_of_stamps_that_are_names_has_their_times(folder, unit):
+    first, step = round(1305031102.175 / unit), round(0.033 / unit)
+    for part in ("color", "depth"):
+        for i, file in enumerate(sorted((folder / part).iterdir())):
+            file.rename(file.with_name(f"{first + i * step}{file.suffix}"))
+    rows = (f"{first + i * step // 3} 0 0 0 0 0 0 1\n" for i in range(10))
+    (folder / "groundtruth.txt").write_text("".join(rows))
+    np.testing.assert_allclose(truth_of(folder).timestamps[::3], open_source(folder).timestamps, atol=1e-6)
+
+
 def icl(folder: Path, name: str = "livingRoom2.gt.freiburg", first: int = 2) -> None:
     """ICL-NUIM's: frames and poses by number, the first without a pose; its world's and its cameras' y points up."""
     rows = []
