@@ -165,7 +165,26 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     found = _at_the_end(names, r"\d+\.\d+")
     seconds = [float(number) for number in found]
     are_distinct = len(set(seconds)) == len(set(found))  # of 1.1 and 1.10 the second is the tenth of something
+    filled = _with_zeros(found)
+    if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)):
+        seconds = filled
     return seconds if found and are_distinct and _is_between(seconds, INTERVALS) else None
+
+
+def _with_zeros(numbers: Sequence[str]) -> list[float]:
+    """Seconds, where what follows the point counts its last place, and zeros are missing before it.
+
+    Programs that print whole seconds and nanoseconds one after the other write 5.021 s as 5.21000000.
+    """
+    parts = [number.split(".") for number in numbers]
+    width = max((len(decimals) for _, decimals in parts), default=0)
+    return [float(f"{whole}.{decimals.zfill(width)}") for whole, decimals in parts]
+
+
+def _even_share(seconds: Sequence[float]) -> float:
+    """How many of the steps from stamp to stamp are about as long as their median."""
+    steps = np.diff(sorted(seconds))
+    return float(np.mean(np.abs(steps - np.median(steps)) <= JITTER * np.median(steps))) if len(steps) else 0.0
 
 
 def _counts(names: Sequence[str]) -> list[float] | None:

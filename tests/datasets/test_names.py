@@ -42,6 +42,20 @@ def test_stamps_of_every_unit_have_the_cameras_rate(name):
     np.testing.assert_allclose(np.diff(found), STEP, atol=6e-3 if "uneven" in name else 0.7e-3)
 
 
+@pytest.mark.parametrize("places", [6, 9])
+def test_zeros_that_are_missing_after_the_point_are_filled_in(places):
+    """Whole seconds and the rest printed one after the other: 102.008 s is 102.8000000, between 102.7 s and 102.9 s."""
+    times = CLOCK + np.arange(40) * STEP
+    names = [f"{int(time)}.{round(time % 1 * 10**places)}" for time in times]
+    assert len(set(map(len, names))) > 1
+    np.testing.assert_allclose(np.array(stamps(names)), times, rtol=0, atol=1e-5)
+
+
+def test_zeros_that_are_missing_at_the_end_are_not():
+    times = np.round(CLOCK + np.arange(40) * STEP, 2)
+    np.testing.assert_array_equal(np.array(stamps([str(time) for time in times])), times)
+
+
 def test_a_frame_that_is_missing_changes_no_unit():
     """Two of them made a clip of 0.4 s one of 13 s."""
     found = stamps(["1000", "1033", "1066", "1100", "1133", "1166", "1233", "1266", "1300", "1333", "1400"])
