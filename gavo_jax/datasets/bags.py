@@ -279,7 +279,7 @@ class _Stream:
             if any(self._is_out_of_reach(topic, number) for topic, number in enumerate(wanted)):
                 self._enter(wanted)
             while missing := [key for key in enumerate(wanted) if key not in self._pending]:
-                with blamed(str(self._bag.path), FrameError):
+                with _legible(self._bag.path, FrameError):
                     found = next(self._coming, None)
                 if found is None:
                     self._next = list(NOWHERE)
@@ -314,13 +314,10 @@ class _Bag:
         self.path = path
         if path.is_file() and path.suffix not in SUFFIXES:
             raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
-        try:
+        with _legible(path):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
             _own_files(self._reader)
-        except Exception as error:  # of many kinds: the library's own, of databases, of packers, of YAML
-            words = " ".join(str(error).split())[:200] or type(error).__name__
-            raise GavoError(f"{path}: not a bag that can be read: {words}: {_mending(path)}") from None
         weakref.finalize(self, _close, self._reader)
         self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
 
@@ -336,14 +333,14 @@ class _Bag:
 
     def deserialize(self, raw: bytes, kind: str) -> Any:
         """The message; raises `FrameError` for one that is torn."""
-        with blamed(str(self.path), FrameError):
+        with _legible(self.path, FrameError):
             return self._reader.deserialize(raw, kind)
 
     def topic(self, name: str) -> _Topic:
         """Go over the messages of a topic for their stamps."""
         connections = [connection for connection in self._reader.connections if connection.topic == name]
         received, stamps = [], []
-        with blamed(str(self.path)):
+        with _legible(self.path):
             for _, time, raw in self._reader.messages(connections):
                 received.append(time)
                 stamps.append(_stamp(raw, self._reader.is2))
@@ -351,7 +348,7 @@ class _Bag:
 
     def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
         """The first message of a topic, of the first few those that are good."""
-        with blamed(str(self.path)):
+        with _legible(self.path):
             few = itertools.islice(self.stream([name]), FEW)
             messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
             return next(filter(is_good, messages), None)
@@ -468,6 +465,18 @@ def _own_files(reader: Any) -> None:
         if isinstance(file := getattr(part, "bio", None), io.BufferedReader):
             part.bio = _File(io.FileIO(file.name))
             file.close()
+
+
+@contextlib.contextmanager
+def _legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
+    """Turn what the library raises of a torn recording into one line that says what may help."""
+    try:
+        yield
+    except GavoError:
+        raise
+    except Exception as error:  # of many kinds: the library's own, of databases, of packers, of YAML
+        words = " ".join(str(error).split())[:200] or type(error).__name__
+        raise kind(f"{path}: not a bag that can be read: {words}: {_mending(path)}") from None
 
 
 def _mending(path: Path) -> str:
