@@ -134,7 +134,7 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A file for each frame."""
-        return pose_files(images_among(path.glob("frame-*.pose.txt"), (".txt",)))
+        return pose_files(images_among(path.glob("frame-*.pose.*"), (".txt",)))
 
 
 class ScanNet(NumberedFolder):

@@ -185,6 +185,8 @@ def _inside(file: Path) -> str | None:
     endings = [suffix.lower() for suffix in file.suffixes]
     if endings[-2:] == [".bag", ".active"]:
         return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+    if endings[-1:] == [".sens"]:
+        return "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder"
     if endings[-1:] and endings[-1] in FILMS:
         return "a film: write its frames as images, with those of depth beside them"
     how = PACKED.get(endings[-1]) if endings else None

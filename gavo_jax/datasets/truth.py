@@ -1,5 +1,6 @@
 """The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -164,10 +165,11 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
     Raises:
         GavoError: no sixteen numbers, or no rigid transform.
     """
-    try:
-        matrix = np.array([number(field) for field in fields]).reshape(4, 4)
+    try:  # "#" is of -1.#INF, as older programs of Windows write infinity
+        matrix = np.array([math.nan if "#" in field else number(field) for field in fields]).reshape(4, 4)
     except ValueError:
-        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {len(fields)} fields") from None
+        found = f"{len(fields)} fields: {' '.join(fields)[:60]!r}"
+        raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {found}") from None
     if not np.isfinite(matrix).all():
         return None
     if np.abs(matrix[:3, 3]).max() < MAX_MAGNITUDE and np.allclose(matrix[3], [0, 0, 0, 1], atol=SKEWED):

@@ -452,6 +452,7 @@ def test_what_is_compressed_says_how_it_is_to_be_named(tmp_path, kind):
         ("walk.tgz", r"packed: unpack it first \(tar -xf\)"),
         ("walk.tar.gz", r"packed: unpack it first \(tar -xf\)"),
         ("walk.bag.gz", r"packed: unpack it first \(gunzip\)"),
+        ("walk.sens", "a scan as ScanNet packs it: export it"),
         ("walk.mp4", "a film.*frames as images"),
         ("walk.svo", "a file of 5 bytes, not one of"),
     ],

@@ -181,6 +181,17 @@ def test_a_faulty_truth_is_refused_in_one_line(folder, name):
     assert str(folder) in str(caught.value) and fault in str(caught.value), caught.value
 
 
+@pytest.mark.parametrize("none", ["-inf", "nan", "-1.#INF", "1.#QNAN"])
+def test_infinity_is_no_pose_however_it_is_written(tmp_path, none):
+    LAYOUTS["seven_scenes"][1](tmp_path)
+    (tmp_path / "frame-000001.pose.txt").rename(tmp_path / "frame-000001.pose.TXT")
+    (tmp_path / "frame-000002.pose.txt").write_text(f"{none} {none} {none} {none}\n" * 4)
+    np.testing.assert_allclose(truth_of(tmp_path).timestamps, np.array([0, 1, 3]) / 30)
+    (tmp_path / "frame-000002.pose.txt").write_text("1 0 0 x " * 4)
+    with pytest.raises(GavoError, match=r"frame-000002\.pose\.txt: expected a pose of .*: '1 0 0 x 1"):
+        open_source(tmp_path)
+
+
 def test_two_trajectories_of_icl_are_refused(tmp_path):
     icl(tmp_path)
     icl(tmp_path, "livingRoom3.gt.freiburg")
