@@ -370,7 +370,7 @@ class _Bag:
                 found.append(given)
                 continue
             names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
-            best = [name for name in names if any(word in name for word in words)] or names
+            best = [name for name in names if _is_named(name, words)] or names
             if len(best) != 1:
                 if not depth:
                     raise GavoError(f"{self.path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
@@ -396,10 +396,11 @@ class _Bag:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
         frames, are_alike = (info.header.frame_id, other[1].header.frame_id), _is_same(moved, camera)
         one = Calibration(camera, origin=name, states_depth_scale=False)
-        is_registered = frames[0] == frames[1] or not all(frames) or any(word in depth for word in DEPTH_NAMES)
-        if are_alike and is_registered:
+        says_so = _is_named(depth, DEPTH_NAMES)
+        if are_alike and (frames[0] == frames[1] or not all(frames) or says_so):
             return one
-        color_T_depth = between(self._transforms(), *frames)
+        are_placed = any(frames) or says_so  # two that have no name are not for that one frame
+        color_T_depth = between(self._transforms(), *frames) if are_placed else None
         if are_alike and color_T_depth is not None and np.allclose(color_T_depth, np.eye(4)):
             return one
         if color_T_depth is None:
@@ -431,11 +432,14 @@ class _Bag:
             return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
 
     def _info(self, topic: str) -> tuple[str, Any] | None:
-        """Name and first message of the camera_info beside a topic of images; one that says something, if any does."""
+        """Name and first message of the camera_info beside a topic of images; one that says something, if any does.
+
+        RealSense's own recordings have it in a place of its own, `info/` beside `image/`.
+        """
         infos = [c.topic for c in self._reader.connections if c.msgtype == CAMERA_INFO]
         parts = topic.split("/")
-        for length in range(len(parts) - 1, 0, -1):
-            name = "/".join([*parts[:length], "camera_info"])
+        beside = ["/".join(parts[:length]) for length in range(len(parts) - 1, 0, -1)]
+        for name in (f"{place}/{inner}camera_info" for place in beside for inner in ("", "info/")):
             if name in infos and (message := self.first(name, is_calibrated) or self.first(name)) is not None:
                 return name, message
         return None
@@ -512,6 +516,11 @@ def _is_same(a: Camera, b: Camera) -> bool:
     """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
     numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
     return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))
+
+
+def _is_named(topic: str, words: tuple[str, ...]) -> bool:
+    """Whether a topic's name holds one of some words, small or capital."""
+    return any(word in topic.lower() for word in words)
 
 
 def _named(topics: Any) -> str:

@@ -56,11 +56,12 @@ INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|dispa
 def is_depth(kind: str, message: Any, topic: str) -> bool:
     """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
     encoding = message.encoding if kind == IMAGE else message.format
-    if INFRARED.search(topic) and "depth" not in topic.lower():
+    is_named = "depth" in topic.lower()
+    if INFRARED.search(topic) and not is_named:
         return False
     if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding:
         return True
-    return "depth" in topic and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
+    return is_named and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
 
 
 def color_of(kind: str, message: Any, name: str) -> np.ndarray:

@@ -149,6 +149,25 @@ def test_topics_are_found_by_type_or_named(tmp_path):
         open_source(tmp_path / "many", Reading(depth_topic="/nowhere"))
 
 
+def test_a_recording_of_realsenses_own_tools_is_understood(tmp_path):
+    """Capital letters, depth as mono16, and camera_info in a folder of its own; its depth is not registered."""
+    for fx in (131.0, 150.0):
+        recorder = Recorder(tmp_path / f"{fx:g}.bag", "ros1")
+        for stamp in (1.0, 1.1):
+            for at, name in enumerate(("Depth_0", "Color_0", "Infrared_1")):
+                pixels, encoding = (MILLIMETRES[0], "mono16") if at == 0 else (GREYS[0], "mono8")
+                recorder.image(f"/device_0/sensor_{at}/{name}/image/data", stamp, pixels, encoding, frame="0")
+                camera = replace(CAMERA, fx=fx) if at == 0 else CAMERA
+                recorder.info(f"/device_0/sensor_{at}/{name}/info/camera_info", stamp, camera, frame="")
+        recorder.close()
+    sequence = open_source(tmp_path / "131.bag")
+    assert isinstance(sequence, BagSequence)
+    assert [topic.name.split("/")[3] for topic in sequence._topics] == ["Color_0", "Depth_0"]
+    assert sequence.calibration.origin == "/device_0/sensor_1/Color_0/info/camera_info"
+    with pytest.raises(GavoError, match=r"Depth_0/image/data is of another camera than .*Color_0.*with a file of both"):
+        open_source(tmp_path / "150.bag")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_path, kind):
     """Colour and depth hang on one link, turned and shifted; the chain between them is followed."""
