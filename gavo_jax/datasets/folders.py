@@ -26,7 +26,7 @@ from gavo_jax.datasets.files import (
     size_of_most,
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
-from gavo_jax.datasets.names import Found, by_number, images_among, stamps, unpaired
+from gavo_jax.datasets.names import Found, by_number, images_among, nameless, stamps, unpaired
 from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
@@ -330,6 +330,8 @@ class _Paired(NamedTuple):
 
 def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired | None:
     """Frames by the stamps that all names are; None where they are none, or the rate is said."""
+    others = [file for file in (*color, *depth) if not re.search(r"\d", file.stem)]
+    color, depth = ([file for file in files if re.search(r"\d", file.stem)] for files in (color, depth))
     found = [None if reading.rate else stamps([file.stem for file in files]) for files in (color, depth)]
     if found[0] is None or found[1] is None:
         return None
@@ -341,7 +343,7 @@ def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading
             "say --rate if the names are no stamps"
         )
     entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
-    left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s")
+    left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s") + nameless(others)
     of_frames = second.copy()
     of_frames[j] = first[i]
     times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))

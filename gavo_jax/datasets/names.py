@@ -54,10 +54,7 @@ class Found(NamedTuple):
 
     def unpaired(self, frames: int) -> list[str]:
         """What makes no frame, a line each."""
-        lines = unpaired((len(self.color), len(self.depth)), frames, "of the same number")
-        if self.others:
-            lines.append(f"{len(self.others)} images: no number in their names, as {self.others[0].name}")
-        return lines
+        return unpaired((len(self.color), len(self.depth)), frames, "of the same number") + nameless(self.others)
 
 
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
@@ -67,6 +64,11 @@ def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
         for count, one, other in zip(images, ("colour", "depth"), ("depth", "colour"), strict=True)
         if count > frames
     ]
+
+
+def nameless(images: Sequence[Path]) -> list[str]:
+    """A line for images without a number in their names, if there are any."""
+    return [f"{len(images)} images: no number in their names, as {images[0].name}"] if images else []
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:

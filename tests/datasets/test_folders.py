@@ -160,6 +160,20 @@ def test_names_that_are_stamps_are_paired_by_time(folder, stems, seconds):
     assert delay is not None and abs(delay - seconds[1] - (0.01 if "." in stems[0] else 0.0)) < 1e-6
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e-9])
+def test_an_image_without_a_number_changes_no_stamp(folder, unit):
+    """Milliseconds became numbers of frames by it; of nanoseconds no frame was left."""
+    for i in range(3):
+        stem = round((1305031102.175 + 0.033 * i) / unit)
+        image(folder / f"color/{stem}.png", GREYS[i])
+        image(folder / f"depth/{stem}.png", raw(METRES[i], 1000))
+    image(folder / "color/preview.png", GREYS[0])
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 0.033, atol=1e-6)
+    assert isinstance(sequence, PlainFolder)
+    assert sequence.left_out == ("1 images: no number in their names, as preview.png",)
+
+
 def test_folders_may_be_written_large_and_hold_what_systems_leave(folder):
     for i in range(4):
         image(folder / f"RGB/{i}.PNG", GREYS[i])
