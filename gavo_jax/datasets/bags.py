@@ -361,8 +361,8 @@ class _Bag:
                 depth[name] = is_depth(kind, message, name)
         found = []
         for is_wanted, given, what, option, words in (
-            (False, reading.color_topic, "colour", "--colour-topic", COLOR_NAMES),
             (True, reading.depth_topic, "depth", "--depth-topic", DEPTH_NAMES),
+            (False, reading.color_topic, "colour", "--colour-topic", COLOR_NAMES),
         ):
             if given is not None:
                 if given not in depth:
@@ -370,6 +370,7 @@ class _Bag:
                 found.append(given)
                 continue
             names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
+            names = [name for name in names if name not in found] or names
             best = [name for name in names if _is_named(name, words)] or names
             if len(best) != 1:
                 if not depth:
@@ -381,7 +382,7 @@ class _Bag:
             raise GavoError(
                 f"{self.path}: {found[0]}: chosen as colour and as depth alike: there are images on {_named(depth)}"
             )
-        return found[0], found[1]
+        return found[1], found[0]
 
     def calibration(self, color: str, depth: str) -> Calibration:
         """The cameras of two topics, from the camera_info beside each."""

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 import sys
 import threading
 import tracemalloc
@@ -337,6 +338,16 @@ def test_what_a_recording_lacks_is_said(tmp_path):
         with pytest.raises(GavoError) as caught:
             open_source(tmp_path / "two", reading)
         assert fault in str(caught.value) and str(tmp_path / "two") in str(caught.value)
+    for reading, fault in (
+        (Reading(), "no depth images; there are images on /left, /right: say --depth-topic"),
+        (Reading(depth_topic="/right"), "/right at 1.000000: encoding 'mono8' is no depth: 16UC1"),
+    ):
+        recorder = Recorder(tmp_path / f"grey{len(fault)}", "sqlite")
+        for name in ("/left", "/right"):
+            recorder.image(name, 1.0, GREYS[0], "mono8")
+        recorder.close()
+        with pytest.raises(GavoError, match=re.escape(fault)):
+            open_source(recorder.writer.path, replace(reading, camera=CAMERA)).check()
     recorder = Recorder(tmp_path / "none.bag", "ros1")
     recorder.info("/camera_info", 1.0, CAMERA)
     recorder.close()
