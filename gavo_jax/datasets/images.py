@@ -36,9 +36,11 @@ JPEG_SIGNATURE = b"\xff\xd8\xff"
 JPEG_WORDS = ("Corrupt JPEG data", "Premature end of JPEG", "for sequential JPEG", "JFIF revision")
 """In what libjpeg prints of a file that it decodes all the same."""
 
-JPEG_LOSS = re.compile(r"[Pp]remature end|bad (?:Huffman|arithmetic)|instead of RST|before marker 0xd[0-7]")
-"""In those of its words that tell of pixels that are not the camera's; bytes too many at the end, which many cameras
-leave there, are none."""
+JPEG_LOSS = re.compile(
+    r"[Pp]remature end|bad (?:Huffman|arithmetic)|instead of RST|before marker 0xd[0-7]|\d{4,} extraneous"
+)
+"""In those of its words that tell of pixels that are not the camera's; some bytes too many at the end, as many cameras
+leave them there, do not."""
 
 NO_READING = 65535
 """Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
@@ -156,9 +158,9 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         _check_png(data, name)
     elif not _is_known(data):
         raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
-    image = _decoded_jpeg(data, flags, name) if data.startswith(JPEG_SIGNATURE) else _decoded(data, flags)
+    image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
-        image = _decoded(data, AS_STORED)  # what is whole, but no colour, is to be told by its kind
+        image = _decoded(data, AS_STORED, name)  # what is whole, but no colour, is to be told by its kind
     if image is None:
         raise FrameError(f"{name}: torn or damaged image: get the file anew")
     if max(image.shape[:2]) > MAX_SIDE:
@@ -167,18 +169,17 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
     return image
 
 
-def _decoded(data: bytes, flags: int) -> np.ndarray | None:
-    try:
-        with _quiet():
-            return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except (cv2.error, MemoryError):
-        return None
+def _decoded(data: bytes, flags: int, name: str) -> np.ndarray | None:
+    """What OpenCV makes of a file.
 
-
-def _decoded_jpeg(data: bytes, flags: int, name: str) -> np.ndarray | None:
-    """Refuse a JPEG of which a part is damaged: libjpeg makes up the rest, and tells nobody but standard error."""
-    with _without_lines(*JPEG_WORDS) as said:
-        image = _decoded(data, flags)
+    Of a JPEG that is damaged libjpeg makes up a part, and tells nobody but standard error; it is refused.
+    """
+    with _without_lines(*JPEG_WORDS) if data.startswith(JPEG_SIGNATURE) else contextlib.nullcontext([]) as said:
+        try:
+            with _quiet():
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except (cv2.error, MemoryError):
+            image = None
     if any(map(JPEG_LOSS.search, said)):
         raise FrameError(f"{name}: damaged JPEG image, of which a part is lost: get the file anew")
     return image
@@ -284,7 +285,7 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
     file = io.BytesIO(data)
     try:
         image = np.load(file, allow_pickle=False)
-    except (ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
+    except Exception as error:  # of many kinds: a damaged header is read as Python
         raise FrameError(f"{name}: not a NumPy array of numbers: {' '.join(str(error).split())[:100]}") from None
     if not 2 <= image.ndim <= 3 or min(image.shape) == 0 or max(image.shape) > MAX_SIDE:
         raise FrameError(f"{name}: not an image: an array of shape {image.shape}")

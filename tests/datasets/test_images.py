@@ -229,12 +229,18 @@ def test_portrait_images_of_any_size(tmp_path):
 
 JPEG, TIFF = cv2.imencode(".jpg", BGR)[1].tobytes(), cv2.imencode(".tiff", METRES)[1].tobytes()
 BAD = {
-    "color.jpg": [JPEG[: len(JPEG) // 2], JPEG[:-2], b"", b"\xff\xd8\xff"],
+    "color.jpg": [
+        JPEG[:11] + b"\x07" + JPEG[12 : len(JPEG) // 2],
+        JPEG[: len(JPEG) // 2],
+        JPEG[:-2],
+        b"",
+        b"\xff\xd8\xff",
+    ],
     "color.webp": [cv2.imencode(".webp", BGR)[1].tobytes()[:-100]],
     "color.gif": [b"GIF89a"],
     "color.tiff": [TIFF],
     "color.txt": [b"hello"],
-    "color.npy": [b"\x93NUMPY", b"\x93NUMPY\x01\0\x0e\0{'descr':'|O'}\n"],
+    "color.npy": [b"\x93NUMPY", b"\x93NUMPY\x01\0\x0e\0{'descr':('|O \n", b"\x93NUMPY\x01\0\x0e\0{'descr':'|O'}\n"],
     "depth.tiff": [TIFF[:5000], cv2.imencode(".tiff", BGR)[1].tobytes()],
     "depth.jpg": [JPEG],
     "depth.png": [cv2.imencode(".png", GREY)[1].tobytes()],
