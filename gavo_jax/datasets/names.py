@@ -140,8 +140,9 @@ def _fault(files: Sequence[Path]) -> str | None:
 def stamps(names: Sequence[str]) -> list[float] | None:
     """Seconds, where all names are stamps; None where they are not.
 
-    Stamps are seconds with decimals, day and time, or whole numbers: since 1970 in s, ms, µs or ns, or since a device
-    was switched on in ms, µs or ns. Nothing else may change from name to name, and the rate has to be that of a camera.
+    Stamps are seconds or milliseconds with decimals, day and time, or whole numbers: since 1970 in s, ms, µs or ns, or
+    since a device was switched on in ms, µs or ns. Nothing else may change from name to name, and the rate has to be
+    that of a camera.
     """
     return next((found for read in (_redwood, _dates, _decimals, _counts) if (found := read(names))), None)
 
@@ -170,7 +171,12 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     filled = _with_zeros(found)
     if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)):
         seconds = filled
-    return seconds if found and are_distinct and _is_between(seconds, INTERVALS) else None
+    if not found or not are_distinct:
+        return None
+    if _is_between(seconds, INTERVALS):
+        return seconds
+    thousandths = [UNITS[1] * number for number in seconds]  # as RealSense's tools name the images that they export
+    return thousandths if _is_between(thousandths, DEVICE_INTERVALS) else None
 
 
 def _with_zeros(numbers: Sequence[str]) -> list[float]:

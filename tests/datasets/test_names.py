@@ -24,6 +24,8 @@ STAMPS = {
     "nanoseconds": at(CLOCK, 1e-9),
     "milliseconds since switched on": at(123.456, 1e-3),
     "milliseconds of an uneven clock": ["1000", "1028", "1066", "1097", "1133", "1167"],
+    "milliseconds with decimals": [f"clip_Color_{1e3 * (CLOCK + time):.8f}" for time in TIMES],
+    "milliseconds with decimals since switched on": [f"{1e3 * (123.456 + time):.3f}" for time in TIMES],
     "microseconds since switched on": at(123.456, 1e-6),
     "nanoseconds since switched on": [f"frame-{name}" for name in at(123.456, 1e-9)],
     "nanoseconds since two days": at(2e5, 1e-9),
