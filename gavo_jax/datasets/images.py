@@ -252,11 +252,12 @@ def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[
     os.dup2(kept, 2)
     os.close(kept)
     said.seek(0)
-    for line in said:
+    for line in said.readlines():  # at once: where standard error was closed, both may be one file
         if any(word.encode() in line for word in words):
             left_out.append(line.decode(errors="replace"))
         else:
-            os.write(2, line)
+            with contextlib.suppress(OSError):
+                os.write(2, line)
 
 
 def _check_png(data: bytes, name: str) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -305,6 +306,23 @@ def test_what_others_say_while_a_library_is_kept_quiet_is_not_lost(capfd):
         os.write(2, b"/x.exr: torn\nmine\n")
         print("Warning: Exception raised reading pixel data\nmine, too")
     assert capfd.readouterr() == ("mine, too\n", "mine\n")
+
+
+@pytest.mark.parametrize("target", ["closed", "/dev/full"])
+def test_a_standard_error_that_takes_nothing_is_no_fault_of_the_image(tmp_path, target):
+    (tmp_path / "color.jpg").write_bytes(JPEG)
+    code = (
+        "import os, sys\n"
+        "from gavo_jax.datasets import images\n"
+        "os.close(2) if sys.argv[1] == 'closed' else os.dup2(os.open(sys.argv[1], os.O_WRONLY), 2)\n"
+        "with images.without_words_on('x'):\n"
+        "    os.write(2, b'another library\\n')\n"
+        "print(images.read_color(sys.argv[2]).shape)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, target, str(tmp_path / "color.jpg")], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0 and done.stdout == "(48, 64, 3)\n"
 
 
 def test_arrays_of_other_things_are_refused(tmp_path):
