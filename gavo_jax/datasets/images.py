@@ -31,6 +31,9 @@ PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x
 EXR_WARNING = "Exception raised reading pixel data"
 """In what OpenEXR prints of a torn file."""
 
+TIFF_ORIENTATION = 274
+"""Tag of how an image lies; 1 is upright."""
+
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 
 JPEG_WORDS = ("Corrupt JPEG data", "Premature end of JPEG", "for sequential JPEG", "JFIF revision")
@@ -158,6 +161,7 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         _check_png(data, name)
     elif not _is_known(data):
         raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
+    data = _unturned(data)
     image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
         image = _decoded(data, AS_STORED, name)  # what is whole, but no colour, is to be told by its kind
@@ -167,6 +171,23 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         height, width = image.shape[:2]
         raise FrameError(f"{name}: is {width}x{height} pixels: more than {MAX_SIDE} a side")
     return image
+
+
+def _unturned(data: bytes) -> bytes:
+    """A file whose image lies as the camera took it.
+
+    Tags that turn an image are left aside, as colour and depth have to lie alike; of TIFF alone OpenCV follows them.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        return data
+    with contextlib.suppress(struct.error):  # torn: OpenCV will say so
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        for at in range(start + 2, start + 2 + 12 * count, 12):
+            if struct.unpack_from(f"{order}H", data, at)[0] == TIFF_ORIENTATION:
+                return data[: at + 8] + struct.pack(f"{order}H", 1) + data[at + 10 :]
+    return data
 
 
 def _decoded(data: bytes, flags: int, name: str) -> np.ndarray | None:

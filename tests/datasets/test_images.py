@@ -308,6 +308,16 @@ def test_what_others_say_while_a_library_is_kept_quiet_is_not_lost(capfd):
     assert capfd.readouterr() == ("mine, too\n", "mine\n")
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_tag_that_turns_a_tiff_turns_neither_image(tmp_path, orientation):
+    """OpenCV turns no other kind of file here: depth would lie otherwise than its colour."""
+    whole = cv2.imencode(".tiff", RAW)[1].tobytes()
+    samples_of_one, tag = struct.pack("<HHI", 277, 3, 1), struct.pack("<HHIH", 274, 3, 1, orientation)
+    at = whole.index(samples_of_one, struct.unpack_from("<I", whole, 4)[0])
+    (tmp_path / "depth.tiff").write_bytes(whole[:at] + tag + whole[at + len(tag) :])
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tiff"), RAW)
+
+
 @pytest.mark.parametrize("target", ["closed", "/dev/full"])
 def test_a_standard_error_that_takes_nothing_is_no_fault_of_the_image(tmp_path, target):
     (tmp_path / "color.jpg").write_bytes(JPEG)
