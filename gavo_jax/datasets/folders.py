@@ -38,8 +38,9 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("aligned_depth", "depth_registered", "depth", "depths")
 """The first one counts: beside depth that is registered to colour another one is that of its own camera."""
 
-COLOR_WORDS = ("colou?r|rgb", "image|frame|img")
-"""In the names of colour images that lie beside depth; the latter where the former say nothing."""
+COLOR_WORDS = ("colou?r|rgb", "image|frame|img", r"^\d+\.")
+"""In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
+say nothing."""
 
 
 class NumberedFolder(FileSequence):

@@ -195,6 +195,18 @@ def test_colour_is_what_is_named_so(folder):
     np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
 
 
+def test_colour_may_be_a_number_beside_depth(folder):
+    for i in range(2):
+        image(folder / f"{i:03}.jpg", GREYS[i])
+        image(folder / f"{i:03}_depth.png", raw(METRES[i], 1000))
+        image(folder / f"{i:03}_mask.png", GREYS[3])
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    assert isinstance(sequence, PlainFolder) and [entry.color.name for entry in sequence.entries] == [
+        "000.jpg",
+        "001.jpg",
+    ]
+
+
 @pytest.mark.parametrize("layout", ["scannet", "seven_scenes", "open3d"])
 def test_two_images_of_one_number_are_refused(folder, layout):
     color = next(wrote(folder, layout).rglob("*.color.png" if layout == "seven_scenes" else "*.jpg"))
