@@ -84,7 +84,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     except OSError as error:
         raise GavoError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise GavoError(f"{path}: not a text file (UTF-8)") from None
+        raise GavoError(f"{path}: not a text file (UTF-8): write it in UTF-8, if it is text") from None
     except ValueError as error:
         if isinstance(error, GavoError):
             raise

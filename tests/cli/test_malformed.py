@@ -63,6 +63,11 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     ),
     "tum: an empty list": ("tum", write("depth.txt", "# nothing\n"), ["depth.txt", "lists no images"]),
     "tum: a binary list": ("tum", write("rgb.txt", b"\x89PNG\xff\xfe"), ["rgb.txt", "not a text file"]),
+    "tum: a list in UTF-16": (
+        "tum",
+        write("rgb.txt", f"0.0 rgb/{FIRST}\n".encode("utf-16")),
+        ["rgb.txt", "not a text file (UTF-8)", "write it in UTF-8"],
+    ),
     "tum: stamps of another day": (
         "tum",
         edit("depth.txt", "\n0.", "\n99990."),
