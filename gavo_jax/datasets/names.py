@@ -201,16 +201,23 @@ def _counts(names: Sequence[str]) -> list[float] | None:
     return None if unit is None else [unit * count for count in counts]
 
 
+def clock_unit(stamps: Sequence[float]) -> float | None:
+    """Seconds of what stamps since 1970 count; None where they are no such stamps."""
+    low, high = min(stamps), max(stamps)
+    return next((unit for unit in UNITS if EPOCH[0] < unit * low and unit * high < EPOCH[1]), None)
+
+
 def unit_of(counts: Sequence[float]) -> float | None:
     """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
     if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
-    of_clock = [unit for unit in UNITS if EPOCH[0] < unit * min(counts) and unit * max(counts) < EPOCH[1]]
-    usual = [unit for unit in of_clock if _is_between([unit * count for count in counts], INTERVALS)]
+    of_clock = clock_unit(counts)
+    if of_clock and _is_between([of_clock * count for count in counts], INTERVALS):
+        return of_clock
     device = [unit for unit in UNITS[2:] if _is_between([unit * count for count in counts], DEVICE_INTERVALS)]
     if _are_milliseconds(np.diff(sorted(counts))):
         device.append(UNITS[1])
-    return next(iter((*usual, *device, *of_clock)), None)
+    return device[0] if device else of_clock
 
 
 def _are_milliseconds(steps: np.ndarray) -> bool:

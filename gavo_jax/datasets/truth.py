@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.names import unit_of
+from gavo_jax.datasets.names import clock_unit, unit_of
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 
@@ -43,8 +43,9 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
 
     Args:
         folder: of the frames.
-        seconds: times of frames by their numbers, where they have no stamps: a truth of whole numbers counts them, too.
-            Else such a truth counts what gives its poses a rate: seconds, milli-, micro- or nanoseconds.
+        seconds: times of frames by their numbers, where they have no stamps: a truth of whole numbers counts them, too,
+            where these are no stamps since 1970. Else such a truth counts what gives its poses a rate: seconds, milli-,
+            micro- or nanoseconds.
         depth: time of each depth image by its number, where one may be in Redwood's form.
 
     Raises:
@@ -52,10 +53,12 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
     """
     if (folder / TRUTH).exists():
         truth = Trajectory.read_tum(folder / TRUTH)
-        if not _are_whole(truth):
-            return truth
-        unit = unit_of(truth.timestamps.tolist()) or 1.0
-        return replace(truth, timestamps=seconds(truth.timestamps) if seconds else unit * truth.timestamps)
+        unit = clock_unit(truth.timestamps.tolist())
+        if unit is None and _are_whole(truth):
+            if seconds:
+                return replace(truth, timestamps=seconds(truth.timestamps))
+            unit = unit_of(truth.timestamps.tolist())
+        return replace(truth, timestamps=(unit or 1.0) * truth.timestamps)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None

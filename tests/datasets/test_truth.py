@@ -85,6 +85,25 @@ def test_frames_of_a_log_that_were_lost_have_no_pose(folder):
     np.testing.assert_allclose(truth_of(folder).timestamps, (1 + np.array([0, 1, 3])) / 30)
 
 
+@pytest.mark.parametrize("unit", [1, 1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("layout", ["plain", "tum"])
+def test_the_stamps_of_a_truth_may_count_what_a_clock_does(tmp_path, layout, unit):
+    """As of a recording that was taken apart: images named by nanoseconds, poses written as they come."""
+    nanoseconds = [1305031102175304000 + 33333333 * i for i in range(4)]
+    (tmp_path / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
+    for kind, pixels in (("rgb", GREYS), ("depth", DEPTHS)):
+        for stamp, one in zip(nanoseconds, pixels, strict=True):
+            image(tmp_path / f"{kind}/{stamp}.png", one)
+        if layout == "tum":
+            rows = [f"{stamp / 1e9:.6f} {kind}/{stamp}.png" for stamp in nanoseconds]
+            (tmp_path / f"{kind}.txt").write_text("\n".join(rows) + "\n")
+    rows = [f"{stamp * 1e-9 / unit:.6f} 0 0 0 0 0 0 1" for stamp in nanoseconds]
+    (tmp_path / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    sequence = open_source(tmp_path)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps, rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
 def test_truth_in_the_unit_of_stamps_that_are_names_has_their_times(folder, unit):
     first, step = round(1305031102.175 / unit), round(0.033 / unit)
