@@ -1,7 +1,7 @@
 """What `gavo run` prints in the end: its figures, and in words why one that people look for is missing."""
 
 import csv
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.metrics import (
     ABSOLUTE_ERROR,
     COMPILE_SECONDS,
@@ -19,8 +20,10 @@ from gavo_jax.odometry.metrics import (
     MILLISECONDS,
     ROTATION_DRIFT,
 )
-from gavo_jax.output.files import BODIES, FRAMES, TRAJECTORY
+from gavo_jax.output.files import BODIES, TRAJECTORY
+from gavo_jax.output.frames import read_steps
 from gavo_jax.output.screen import number, print_table, say
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 ERRORS = (
@@ -64,10 +67,9 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     if not known:
         rows += _of_trajectory(trajectory, metrics)
     rows += [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
-    counted = metrics.get("statuses", {}).items()
-    for status, count in counted:
+    for status, count in metrics.get("statuses", {}).items():
         if status == "frozen":
-            rows += _of_frozen(folder / FRAMES, count)
+            rows += _of_frozen(read_steps(folder, trajectory))
         elif status != "ok":
             rows.append((f"pairs: {status}", str(count), ""))
     if "loops" in metrics:
@@ -83,13 +85,11 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
     say(f"files in {folder}")
 
 
-def _of_frozen(path: Path, count: int) -> list[Row]:
+def _of_frozen(steps: list[Step]) -> list[Row]:
     """How many of the pairs that are frozen are so for their image, and how many for their depth."""
-    with path.open(encoding="utf-8", newline="") as file:
-        errors = [float(row["error"]) for row in csv.DictReader(file) if row["status"] == "frozen"]
-    depth = int(np.isfinite(errors).sum())  # nothing is aligned with a repeated image
-    rows = (("image", count - depth), ("depth", depth))
-    return [(f"pairs: frozen, the {what} repeats", str(number), "") for what, number in rows if number]
+    frozen = (step.alignment.frozen for step in steps if step.alignment.status is AlignmentStatus.FROZEN)
+    counted = sorted(Counter(frozen).items(), reverse=True)  # the image first
+    return [(f"pairs: frozen, the {what} repeats", str(count), "") for what, count in counted]
 
 
 def _of_bodies(path: Path) -> list[Row]:

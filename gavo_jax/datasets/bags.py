@@ -475,13 +475,8 @@ def _own_files(reader: Any) -> None:
 @contextlib.contextmanager
 def _legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
     """Turn what the library raises of a torn recording into one line that says what may help."""
-    try:
+    with blamed(f"{path}: not a bag that can be read", lambda words: kind(f"{words}: {_mending(path)}")):
         yield
-    except GavoError:
-        raise
-    except Exception as error:  # of many kinds: the library's own, of databases, of packers, of YAML
-        words = " ".join(str(error).split())[:200] or type(error).__name__
-        raise kind(f"{path}: not a bag that can be read: {words}: {_mending(path)}") from None
 
 
 def _mending(path: Path) -> str:

@@ -167,12 +167,11 @@ def _dates(names: Sequence[str]) -> list[float] | None:
 def _decimals(names: Sequence[str]) -> list[float] | None:
     found = _at_the_end(names, r"\d+\.\d+")
     seconds = [float(number) for number in found]
-    are_distinct = len(set(seconds)) == len(set(found))  # of 1.1 and 1.10 the second is the tenth of something
+    if not found or len(set(seconds)) < len(set(found)):  # of 1.1 and 1.10 the second is the tenth of something
+        return None
     filled = _with_zeros(found)
     if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)):
         seconds = filled
-    if not found or not are_distinct:
-        return None
     if _is_between(seconds, INTERVALS):
         return seconds
     thousandths = [UNITS[1] * number for number in seconds]  # as RealSense's tools name the images that they export
@@ -185,14 +184,20 @@ def _with_zeros(numbers: Sequence[str]) -> list[float]:
     Programs that print whole seconds and nanoseconds one after the other write 5.021 s as 5.21000000.
     """
     parts = [number.split(".") for number in numbers]
-    width = max((len(decimals) for _, decimals in parts), default=0)
+    width = max(len(decimals) for _, decimals in parts)
     return [float(f"{whole}.{decimals.zfill(width)}") for whole, decimals in parts]
 
 
 def _even_share(seconds: Sequence[float]) -> float:
     """How many of the steps from stamp to stamp are about as long as their median."""
     steps = np.diff(sorted(seconds))
-    return float(np.mean(np.abs(steps - np.median(steps)) <= JITTER * np.median(steps))) if len(steps) else 0.0
+    return float(np.mean(_are_usual(steps))) if len(steps) else 0.0
+
+
+def _are_usual(steps: np.ndarray) -> np.ndarray:
+    """Which steps are about as long as their median."""
+    middle = np.median(steps)
+    return np.abs(steps - middle) <= JITTER * middle
 
 
 def _counts(names: Sequence[str]) -> list[float] | None:
@@ -223,9 +228,9 @@ def unit_of(counts: Sequence[float]) -> float | None:
 def _are_milliseconds(steps: np.ndarray) -> bool:
     if len(steps) < 2:
         return False
-    middle = np.median(steps)
-    usual = steps[np.abs(steps - middle) <= JITTER * middle]
-    if len(usual) < MOST_STEPS * len(steps) or not MILLISECONDS[0] <= steps.min() <= middle <= MILLISECONDS[1]:
+    usual = steps[_are_usual(steps)]
+    is_rate = MILLISECONDS[0] <= steps.min() <= np.median(steps) <= MILLISECONDS[1]
+    if len(usual) < MOST_STEPS * len(steps) or not is_rate:
         return False
     return np.gcd.reduce(usual.astype(np.int64)) == 1
 

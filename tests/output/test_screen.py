@@ -1,14 +1,19 @@
 """Tables on the screen."""
 
+import csv
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli.run_table import print_run
+from gavo_jax.odometry.driver import Step
 from gavo_jax.output.bodies import BODY_COLUMNS
+from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
 from gavo_jax.output.screen import known_columns, number, print_table, say
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 
@@ -73,7 +78,13 @@ def test_a_run_tells_of_the_bodies_it_saw(
 
 def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))).write_tum(tmp_path / "trajectory.txt")
-    (tmp_path / "frames.csv").write_text("status,error\nfrozen,nan\nok,4.5\nfrozen,4.5\nfrozen,nan\n")
+    frozen, ok = AlignmentStatus.FROZEN, AlignmentStatus.OK
+    with (tmp_path / "frames.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(FRAME_COLUMNS)
+        for status, error in ((frozen, np.nan), (ok, 4.5), (frozen, 4.5), (frozen, np.nan)):
+            alignment = no_alignment(status)._replace(error=np.float32(error))
+            rows.writerow(frame_row(Step(1, 0.0, 1.0, alignment, np.eye(4), 1.0, False)))
     print_run("run", {"statuses": {"frozen": 3, "ok": 1, "gap": 1}}, tmp_path, has_truth=False)
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table if row[0].startswith("pairs:")}
