@@ -3,6 +3,7 @@
 import bisect
 import itertools
 import math
+import os
 from collections import Counter
 from collections.abc import Iterable
 from functools import partial
@@ -94,8 +95,8 @@ class TumSequence(FileSequence):
             rate: frames per second, where stamps are the numbers of the frames.
 
         Raises:
-            GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder (through a link,
-                too), no pair of stamps near enough, unusable ground truth, unknown camera.
+            GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder, no pair
+                of stamps near enough, unusable ground truth, unknown camera.
         """
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
@@ -218,7 +219,7 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
 
 
 def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
-    """Check a stamp and a path, which stays below `root`."""
+    """Check a stamp and a path, which as it is written stays below `root`; links are the user's own, and followed."""
     try:
         stamp = number(time)
     except ValueError:
@@ -228,12 +229,12 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
     try:
         if "\\" in image and not (root / image).exists():
             image = image.replace("\\", "/")  # as Windows has it
-        resolved = (root / image).resolve()
+        places = (root / image).resolve(), Path(os.path.normpath(root / image))
         if len(image) > MAX_PATH:
             raise ValueError("too long")
     except (OSError, RuntimeError, ValueError):
         raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
-    if not resolved.is_relative_to(root):
+    if not any(found.is_relative_to(root) for found in places):
         raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}")
     return _Row(stamp, path.parent / image, place)
 

@@ -559,3 +559,19 @@ def test_red_kitchen_by_its_folder_alone(data_dir):
     assert sequence.ground_truth is not None and len(sequence.ground_truth) == 60
     with pytest.raises((IndexError, FrameError)):
         sequence[60]
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_links_to_folders_and_files_are_followed(folder, name):
+    """Everything that lies in the folder is moved to another place, and linked from there."""
+    wrote(folder, name)
+    disk = folder.parent / "disk"
+    disk.mkdir()
+    for part in list(folder.iterdir()):
+        part.rename(disk / part.name)
+        part.symlink_to(disk / part.name)
+    (folder.parent / "link").symlink_to(folder)
+    sequence = open_source(folder.parent / "link")
+    sequence.check()
+    assert recognise(folder.parent / "link").kind == LAYOUTS[name][0] and len(sequence) == 4
+    assert (sequence.ground_truth is None) == (open_source(folder).ground_truth is None)
