@@ -1,7 +1,9 @@
 """Bad input as one kind of exception, the text files that users hand in, and files that are written whole."""
 
 import contextlib
+import math
 import os
+import re
 import reprlib
 import tomllib
 from collections.abc import Callable, Iterator
@@ -13,6 +15,9 @@ MAX_SHOWN = 100
 """Characters of a value that a message shows."""
 PARTIAL = ".partial"
 """Suffix of a file that is being written."""
+
+OF_WINDOWS = re.compile(r"[-+]?1\.#[A-Z]{1,4}0*")
+"""What older programs of Windows write for infinity and for no number: -1.#INF, 1.#QNAN."""
 
 
 class GavoError(ValueError):
@@ -56,14 +61,14 @@ def shown(value: Any) -> str:
 
 
 def number(text: str) -> float:
-    """Return the number that a field of a text file is, as people and programs write them.
+    """Return the number that a field of a text file is, as people and programs write them; NaN for 1.#INF and its like.
 
     Raises:
         ValueError: it is none; Python alone would take 1_000, and the digits of other scripts.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"not a number: {text[:MAX_SHOWN]!r}")
-    return float(text)
+    return math.nan if OF_WINDOWS.fullmatch(text) else float(text)
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:

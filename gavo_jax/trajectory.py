@@ -2,6 +2,7 @@
 
 import heapq
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, number, read_text, rows_of, write_bytes
+from gavo_jax.errors import GavoError, GavoWarning, number, read_text, rows_of, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -81,17 +82,24 @@ class Trajectory:
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
         A comment of `segment_comment` starts a new segment. Rows come back in the order of their stamps; of rows with
-        equal stamps the first is kept. Quaternions are normalised.
+        equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite are left out, as
+        where a tracker lost its markers, and a `GavoWarning` says how many.
 
         Raises:
-            GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, not finite, absurdly
-                large or without a rotation (zero quaternion).
+            GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, absurdly large or
+                without a rotation (zero quaternion); no row is finite.
         """
         text = read_text(path)
-        places = rows_of(text, path)
-        rows = [_parse_tum_row(place, fields) for place, fields in places]
-        if not rows:
+        all_places = rows_of(text, path)
+        parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
+        if not parsed:
             raise GavoError(f"{path}: holds no trajectory (no rows)")
+        places = [place for place, row in zip(all_places, parsed, strict=True) if row is not None]
+        rows = [row for row in parsed if row is not None]
+        if not rows:
+            raise GavoError(f"{all_places[0][0]}: holds a value that is not finite, as every row does")
+        if lost := len(parsed) - len(rows):
+            warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: not finite", GavoWarning, stacklevel=2)
         breaks = [n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
         segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
@@ -280,7 +288,8 @@ def _slerp(
     return weight_start * start + weight_end * end
 
 
-def _parse_tum_row(place: str, fields: list[str]) -> list[float]:
+def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
+    """The numbers of a row; None where they are not all finite."""
     if len(fields) != 8:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
     try:
@@ -288,7 +297,7 @@ def _parse_tum_row(place: str, fields: list[str]) -> list[float]:
     except ValueError:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found text") from None
     if not all(map(math.isfinite, values)):
-        raise GavoError(f"{place}: holds a value that is not finite")
+        return None
     if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_STAMP:
         raise GavoError(f"{place}: holds an absurdly large value")
     if math.hypot(*values[4:]) < 1e-6:

@@ -1,10 +1,11 @@
 """Files that are written whole or not at all."""
 
+import math
 import pickle
 
 import pytest
 
-from gavo_jax.errors import PARTIAL, GavoError, printable, write_bytes
+from gavo_jax.errors import PARTIAL, GavoError, number, printable, write_bytes
 
 
 def test_a_planted_link_is_not_followed(tmp_path):
@@ -42,6 +43,17 @@ def test_what_would_command_a_terminal_is_shown_as_code(text):
 def test_words_of_any_language_stay_as_they_are():
     for text in ("Bäume/日本語/πλάτος", "C:\\new\\x1b", "a b", ""):
         assert printable(text) == text
+
+
+@pytest.mark.parametrize("text", ["1.#INF", "-1.#INF00", "1.#QNAN", "-1.#IND0", "1.#J", "1.#SNAN000"])
+def test_no_number_may_be_written_as_windows_does(text):
+    assert math.isnan(number(text))
+
+
+@pytest.mark.parametrize("text", ["#", "1#", "2.#INF", "1.#", "1.#inf", "1.#INF1", "1_0", "\u0661", ""])
+def test_what_is_no_number_is_not_taken_for_one(text):
+    with pytest.raises(ValueError):
+        number(text)
 
 
 def test_the_message_outlives_a_process_border():

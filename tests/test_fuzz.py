@@ -222,6 +222,7 @@ def fuzz(reader: str, folder: Path, examples: int) -> int:
     return taken
 
 
+@pytest.mark.filterwarnings("ignore:.* left out")
 @pytest.mark.parametrize("reader", READERS)
 def test_readers_raise_nothing_else(tmp_path, reader):
     taken = fuzz(reader, tmp_path, 300)
@@ -229,6 +230,7 @@ def test_readers_raise_nothing_else(tmp_path, reader):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.* left out")
 @pytest.mark.parametrize("reader", READERS)
 def test_readers_raise_nothing_else_at_length(tmp_path, reader):
     fuzz(reader, tmp_path, 100_000)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.trajectory import (
     Trajectory,
     associate,
@@ -15,6 +15,7 @@ from gavo_jax.trajectory import (
     inverse,
     quaternion_from_rotation,
     rotation_from_quaternion,
+    segment_comment,
 )
 
 GOOD = "1.0 1 2 3 0 0 0 1\n"
@@ -110,7 +111,7 @@ def test_rows_are_sorted_comments_skipped_and_quaternions_normalised(tmp_path):
         (GOOD + "1 2 3 4 5 6 7 8 9\n", ":2: expected 8"),
         (GOOD + "a b c d e f g h\n", ":2: "),
         ("nan nan nan nan nan nan nan nan\n", ":1: "),
-        (GOOD + "2.0 1 2 inf 0 0 0 1\n", ":2: "),
+        ("2.0 1 2 inf 0 0 0 1\n2.1 1 2 3 0 0 0 nan\n", ":1: holds a value that is not finite, as every row"),
         (GOOD + "2.0 1 2 3 0 0 0 0\n", "quaternion"),
         (GOOD + "2.0 1 2 3 1e-200 0 0 0\n", "quaternion"),
         (GOOD + "2.0 1e300 2 3 0 0 0 1\n", "absurd"),
@@ -123,6 +124,17 @@ def test_bad_files_are_refused_with_their_line(tmp_path, text, fault):
         Trajectory.read_tum(path)
     message = str(caught.value)
     assert message.startswith(str(path)) and fault in message and len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("none", ["nan", "inf", "-1.#IND"])
+def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path, none):
+    """As motion capture writes them while it does not see the camera."""
+    path = tmp_path / "t.txt"
+    lost = f"2.0 {none} {none} {none} 0 0 0 1\n"
+    path.write_text(f"{GOOD}{lost}{segment_comment(1, 2.0, 3.0)}\n3.0 1 2 3 0 0 0 1\n")
+    with pytest.warns(GavoWarning, match=r"t\.txt: 1 of 3 rows left out: not finite"):
+        trajectory = Trajectory.read_tum(path)
+    assert trajectory.timestamps[-1] == 3 and len(trajectory) == 2 and trajectory.segments.tolist() == [0, 1]
 
 
 def test_missing_files_and_folders_are_refused(tmp_path):
@@ -141,6 +153,7 @@ number = st.one_of(st.floats().map(str), st.integers().map(str), st.text(max_siz
 line = st.lists(number, min_size=7, max_size=9).map(" ".join)
 
 
+@pytest.mark.filterwarnings("ignore:.* left out")
 @given(
     content=st.one_of(st.binary(max_size=200), st.lists(line, max_size=4).map(lambda rows: "\n".join(rows).encode()))
 )

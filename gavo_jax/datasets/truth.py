@@ -1,6 +1,5 @@
 """The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
 
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -168,8 +167,8 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
     Raises:
         GavoError: no sixteen numbers, or no rigid transform.
     """
-    try:  # "#" is of -1.#INF, as older programs of Windows write infinity
-        matrix = np.array([math.nan if "#" in field else number(field) for field in fields]).reshape(4, 4)
+    try:
+        matrix = np.array([number(field) for field in fields]).reshape(4, 4)
     except ValueError:
         found = f"{len(fields)} fields: {' '.join(fields)[:60]!r}"
         raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {found}") from None
