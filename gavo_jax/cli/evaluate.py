@@ -1,8 +1,14 @@
 """`gavo evaluate`: errors of one trajectory file against another."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 
 from gavo_jax.cli.options import Evaluate
+from gavo_jax.datasets.names import INTERVALS
+from gavo_jax.datasets.truth import counted_in
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import ErrorSeries, absolute_trajectory_error, distance_error, relative_pose_error
 from gavo_jax.output import plots
@@ -11,13 +17,21 @@ from gavo_jax.output.files import prepare_folder
 from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import Trajectory
 
+UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+"""What stamps count instead of seconds."""
+
+ALIKE = 0.1
+"""Two trajectories whose lengths in time differ by no more of it are of one recording."""
+
 
 def evaluate(options: Evaluate) -> int:
     """Print relative pose error, absolute trajectory error and distance error with their definitions, or as JSON."""
     if options.plot is not None and not plots.available():
         raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
-    estimate, truth = Trajectory.read_tum(options.estimate), Trajectory.read_tum(options.groundtruth)
+    paths = options.estimate, options.groundtruth
+    (estimate, *_), (truth, *_) = read = [_read(path) for path in paths]
     try:
+        _check_units(estimate.timestamps, truth.timestamps)
         relative = relative_pose_error(estimate, truth, options.delta, options.unit)
         absolute = absolute_trajectory_error(estimate, truth)
         distance = distance_error(estimate, truth)
@@ -35,6 +49,9 @@ def evaluate(options: Evaluate) -> int:
         print(json.dumps({**span, **{name: errors.summary() for name, errors in series.items()}}, indent=2))
     else:
         _print(options, series)
+        for path, (_, unit) in zip(paths, read, strict=True):
+            if unit in UNITS:
+                say(f"{path}: its stamps are taken for {UNITS[unit]}")
     if options.plot is not None:
         folder = prepare_folder(options.plot)
         with waiting("drawing figures …"):
@@ -42,6 +59,30 @@ def evaluate(options: Evaluate) -> int:
         if not options.json:
             say(f"figures in {folder}")
     return 0
+
+
+def _read(path: Path) -> tuple[Trajectory, float]:
+    """A trajectory with stamps in seconds, and the seconds of what they count in the file."""
+    trajectory = Trajectory.read_tum(path)
+    unit = counted_in(trajectory)
+    return replace(trajectory, timestamps=unit * trajectory.timestamps), unit
+
+
+def _check_units(estimate: np.ndarray, truth: np.ndarray) -> None:
+    """Refuse stamps that seem to count something else than the other ones; nothing else tells what they count."""
+    for whose, stamps, others in (("estimate", estimate, truth), ("truth", truth, estimate)):
+        if min(len(stamps), len(others)) < 2:
+            return
+        for unit, name in UNITS.items():
+            is_alike = abs(unit * np.ptp(stamps) / np.ptp(others) - 1) < ALIKE or not _meet(stamps, others)
+            if is_alike and _meet(unit * stamps, others) and unit * np.median(np.diff(stamps)) > INTERVALS[0]:
+                raise GavoError(
+                    f"the stamps of the {whose} look like {name}, the other ones like seconds: write both so"
+                )
+
+
+def _meet(stamps: np.ndarray, others: np.ndarray) -> bool:
+    return bool(stamps.min() <= others.max() and others.min() <= stamps.max())
 
 
 def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:

@@ -52,15 +52,18 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
     """
     if (folder / TRUTH).exists():
         truth = Trajectory.read_tum(folder / TRUTH)
-        unit = clock_unit(truth.timestamps.tolist())
-        if unit is None and _are_whole(truth):
-            if seconds:
-                return replace(truth, timestamps=seconds(truth.timestamps))
-            unit = unit_of(truth.timestamps.tolist())
-        return replace(truth, timestamps=(unit or 1.0) * truth.timestamps)
+        if seconds and clock_unit(truth.timestamps.tolist()) is None and _are_whole(truth):
+            return replace(truth, timestamps=seconds(truth.timestamps))
+        return replace(truth, timestamps=counted_in(truth) * truth.timestamps)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
+
+
+def counted_in(trajectory: Trajectory) -> float:
+    """Seconds of what stamps count: since 1970, or as whole numbers whose steps have the rate of a camera."""
+    stamps = trajectory.timestamps.tolist()
+    return clock_unit(stamps) or (_are_whole(trajectory) and unit_of(stamps)) or 1.0
 
 
 def icl_truth(folder: Path) -> Path | None:

@@ -372,6 +372,33 @@ def test_evaluate_refuses(gavo, clip):
     assert is_refused(gavo("evaluate", later, truth), "later.txt", "from 9000.000 to 9002.000 s, the truth from 0.000")
 
 
+def stamped(folder: Path, name: str, first: float, unit: float, decimals: int) -> Path:
+    """Forty poses of 30 Hz whose stamps count a unit."""
+    times = first + np.arange(40) / 30 + 0.001 * (np.arange(40) % 3)
+    rows = (f"{time / unit:.{decimals}f} {0.01 * i:.3f} 0 0 0 0 0 1\n" for i, time in enumerate(times))
+    (folder / name).write_text("".join(rows))
+    return folder / name
+
+
+@pytest.mark.parametrize("first", [0.0, 77.0, 1305031102.175])
+@pytest.mark.parametrize(("unit", "name"), [(1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")])
+def test_evaluate_takes_whole_numbers_for_what_they_count(gavo, tmp_path, first, unit, name):
+    odd, usual = stamped(tmp_path, "odd.txt", first, unit, 0), stamped(tmp_path, "usual.txt", first, 1.0, 6)
+    for pair in ((odd, usual), (usual, odd), (odd, odd)):
+        done = gavo("evaluate", *pair, "--json")
+        assert done.status == 0, done.err
+        assert json.loads(done.out)["ate"]["count"] == 40 and json.loads(done.out)["rpe_translation"]["rmse"] < 1e-6
+    assert f"odd.txt: its stamps are taken for {name}" in gavo("evaluate", odd, usual).out
+
+
+@pytest.mark.parametrize("first", [0.0, 77.0])
+@pytest.mark.parametrize("whose", ["estimate", "truth"])
+def test_evaluate_refuses_stamps_of_another_unit(gavo, tmp_path, first, whose):
+    odd, usual = stamped(tmp_path, "odd.txt", first, 1e-3, 3), stamped(tmp_path, "usual.txt", first, 1.0, 6)
+    pair = (odd, usual) if whose == "estimate" else (usual, odd)
+    assert is_refused(gavo("evaluate", *pair), f"the stamps of the {whose} look like milliseconds", "seconds")
+
+
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
     truth = clip / "groundtruth.txt"
     done = gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames", "--json", "--plot", tmp_path / "figures")
