@@ -1,16 +1,27 @@
 """Errors of a trajectory against the truth: relative pose error (15)(16), absolute error, distance error (17)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gavo_jax.errors import GavoError
-from gavo_jax.trajectory import MAX_GAP, Trajectory, associate, inverse
+from gavo_jax.trajectory import (
+    MAX_GAP,
+    Trajectory,
+    associate,
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 
 MAX_DIFFERENCE = 0.02
 """Stamps of estimate and truth at least this far apart, in seconds, are not associated."""
+
+REORDERED, LARGE = 0.25, 2.0
+"""Quaternions are in another order where that leaves less than this share of the median error of rotation over one
+second, and the error is larger than so many degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +163,27 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     distances = np.linalg.norm((from_first - true_from_first)[:, :3, 3], axis=1)
     definition = "distance between estimated and true position, both relative to the first pose; truth interpolated"
     return ErrorSeries(distances, estimate.timestamps[valid], "m", definition)
+
+
+def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
+    """Whether the quaternions of a file stand as w x y z where x y z w belongs, as those of another one tell.
+
+    The file alone does not tell: the wrong order leaves every motion as large and as smooth. But two that disagree, and
+    agree once this one is put in order, do. What is read so is the inverse rotation between two fixed ones, so a camera
+    that turns about one axis may look alike where a file has inverse poses; of that nothing is said.
+    """
+
+    def error(quaternions: Float[np.ndarray, "n 4"]) -> float:
+        poses = trajectory.world_T_camera.copy()
+        poses[:, :3, :3] = rotation_from_quaternion(quaternions)
+        return relative_pose_error(other, replace(trajectory, world_T_camera=poses)).rotation.median
+
+    quaternions = quaternion_from_rotation(trajectory.world_T_camera[:, :3, :3])
+    try:
+        least = min(error(quaternions), error(quaternions * [-1, -1, -1, 1]))
+        return least > LARGE and error(quaternions[:, [1, 2, 3, 0]]) < REORDERED * least
+    except GavoError:
+        return False
 
 
 def align_rigidly(

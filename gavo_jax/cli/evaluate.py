@@ -10,7 +10,7 @@ from gavo_jax.cli.options import Evaluate
 from gavo_jax.datasets.names import INTERVALS
 from gavo_jax.datasets.truth import counted_in
 from gavo_jax.errors import GavoError
-from gavo_jax.evaluation import ErrorSeries, absolute_trajectory_error, distance_error, relative_pose_error
+from gavo_jax.evaluation import ErrorSeries, absolute_trajectory_error, distance_error, is_w_first, relative_pose_error
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import prepare_folder
@@ -49,9 +49,11 @@ def evaluate(options: Evaluate) -> int:
         print(json.dumps({**span, **{name: errors.summary() for name, errors in series.items()}}, indent=2))
     else:
         _print(options, series)
-        for path, (_, unit) in zip(paths, read, strict=True):
+        for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
             if unit in UNITS:
                 say(f"{path}: its stamps are taken for {UNITS[unit]}")
+            if is_w_first(one, other):
+                say(f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w")
     if options.plot is not None:
         folder = prepare_folder(options.plot)
         with waiting("drawing figures …"):

@@ -15,6 +15,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
+from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
@@ -95,6 +96,8 @@ def run(options: Run) -> int:
         if options.map is not None:
             save_map(options.map, sequence, folder.steps(), trajectory, shape, options.voxel)
     print_run(name, metrics, folder.path, sequence.ground_truth is not None)
+    if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
+        say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
     if interrupted:
         return INTERRUPTED
     viewer.stay()

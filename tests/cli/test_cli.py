@@ -399,6 +399,19 @@ def test_evaluate_refuses_stamps_of_another_unit(gavo, tmp_path, first, whose):
     assert is_refused(gavo("evaluate", *pair), f"the stamps of the {whose} look like milliseconds", "seconds")
 
 
+def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
+    rows = [(i / 30, np.cos(i / 60), np.sin(i / 60) * 0.6, np.sin(i / 60) * 0.8) for i in range(60)]
+    lines = {
+        "right": (f"{t} 0 0 0 {x} 0 {z} {w}\n" for t, w, x, z in rows),
+        "other": (f"{t} 0 0 0 {w} {x} 0 {z}\n" for t, w, x, z in rows),
+    }
+    for name, text in lines.items():
+        (tmp_path / name).write_text("".join(text))
+    words = "agree once its quaternions are taken as w x y z"
+    assert f"other: its rotations {words}" in gavo("evaluate", tmp_path / "right", tmp_path / "other").out
+    assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
+
+
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
     truth = clip / "groundtruth.txt"
     done = gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames", "--json", "--plot", tmp_path / "figures")
