@@ -169,13 +169,21 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     seconds = [float(number) for number in found]
     if not found or len(set(seconds)) < len(set(found)):  # of 1.1 and 1.10 the second is the tenth of something
         return None
-    filled = _with_zeros(found)
-    if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)):
-        seconds = filled
+    seconds = filled_in(found)
     if _is_between(seconds, INTERVALS):
         return seconds
     thousandths = [UNITS[1] * number for number in seconds]  # as RealSense's tools name the images that they export
     return thousandths if _is_between(thousandths, DEVICE_INTERVALS) else None
+
+
+def filled_in(numbers: Sequence[str]) -> list[float]:
+    """Numbers with decimals as seconds, with zeros filled in where they are missing after the point, see `_with_zeros`.
+
+    They are where this makes a clock and, as elsewhere zeros are missing at the end, some of the numbers end in one.
+    """
+    seconds, filled = [float(number) for number in numbers], _with_zeros(numbers)
+    is_cut = not any(re.search(r"\.\d+0$", number) for number in numbers)
+    return filled if not is_cut and _even_share(filled) > max(MOST_STEPS, _even_share(seconds)) else seconds
 
 
 def _with_zeros(numbers: Sequence[str]) -> list[float]:

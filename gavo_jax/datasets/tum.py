@@ -4,6 +4,7 @@ import bisect
 import itertools
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable
 from functools import partial
@@ -23,7 +24,7 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.names import unit_of, unpaired
+from gavo_jax.datasets.names import filled_in, unit_of, unpaired
 from gavo_jax.datasets.truth import truth_in
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import associate
@@ -149,6 +150,8 @@ class _Row(NamedTuple):
     path: Path
     place: str
     """file:line"""
+    written: str
+    """The stamp, as it stands there."""
     misplaced: bool = False
 
 
@@ -236,13 +239,15 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
         raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
     if not any(found.is_relative_to(root) for found in places):
         raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}")
-    return _Row(stamp, path.parent / image, place)
+    return _Row(stamp, path.parent / image, place, time)
 
 
 def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
     """Rows in the order of their stamps, marked where that is in doubt."""
     if not rows:
         raise GavoError(f"{path}: lists no images")
+    if all(re.fullmatch(r"\d+\.\d+", row.written) for row in rows):
+        rows = [row._replace(stamp=at) for row, at in zip(rows, filled_in([row.written for row in rows]), strict=True)]
     trusted = _in_order([row.stamp for row in rows])
     if trusted.count(False) > MAX_MISPLACED * len(rows):
         first = {row.stamp: row for row in reversed(rows)}

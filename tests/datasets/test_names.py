@@ -58,6 +58,12 @@ def test_zeros_that_are_missing_at_the_end_are_not():
     np.testing.assert_array_equal(np.array(stamps([str(time) for time in times])), times)
 
 
+def test_a_number_cut_by_chance_does_not_shift_the_others():
+    """Two of them lack a zero at the end; with one after the point their clock would look more even."""
+    cut = ["2.19", "2.23", "2.26", "2.3", "2.33", "2.36", "2.4", "2.43"]
+    np.testing.assert_array_equal(np.array(stamps(cut)), np.array(cut, float))
+
+
 def test_a_frame_that_is_missing_changes_no_unit():
     """Two of them made a clip of 0.4 s one of 13 s."""
     found = stamps(["1000", "1033", "1066", "1100", "1133", "1166", "1233", "1266", "1300", "1333", "1400"])

@@ -181,6 +181,34 @@ def test_stamps_that_are_whole_numbers_count_what_gives_a_cameras_rate(folder, n
         np.testing.assert_allclose(np.diff(TumSequence(folder, CAMERA, rate=10.0).timestamps), 0.1)
 
 
+@pytest.mark.parametrize("layout", ["two lists", "one list"])
+def test_zeros_that_are_missing_after_the_point_are_filled_in(folder, layout):
+    """Whole seconds and the rest printed one after the other: 102.008 s is 102.8000."""
+    times = [1305031102.966 + i * 0.03339 for i in range(6)]
+    wrong, right = ([f"{int(t)}.{round(t % 1 * 1e6):{form}}" for t in times] for form in ("", "06"))
+    assert wrong[2:] != right[2:]
+    for stamps in (wrong, right):
+        if layout == "one list":
+            rows = [f"{stamp} rgb/{i}.png {stamp} depth/{i}.png" for i, stamp in enumerate(stamps)]
+            (folder / "associations.txt").write_text("\n".join(rows))
+            (folder / "rgb.txt").unlink(missing_ok=True)
+            (folder / "depth.txt").unlink(missing_ok=True)
+        else:
+            for kind in ("rgb", "depth"):
+                rows = [f"{stamp} {kind}/{i}.png" for i, stamp in enumerate(stamps)]
+                (folder / f"{kind}.txt").write_text("\n".join(rows))
+        sequence = TumSequence(folder, CAMERA)
+        np.testing.assert_allclose(sequence.timestamps, times, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(sequence[3].depth, depth_image(3))
+
+
+def test_zeros_that_are_missing_at_the_end_are_not(folder):
+    times = [100.3, 100.33, 100.37, 100.4, 100.43, 100.47]
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").write_text("\n".join(f"{t} {kind}/{i}.png" for i, t in enumerate(times)))
+    np.testing.assert_array_equal(TumSequence(folder, CAMERA).timestamps, times)
+
+
 def test_milliseconds_with_decimals_are_refused(folder):
     for kind in ("rgb", "depth"):
         edit(folder / f"{kind}.txt", "\n100.", "\n1305031102175.")
