@@ -9,6 +9,7 @@ import tempfile
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -52,7 +53,7 @@ WHITES = (255, 1023, 4095, 16383, 65535)
 """Full scales of sensors: what 16-bit intensities are measured against."""
 
 _ASIDE = threading.Lock()
-"""Held by whoever has standard error of the process put aside."""
+"""Held by whoever has standard error of the process put aside, and while the process forks."""
 
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -260,7 +261,8 @@ def _without_lines(*words: str) -> Iterator[list[str]]:
     The list that is yielded has them afterwards; what others write in that time comes after it.
     """
     left_out: list[str] = []
-    with _ASIDE, tempfile.TemporaryFile() as said, contextlib.ExitStack() as later:
+    with _ASIDE, contextlib.ExitStack() as later:
+        said = _notes()
         with contextlib.suppress(OSError):  # there may be no standard error
             kept = os.dup(2)
             os.dup2(said.fileno(), 2)
@@ -268,12 +270,31 @@ def _without_lines(*words: str) -> Iterator[list[str]]:
         yield left_out
 
 
+@cache
+def _notes() -> IO[bytes]:
+    """A file of this process for what is said meanwhile."""
+    return tempfile.TemporaryFile()
+
+
+def _renew() -> None:
+    """In a process that was forked: a file of its own."""
+    _notes.cache_clear()
+    _ASIDE.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_ASIDE.acquire, after_in_parent=_ASIDE.release, after_in_child=_renew)
+
+
 def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[str]) -> None:
     """Put standard error in its place again, and pass on what was said but for lines with some words."""
     os.dup2(kept, 2)
     os.close(kept)
     said.seek(0)
-    for line in said.readlines():  # at once: where standard error was closed, both may be one file
+    lines = said.readlines()  # at once: where standard error was closed, both may be one file
+    said.seek(0)
+    said.truncate()
+    for line in lines:
         if any(word.encode() in line for word in words):
             left_out.append(line.decode(errors="replace"))
         else:

@@ -308,6 +308,39 @@ def test_what_others_say_while_a_library_is_kept_quiet_is_not_lost(capfd):
     assert capfd.readouterr() == ("mine, too\n", "mine\n")
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_damage_is_told_in_threads_and_in_processes_that_are_forked_from_them(tmp_path):
+    """Each has its own words of the library: a fork in the middle of an image neither waits for ever nor mixes them."""
+    large = cv2.imencode(".jpg", np.tile(BGR, (8, 8, 1)))[1].tobytes()
+    (tmp_path / "whole.jpg").write_bytes(large)
+    (tmp_path / "torn.jpg").write_bytes(large[: len(large) // 2] + b"\xff\xd9")
+    code = (
+        "import os, sys, threading\n"
+        "from gavo_jax.datasets.base import FrameError\n"
+        "from gavo_jax.datasets.images import read_color\n"
+        "def both(times):\n"
+        "    for _ in range(times):\n"
+        "        read_color('whole.jpg')\n"
+        "        try:\n"
+        "            read_color('torn.jpg')\n"
+        "        except FrameError:\n"
+        "            continue\n"
+        "        os._exit(1)\n"
+        "threads = [threading.Thread(target=both, args=(100,)) for _ in range(3)]\n"
+        "for thread in threads: thread.start()\n"
+        "for _ in range(20):\n"
+        "    child = os.fork()\n"
+        "    if not child:\n"
+        "        both(3)\n"
+        "        os._exit(0)\n"
+        "    assert os.waitpid(child, 0)[1] == 0\n"
+        "for thread in threads: thread.join()\n"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_tag_that_turns_a_tiff_turns_neither_image(tmp_path, orientation):
     """OpenCV turns no other kind of file here: depth would lie otherwise than its colour."""
