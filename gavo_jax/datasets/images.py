@@ -2,16 +2,14 @@
 
 import contextlib
 import io
-import os
 import re
 import struct
 import tempfile
-import threading
+import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,21 +17,23 @@ from jaxtyping import Float, Shaped, UInt8, UInt16
 
 from gavo_jax.camera import MAX_SIDE
 from gavo_jax.datasets.base import FrameError
+from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
 """Of what is looked for in a folder; a file that is named may have any."""
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".pgm", ".pfm")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm")
 
 MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
 """Of a file: the largest image with sixteen bytes to a pixel, and some room."""
 
-PNG_SIGNATURE, EXR_SIGNATURE, NPY_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01", b"\x93NUMPY"
+PNG_SIGNATURE, EXR_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
+NPY_SIGNATURE, NPZ_SIGNATURE = b"\x93NUMPY", b"PK\x03\x04"
 
-EXR_WARNING = "Exception raised reading pixel data"
-"""In what OpenEXR prints of a torn file."""
+TIFF_ORIENTATION, TIFF_BITS, TIFF_NUMBERS = 274, 258, 339
+"""Tags of how an image lies (1 is upright), of the bits of a number and of its kind (3 is a float)."""
 
-TIFF_ORIENTATION = 274
-"""Tag of how an image lies; 1 is upright."""
+PFM_SCALE = re.compile(rb"(P[fF]\s+\d+\s+\d+\s+-?)\S+(?=\s)")
+"""The head of a PFM image, up to the number whose sign alone tells of its bytes."""
 
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 
@@ -51,9 +51,6 @@ NO_READING = 65535
 
 WHITES = (255, 1023, 4095, 16383, 65535)
 """Full scales of sensors: what 16-bit intensities are measured against."""
-
-_ASIDE = threading.Lock()
-"""Held by whoever has standard error of the process put aside, and while the process forks."""
 
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -97,6 +94,8 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
     """`read_depth` of a file's content; `name` stands in messages."""
     if data.startswith(NPY_SIGNATURE):
         image = _decode_npy(data, name)
+    elif data.startswith(NPZ_SIGNATURE):
+        image = _decode_npz(data, name)
     elif data.startswith(EXR_SIGNATURE):
         image = _decode_exr(data, name)
     else:
@@ -162,7 +161,7 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
         _check_png(data, name)
     elif not _is_known(data):
         raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
-    data = _unturned(data)
+    data = PFM_SCALE.sub(rb"\g<1>1", data, 1) if data.startswith((b"Pf", b"PF")) else _unturned(data, name)
     image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
         image = _decoded(data, AS_STORED, name)  # what is whole, but no colour, is to be told by its kind
@@ -174,20 +173,28 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
     return image
 
 
-def _unturned(data: bytes) -> bytes:
+def _unturned(data: bytes, name: str) -> bytes:
     """A file whose image lies as the camera took it.
 
     Tags that turn an image are left aside, as colour and depth have to lie alike; of TIFF alone OpenCV follows them.
+
+    Raises:
+        FrameError: a TIFF of a kind that OpenCV does not decode.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return data
+    tags: dict[int, int] = {}
     with contextlib.suppress(struct.error):  # torn: OpenCV will say so
         (start,) = struct.unpack_from(f"{order}I", data, 4)
         (count,) = struct.unpack_from(f"{order}H", data, start)
         for at in range(start + 2, start + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, at)[0] == TIFF_ORIENTATION:
-                return data[: at + 8] + struct.pack(f"{order}H", 1) + data[at + 10 :]
+            tag, value = struct.unpack_from(f"{order}H6xH", data, at)
+            tags[tag] = value
+            if tag == TIFF_ORIENTATION:
+                data = data[: at + 8] + struct.pack(f"{order}H", 1) + data[at + 10 :]
+    if tags.get(TIFF_NUMBERS) == 3 and tags.get(TIFF_BITS) == 16:
+        raise FrameError(f"{name}: a TIFF of floats of 16 bits, which OpenCV does not decode: write 32 bits, or .npy")
     return data
 
 
@@ -196,9 +203,9 @@ def _decoded(data: bytes, flags: int, name: str) -> np.ndarray | None:
 
     Of a JPEG that is damaged libjpeg makes up a part, and tells nobody but standard error; it is refused.
     """
-    with _without_lines(*JPEG_WORDS) if data.startswith(JPEG_SIGNATURE) else contextlib.nullcontext([]) as said:
+    with without_lines(*JPEG_WORDS) if data.startswith(JPEG_SIGNATURE) else contextlib.nullcontext([]) as said:
         try:
-            with _quiet():
+            with without_log():
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except (cv2.error, MemoryError):
             image = None
@@ -228,78 +235,6 @@ SIGNATURES = (
 def _is_known(data: bytes) -> bool:
     """Whether a file begins like an image that OpenCV decodes (AVIF names itself a little later)."""
     return data.startswith(SIGNATURES) or data[4:12] in (b"ftypavif", b"ftypavis")
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep OpenCV from saying on standard error, in lines of its own, what is wrong with a file."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-@contextlib.contextmanager
-def without_words_on(name: str) -> Iterator[None]:
-    """Leave out the lines that OpenEXR prints while it reads a file; what others print in that time comes after it."""
-    with _without_lines(name):
-        said = io.StringIO()
-        try:
-            with contextlib.redirect_stdout(said):
-                yield
-        finally:
-            if others := [line for line in said.getvalue().splitlines(True) if EXR_WARNING not in line]:
-                print(*others, sep="", end="")
-
-
-@contextlib.contextmanager
-def _without_lines(*words: str) -> Iterator[list[str]]:
-    """Leave out the lines on standard error, where libraries write past Python, that hold one of some words.
-
-    The list that is yielded has them afterwards; what others write in that time comes after it.
-    """
-    left_out: list[str] = []
-    with _ASIDE, contextlib.ExitStack() as later:
-        said = _notes()
-        with contextlib.suppress(OSError):  # there may be no standard error
-            kept = os.dup(2)
-            os.dup2(said.fileno(), 2)
-            later.callback(_restore, kept, said, words, left_out)
-        yield left_out
-
-
-@cache
-def _notes() -> IO[bytes]:
-    """A file of this process for what is said meanwhile."""
-    return tempfile.TemporaryFile()
-
-
-def _renew() -> None:
-    """In a process that was forked: a file of its own."""
-    _notes.cache_clear()
-    _ASIDE.release()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_ASIDE.acquire, after_in_parent=_ASIDE.release, after_in_child=_renew)
-
-
-def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[str]) -> None:
-    """Put standard error in its place again, and pass on what was said but for lines with some words."""
-    os.dup2(kept, 2)
-    os.close(kept)
-    said.seek(0)
-    lines = said.readlines()  # at once: where standard error was closed, both may be one file
-    said.seek(0)
-    said.truncate()
-    for line in lines:
-        if any(word.encode() in line for word in words):
-            left_out.append(line.decode(errors="replace"))
-        else:
-            with contextlib.suppress(OSError):
-                os.write(2, line)
 
 
 def _check_png(data: bytes, name: str) -> None:
@@ -335,6 +270,25 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
     if image.dtype.kind not in "uif":
         raise FrameError(f"{name}: not an image: an array of {image.dtype}")
     return image.astype(image.dtype.newbyteorder("="))
+
+
+def _decode_npz(data: bytes, name: str) -> np.ndarray:
+    """Of an archive of NumPy arrays the one named depth, else the only one."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        named = [entry for entry in archive.infolist() if entry.filename == "depth.npy"]
+        chosen = named or archive.infolist()
+        if len(chosen) != 1:
+            found = ", ".join(entry.filename for entry in chosen)[:100] or "none"
+            raise FrameError(f"{name}: of several arrays one has to be named depth: found {found}")
+        if chosen[0].file_size > MAX_BYTES:
+            raise FrameError(f"{name}: larger than {MAX_BYTES} bytes: no image of up to {MAX_SIDE} pixels a side")
+        content = archive.read(chosen[0])
+    except FrameError:
+        raise
+    except Exception:  # of many kinds, as the archive's compression is
+        raise FrameError(f"{name}: torn or damaged archive of NumPy arrays: get the file anew") from None
+    return _decode_npy(content, name)
 
 
 def _color_array(image: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
-from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid, without_words_on
+from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid
+from gavo_jax.datasets.quiet import without_words_on
 from gavo_jax.errors import GavoError
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
@@ -32,6 +33,8 @@ METRES = (RAW / 5000).astype(np.float32)
 def write(path: Path, image: np.ndarray) -> Path:
     if path.suffix == ".npy":
         np.save(path, image)
+    elif path.suffix == ".npz":
+        np.savez_compressed(path, image)
     elif path.suffix == ".exr":
         pytest.importorskip("OpenEXR").File({}, {"Z": image}).write(str(path))
     else:
@@ -125,7 +128,7 @@ def test_depth_of_sixteen_bits_is_taken_as_it_is(tmp_path, color_file, ending):
     assert frame.depth.dtype == np.uint16 and camera.depth_scale == 5000
 
 
-@pytest.mark.parametrize("ending", [".tiff", ".npy", ".pfm", ".exr"])
+@pytest.mark.parametrize("ending", [".tiff", ".npy", ".npz", ".pfm", ".exr"])
 @pytest.mark.parametrize("units", [1.0, 1000.0])
 def test_depth_of_floats_in_metres_or_millimetres(tmp_path, color_file, ending, units):
     """A preset's depth_scale speaks of its PNG files and is not asked."""
@@ -143,6 +146,31 @@ def test_arrays_of_any_numbers_are_depth(tmp_path, color_file, dtype):
     )
     metres = frame.depth / camera.depth_scale
     assert np.abs(metres - (values if np.dtype(dtype).kind == "f" else values / 1000)).max() < 3e-3
+
+
+@pytest.mark.parametrize("scale", [b"1.0", b"-1", b"-0.003922", b"-5e-3", b"5e3"])
+def test_a_pfm_has_the_numbers_that_stand_in_it(tmp_path, scale):
+    """OpenCV divides them by its scale, of which nobody else takes more than the sign, for the order of its bytes."""
+    numbers = METRES[::-1].astype("<f4" if scale.startswith(b"-") else ">f4")
+    (tmp_path / "depth.pfm").write_bytes(b"Pf\n64 48\n%s\n" % scale + numbers.tobytes())
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.pfm"), METRES)
+
+
+def test_of_several_arrays_one_is_named_depth(tmp_path):
+    np.savez(tmp_path / "depth.npz", depth=METRES, confidence=RAW)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.npz"), METRES)
+    np.savez(tmp_path / "depth.npz", a=METRES, b=RAW)
+    with pytest.raises(FrameError, match=r"depth\.npz: .* named depth: found a\.npy, b\.npy"):
+        read_depth(tmp_path / "depth.npz")
+
+
+def test_a_tiff_of_floats_of_16_bits_is_refused_for_what_it_is(tmp_path):
+    tags = ((256, 64), (257, 48), (258, 16), (259, 1), (262, 1), (273, 8), (277, 1), (278, 48), (279, 6144), (339, 3))
+    table = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    head = b"II*\0" + struct.pack("<I", 8 + 6144)
+    (tmp_path / "depth.tif").write_bytes(head + METRES.astype("<f2").tobytes() + table + bytes(4))
+    with pytest.raises(FrameError, match=r"depth\.tif: a TIFF of floats of 16 bits, .*: write 32 bits, or \.npy"):
+        read_depth(tmp_path / "depth.tif")
 
 
 def test_wide_integers_of_16_bits_are_those(tmp_path):
@@ -260,7 +288,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, capfd, name, conte
     assert capfd.readouterr() == ("", "")
 
 
-TORN = (".png", ".jpg", ".tiff", ".webp", ".jp2", ".bmp", ".ppm", ".npy", ".exr")
+TORN = (".png", ".jpg", ".tiff", ".webp", ".jp2", ".bmp", ".ppm", ".npy", ".npz", ".exr")
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.97])
@@ -268,7 +296,7 @@ TORN = (".png", ".jpg", ".tiff", ".webp", ".jp2", ".bmp", ".ppm", ".npy", ".exr"
 def test_a_torn_image_is_one_line_and_its_library_says_nothing(tmp_path, capfd, ending, keep):
     """Neither on standard error nor, as OpenEXR does, on standard output, where a program reads JSON."""
     path = tmp_path / f"image{ending}"
-    reads_depth = ending in (".npy", ".exr")
+    reads_depth = ending in (".npy", ".npz", ".exr")
     write(path, METRES if reads_depth else BGR)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(keep * len(whole))])
@@ -356,9 +384,9 @@ def test_a_standard_error_that_takes_nothing_is_no_fault_of_the_image(tmp_path, 
     (tmp_path / "color.jpg").write_bytes(JPEG)
     code = (
         "import os, sys\n"
-        "from gavo_jax.datasets import images\n"
+        "from gavo_jax.datasets import images, quiet\n"
         "os.close(2) if sys.argv[1] == 'closed' else os.dup2(os.open(sys.argv[1], os.O_WRONLY), 2)\n"
-        "with images.without_words_on('x'):\n"
+        "with quiet.without_words_on('x'):\n"
         "    os.write(2, b'another library\\n')\n"
         "print(images.read_color(sys.argv[2]).shape)\n"
     )

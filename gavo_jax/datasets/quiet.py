@@ -1,0 +1,90 @@
+"""What libraries of images say past Python, on standard error and output, kept from there and handed to who asks."""
+
+import contextlib
+import io
+import os
+import tempfile
+import threading
+from collections.abc import Iterator
+from functools import cache
+from typing import IO
+
+import cv2
+
+EXR_WARNING = "Exception raised reading pixel data"
+"""In what OpenEXR prints of a torn file."""
+
+_ASIDE = threading.Lock()
+"""Held by whoever has standard error of the process put aside, and while the process forks."""
+
+
+@contextlib.contextmanager
+def without_log() -> Iterator[None]:
+    """Keep OpenCV from saying on standard error, in lines of its own, what is wrong with a file."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+@contextlib.contextmanager
+def without_words_on(name: str) -> Iterator[None]:
+    """Leave out the lines that OpenEXR prints while it reads a file; what others print in that time comes after it."""
+    with without_lines(name):
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(said):
+                yield
+        finally:
+            if others := [line for line in said.getvalue().splitlines(True) if EXR_WARNING not in line]:
+                print(*others, sep="", end="")
+
+
+@contextlib.contextmanager
+def without_lines(*words: str) -> Iterator[list[str]]:
+    """Leave out the lines on standard error, where libraries write past Python, that hold one of some words.
+
+    The list that is yielded has them afterwards; what others write in that time comes after it.
+    """
+    left_out: list[str] = []
+    with _ASIDE, contextlib.ExitStack() as later:
+        said = _notes()
+        with contextlib.suppress(OSError):  # there may be no standard error
+            kept = os.dup(2)
+            os.dup2(said.fileno(), 2)
+            later.callback(_restore, kept, said, words, left_out)
+        yield left_out
+
+
+@cache
+def _notes() -> IO[bytes]:
+    """A file of this process for what is said meanwhile."""
+    return tempfile.TemporaryFile()
+
+
+def _renew() -> None:
+    """In a process that was forked: a file of its own."""
+    _notes.cache_clear()
+    _ASIDE.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_ASIDE.acquire, after_in_parent=_ASIDE.release, after_in_child=_renew)
+
+
+def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[str]) -> None:
+    """Put standard error in its place again, and pass on what was said but for lines with some words."""
+    os.dup2(kept, 2)
+    os.close(kept)
+    said.seek(0)
+    lines = said.readlines()  # at once: where standard error was closed, both may be one file
+    said.seek(0)
+    said.truncate()
+    for line in lines:
+        if any(word.encode() in line for word in words):
+            left_out.append(line.decode(errors="replace"))
+        else:
+            with contextlib.suppress(OSError):
+                os.write(2, line)
