@@ -12,7 +12,8 @@ from gavo_jax.camera import MAX_SIDE, PRESETS, Camera
 from gavo_jax.camera_makes import MODELS, PARSERS, Table
 from gavo_jax.errors import GavoError, read_text, shown
 
-MAX_CAMERA_FILE_BYTES = 65536
+MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
+"""Of a file; one of JSON may hold the pose of every frame, too."""
 
 LONGEST_LENS = 20
 """Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
@@ -90,8 +91,8 @@ def load_calibration(
     TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
     "fisheye"), depth_scale, readout and depth_delay (seconds). Depth that is not registered to colour: a table [depth]
     with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr.
-    OpenCV FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, or `cam_params.json` of Replica. Text: a
-    matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
+    OpenCV FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, `cam_params.json` of Replica, intrinsics of
+    RealSense's SDK, or NeRF's `transforms.json`. Text: a matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
 
     Args:
         path_or_name: fr1, fr2, fr3, bonn, icl, or a file.
@@ -110,7 +111,8 @@ def load_calibration(
         raise GavoError(
             f"unknown camera {name!r}: neither one of {', '.join(PRESETS)} nor a file ({', '.join(suffixes)} or {last})"
         )
-    table = PARSERS[suffix](path, read_text(path, MAX_CAMERA_FILE_BYTES))
+    most = MAX_JSON_BYTES if suffix == ".json" else MAX_CAMERA_FILE_BYTES
+    table = PARSERS[suffix](path, read_text(path, most))
     if size is not None and not {"width", "height"} <= table.keys():
         width, height = size() if callable(size) else size
         table = {"width": width, "height": height, **table}

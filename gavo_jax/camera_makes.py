@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gavo_jax.camera_exports import is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 Table = dict[str, Any]
@@ -211,6 +212,8 @@ MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...
     (_is_replica, _read_replica),
     (_is_ros, _read_ros),
     (_is_kalibr, _read_kalibr),
+    (is_realsense, read_realsense),
+    (is_nerfstudio, read_nerfstudio),
 )
 """How each make is known, and read."""
 
@@ -379,5 +382,6 @@ PARSERS: dict[str, Callable[[Path, str], Table]] = {
     ".json": _parse_json,
     ".xml": _parse_xml,
     ".txt": _parse_numbers,
+    ".csv": _parse_numbers,
 }
 """By a file's ending."""

@@ -86,6 +86,13 @@ OPENCV = {"K": "camera_matrix", "D": "distortion_coefficients", "width": "image_
 OTHER = {"K": "K", "D": "D", "width": "width", "height": "height"}
 OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": MATRIX.T.ravel().tolist()}
 REPLICA = {"camera": {"w": 640, "h": 480, "fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5, "scale": 6553.5}}
+REALSENSE = {
+    **{"width": 640, "height": 480, "fx": 500.0, "fy": 510.0, "ppx": 319.5, "ppy": 239.5},
+    **{"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5},
+}
+NERF = {"fl_x": 500.0, "fl_y": 510.0, "cx": 319.5, "cy": 239.5, "w": 640, "h": 480.0, "k1": 0.0}
+LENS = dict(zip(("k1", "k2", "p1", "p2"), RADTAN, strict=True))
+FISH_LENS = dict(zip(("k1", "k2", "k3", "k4"), EQUIDISTANT, strict=True))
 ORB = """%YAML:1.0
 Camera.type: "PinHole"
 Camera.fx: 500.0
@@ -145,6 +152,14 @@ FILES = {
     "opencv fisheye without numbers.yml": (storage(".yml", OPENCV, True, []), IDEAL_FISH),
     "orb fisheye.yaml": (ORB_FISH, FISH),
     "open3d rows.json": (json.dumps({**OPEN3D, "intrinsic_matrix": ROWS}), NONE),
+    "realsense.json": (json.dumps(REALSENSE), NONE),
+    "realsense brown.json": (json.dumps({**REALSENSE, "model": "Brown Conrady", "coeffs": [*RADTAN, 0.0]}), BROWN),
+    "realsense number.json": (json.dumps({**REALSENSE, "model": 4, "coeffs": [*RADTAN, 0.0]}), BROWN),
+    "transforms.json": (json.dumps({**NERF, "frames": [{"file_path": 300 * "x"}] * 1000}), NONE),
+    "transforms opencv.json": (json.dumps({**NERF, "camera_model": "OPENCV", **LENS}), BROWN),
+    "transforms fisheye.json": (json.dumps({**NERF, "camera_model": "OPENCV_FISHEYE", **FISH_LENS}), FISH),
+    "transforms of frames.json": (json.dumps({"frames": [NERF, {**NERF, "sharpness": 3}]}), NONE),
+    "stray scanner.csv": ("500.0, 0.0, 319.5\n0.0, 510.0, 239.5\n0.0, 0.0, 1.0\n", NONE),
     "own.toml": (TOML + f"distortion={RATIONAL}\nmodel='rational'\n", RATIO),
     "own fisheye.toml": (TOML + f"distortion={EQUIDISTANT}\nmodel='fisheye'\n", FISH),
 }
@@ -154,10 +169,15 @@ FILES = {
 def test_every_make_leads_to_the_same_camera(tmp_path, name):
     text, camera = FILES[name]
     (tmp_path / name).write_text(text)
-    found = load_calibration(tmp_path / name)
-    assert found.color == camera and found.depth is None and found.origin == str(tmp_path / name)
+    found = load_calibration(tmp_path / name, (640, 480) if name.endswith(".csv") else None)
+    np.testing.assert_allclose(found.color.distortion, camera.distortion, atol=1e-12)
+    assert (
+        replace(found.color, distortion=camera.distortion) == camera
+        and found.depth is None
+        and found.origin == str(tmp_path / name)
+    )
     assert found.states_depth_scale == (name in ("orb.yaml", "replica.json"))
-    assert load_camera(tmp_path / name) == camera
+    assert name.endswith(".csv") or load_camera(tmp_path / name) == found.color
 
 
 @pytest.mark.parametrize(
@@ -243,6 +263,12 @@ FAULTS = {
     "kalibr no size.yaml": (kalibr("radtan", RADTAN).replace("resolution", "size"), "Kalibr"),
     "open3d short.json": (json.dumps({**OPEN3D, "intrinsic_matrix": [1, 2]}), "Open3D"),
     "open3d list.json": ("[1, 2]", "not a camera file"),
+    "realsense ftheta.json": (json.dumps({**REALSENSE, "model": "ftheta", "coeffs": RADTAN}), "the lens model is fth"),
+    "realsense short.json": (json.dumps({"ppx": 3}), "RealSense's SDK. Its entry 'fx' is missing"),
+    "realsense of two.json": (json.dumps({**REALSENSE, "coeffs": [1.0, 2.0]}), "RealSense's SDK. Entries are missing"),
+    "transforms of many.json": (json.dumps({"frames": [NERF, {**NERF, "fl_x": 3}]}), "each frame has a camera of its"),
+    "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
+    "transforms round.json": (json.dumps({**NERF, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),
     "torn.json": ('{"width": 3', "not JSON"),
     "torn.yaml": ("a: [1, 2", "not YAML"),
     "tag.yaml": ("!!python/object/apply:os.system ['true']", "not YAML"),

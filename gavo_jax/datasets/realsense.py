@@ -1,12 +1,12 @@
 """A camera of Intel's RealSense line, through the library pyrealsense2 (extra `[realsense]`)."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from gavo_jax.camera import Camera
+from gavo_jax.camera_exports import sdk_distortion
 from gavo_jax.datasets.live import LiveImages
 from gavo_jax.errors import GavoError
 from gavo_jax.libusb import import_with_libusb
@@ -104,53 +104,8 @@ def camera_of(intrinsics: Any, depth_scale: float) -> Camera:
         intrinsics.height,
         depth_scale=depth_scale,
     )
-    coefficients = np.array(intrinsics.coeffs, float)
-    model = str(intrinsics.model).rsplit(".", 1)[-1].lower()
-    if model == "none" or not coefficients.any():
-        return camera
-    if model not in LENSES:
-        raise GavoError(f"{NAME}: the colour stream's lens model is {model}: not one of none, {', '.join(LENSES)}")
-    return replace(camera, distortion=_as_opencv(LENSES[model], coefficients, camera))
-
-
-Rays = tuple[np.ndarray, np.ndarray]
-
-
-def _brown(x: np.ndarray, y: np.ndarray, k: np.ndarray, scaled: bool = False) -> Rays:
-    """Radial and tangential terms, coefficients k1 k2 p1 p2 k3; `scaled`: the latter of what the radial ones left."""
-    square = x**2 + y**2
-    radial = 1 + k[0] * square + k[1] * square**2 + k[4] * square**3
-    u, v = (x * radial, y * radial) if scaled else (x, y)
-    return (
-        x * radial + 2 * k[2] * u * v + k[3] * (square + 2 * u**2),
-        y * radial + 2 * k[3] * u * v + k[2] * (square + 2 * v**2),
-    )
-
-
-Lens = Callable[
-    [np.ndarray, np.ndarray, np.ndarray], tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-]
-"""From a grid of points and coefficients: ideal points, and where the lens shows them."""
-
-LENSES: dict[str, Lens] = {
-    "brown_conrady": lambda x, y, k: ((x, y), _brown(x, y, k)),
-    "modified_brown_conrady": lambda x, y, k: ((x, y), _brown(x, y, k, scaled=True)),
-    "inverse_brown_conrady": lambda x, y, k: (_brown(x, y, k), (x, y)),
-}
-"""The SDK's models by name, as `rsutil.h` has them."""
-
-GRID = 25
-"""Points along either side of the image to which OpenCV's model is fitted."""
-
-
-def _as_opencv(lens: Lens, coefficients: np.ndarray, camera: Camera) -> tuple[float, ...]:
-    """OpenCV's k1 k2 p1 p2 k3 that show what another model shows: linear in them, so least squares over the image."""
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
-    (x, y), seen = lens((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, coefficients)
-    columns = [np.stack(_brown(x, y, unit)) - np.stack([x, y]) for unit in np.eye(5)]
-    matrix = np.stack([column.ravel() for column in columns], axis=1)
-    found, *_ = np.linalg.lstsq(matrix, (np.stack(seen) - np.stack([x, y])).ravel(), rcond=None)
-    return tuple(found.tolist())
+    lens = sdk_distortion(f"{NAME}: the colour stream's", intrinsics.model, intrinsics.coeffs, asdict(camera))
+    return replace(camera, distortion=tuple(lens)) if lens else camera
 
 
 def _import_sdk() -> Any:

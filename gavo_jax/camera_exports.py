@@ -1,0 +1,111 @@
+"""Cameras as programs that record and export write them: RealSense's SDK, whose lens models are its own, nerfstudio."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.errors import GavoError, shown
+
+Table = dict[str, Any]
+
+Rays = tuple[np.ndarray, np.ndarray]
+
+Lens = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[Rays, Rays]]
+"""From a grid of points and coefficients: ideal points, and where the lens shows them."""
+
+GRID = 25
+"""Points along either side of the image to which OpenCV's model is fitted."""
+
+SDK_MODELS = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
+"""Of RealSense's SDK, in the order of its numbers for them."""
+
+
+def _brown(x: np.ndarray, y: np.ndarray, k: np.ndarray, scaled: bool = False) -> Rays:
+    """Radial and tangential terms, coefficients k1 k2 p1 p2 k3; `scaled`: the latter of what the radial ones left."""
+    square = x**2 + y**2
+    radial = 1 + k[0] * square + k[1] * square**2 + k[4] * square**3
+    u, v = (x * radial, y * radial) if scaled else (x, y)
+    return (
+        x * radial + 2 * k[2] * u * v + k[3] * (square + 2 * u**2),
+        y * radial + 2 * k[3] * u * v + k[2] * (square + 2 * v**2),
+    )
+
+
+LENSES: dict[str, Lens] = {
+    "brown_conrady": lambda x, y, k: ((x, y), _brown(x, y, k)),
+    "modified_brown_conrady": lambda x, y, k: ((x, y), _brown(x, y, k, scaled=True)),
+    "inverse_brown_conrady": lambda x, y, k: (_brown(x, y, k), (x, y)),
+}
+"""The SDK's models by name, as `rsutil.h` has them."""
+
+
+def sdk_distortion(whose: str, model: Any, coefficients: Any, table: Table) -> list[float]:
+    """OpenCV's k1 k2 p1 p2 k3 that show what a lens model of RealSense's SDK shows; none where there is no distortion.
+
+    OpenCV's terms are linear in its coefficients, so it is least squares over the image.
+
+    Args:
+        whose: begins the message.
+        model: as the SDK or its tools print it, or its number.
+        coefficients: five.
+        table: fx, fy, cx, cy, width and height.
+
+    Raises:
+        GavoError: a lens model that is none of ours.
+    """
+    numbered = SDK_MODELS[model] if isinstance(model, int) and 0 <= model < len(SDK_MODELS) else str(model)
+    name = numbered.rsplit(".", 1)[-1].lower().replace(" ", "_").removeprefix("rs2_distortion_")
+    k = np.array(coefficients, float)
+    if name == "none" or not k.any():
+        return []
+    if name not in LENSES:
+        raise GavoError(f"{whose} lens model is {name[:60]}: not one of none, {', '.join(LENSES)}")
+    u, v = np.meshgrid(np.linspace(0, table["width"] - 1, GRID), np.linspace(0, table["height"] - 1, GRID))
+    (x, y), seen = LENSES[name]((u - table["cx"]) / table["fx"], (v - table["cy"]) / table["fy"], k)
+    columns = [np.stack(_brown(x, y, unit)) - np.stack([x, y]) for unit in np.eye(5)]
+    matrix = np.stack([column.ravel() for column in columns], axis=1)
+    found, *_ = np.linalg.lstsq(matrix, (np.stack(seen) - np.stack([x, y])).ravel(), rcond=None)
+    return found.tolist()
+
+
+def is_realsense(values: Table) -> bool:
+    """Whether a file has the names of RealSense's SDK."""
+    return "ppx" in values
+
+
+def read_realsense(path: Path, values: Table) -> Table:
+    """Looks like intrinsics of RealSense's SDK."""
+    names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy", "width": "width", "height": "height"}
+    table = {ours: values[theirs] for ours, theirs in names.items()}
+    lens = sdk_distortion(f"{path}: the", values.get("model", "none"), values.get("coeffs") or [0.0] * 5, table)
+    return {**table, **({"distortion": lens} if lens else {})}
+
+
+def is_nerfstudio(values: Table) -> bool:
+    """Whether a file has the names of NeRF's transforms."""
+    return "fl_x" in values or isinstance(values.get("frames"), list)
+
+
+def read_nerfstudio(path: Path, values: Table) -> Table:
+    """Looks like NeRF's transforms."""
+    if "fl_x" not in values and values["frames"]:
+        own = [{key: frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")} for frame in values["frames"]]
+        if any(camera != own[0] for camera in own):
+            raise GavoError(f"{path}: each frame has a camera of its own: write the one of most as a camera file")
+        values = {**own[0], **values}
+    size = {ours: _whole(values[theirs]) for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
+    table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
+    model = values.get("camera_model", "OPENCV")
+    if model == "OPENCV_FISHEYE":
+        return {**table, **size, "model": "fisheye", "distortion": [values.get(f"k{i}", 0.0) for i in range(1, 5)]}
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or values.get("k4"):
+        raise GavoError(f"{path}: camera_model {shown(model)}, or its k4: OPENCV, OPENCV_FISHEYE and PINHOLE are read")
+    lens = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    return {**table, **size, **({"distortion": lens} if any(lens) else {})}
+
+
+def _whole(value: Any) -> Any:
+    """A size that is written as 640.0, as a whole number."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
