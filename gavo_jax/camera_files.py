@@ -41,6 +41,8 @@ CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model",
 DEVICE_KEYS = ("depth_delay",)
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
+PROJECTION = "projection_matrix"
+"""Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
 
 Size = tuple[int, int]
@@ -84,7 +86,10 @@ def load_camera(path_or_name: str | Path) -> Camera:
 
 
 def load_calibration(
-    path_or_name: str | Path, size: Size | Callable[[], Size] | None = None, depth_scale: float = DEPTH_SCALE
+    path_or_name: str | Path,
+    size: Size | Callable[[], Size] | None = None,
+    depth_scale: float = DEPTH_SCALE,
+    is_rectified: bool = False,
 ) -> Calibration:
     """Return the calibration that a preset's name stands for or a file holds.
 
@@ -98,6 +103,8 @@ def load_calibration(
         path_or_name: fr1, fr2, fr3, bonn, icl, or a file.
         size: width and height of the images, for files that do not say it; or what finds them out.
         depth_scale: for files that do not say it, raw units per metre.
+        is_rectified: whether the images come from ROS without distortion, so that the lens of a ROS camera_info is not
+            theirs.
 
     Raises:
         GavoError: no such preset or file, an unreadable line, or an unknown, missing, non-finite or absurd value.
@@ -112,7 +119,10 @@ def load_calibration(
             f"unknown camera {name!r}: neither one of {', '.join(PRESETS)} nor a file ({', '.join(suffixes)} or {last})"
         )
     most = MAX_JSON_BYTES if suffix == ".json" else MAX_CAMERA_FILE_BYTES
-    table = PARSERS[suffix](path, read_text(path, most))
+    table, origin = PARSERS[suffix](path, read_text(path, most)), str(path)
+    projection = table.pop(PROJECTION, None)
+    if is_rectified and projection is not None:
+        table, origin = _rectified(path, table, projection), f"{path}, its lens left aside: the images are rectified"
     if size is not None and not {"width", "height"} <= table.keys():
         width, height = size() if callable(size) else size
         table = {"width": width, "height": height, **table}
@@ -126,7 +136,17 @@ def load_calibration(
     if isinstance(table.get("depth"), dict) and "depth_scale" in table["depth"]:
         own["depth_scale"] = table["depth"]["depth_scale"]
     color = camera_from_table(path, own, depth_scale)
-    return Calibration(color, depth, color_T_depth, str(path), "depth_scale" in own, depth_delay=delay)
+    return Calibration(color, depth, color_T_depth, origin, "depth_scale" in own, depth_delay=delay)
+
+
+def _rectified(path: Path, table: Table, projection: Any) -> Table:
+    """The camera of images without distortion: that of the projection matrix, where it is not left out or zero."""
+    table = {key: value for key, value in table.items() if key not in ("distortion", "model")}
+    if projection in ([], [0] * 12):
+        return table
+    if not isinstance(projection, list) or len(projection) != 12:
+        raise GavoError(f"{path}: {PROJECTION}: must be twelve numbers, of three rows and four columns")
+    return {**table, "fx": projection[0], "cx": projection[2], "fy": projection[5], "cy": projection[6]}
 
 
 def camera_from_table(path: Path | str, values: Table, depth_scale: float, part: str = "") -> Camera:

@@ -160,6 +160,7 @@ def _read_ros(path: Path, values: Table) -> Table:
         **{key: value for key, value in sizes.items() if value is not None},
         **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
         **{key: values[key] for key in ("depth_scale", "readout") if key in values},
+        "projection_matrix": numbers(first("projection_matrix", "P", "p")),
     }
 
 

@@ -219,7 +219,8 @@ class BagSequence:
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
-        found = reading.calibration(own, self._size, MILLIMETRES)  # units of 16UC1, by REP 118
+        is_rectified = bool(RECTIFIED.search(self._topics[0].name))
+        found = reading.calibration(own, self._size, MILLIMETRES, is_rectified)  # units of 16UC1, by REP 118
         return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
 
 

@@ -70,6 +70,7 @@ class Reading:
         own: Callable[[], Calibration],
         size: Callable[[], Size] | None = None,
         depth_scale: float = DEPTH_SCALE,
+        is_rectified: bool = False,
     ) -> Calibration:
         """The calibration that is named, else the source's own.
 
@@ -77,6 +78,7 @@ class Reading:
             own: reads what the source brings.
             size: finds out width and height of the images, for a file that does not say it.
             depth_scale: of a kind of source, for a file that does not say it.
+            is_rectified: as of `load_calibration`.
 
         Raises:
             GavoError: as `load_calibration`.
@@ -87,7 +89,7 @@ class Reading:
             return self.camera
         if isinstance(self.camera, Camera):
             return Calibration(self.camera)
-        return load_calibration(self.camera, size, depth_scale)
+        return load_calibration(self.camera, size, depth_scale, is_rectified)
 
 
 class Entry(NamedTuple):

@@ -307,6 +307,41 @@ def test_two_cameras_alike_that_lie_apart_are_two(tmp_path, said):
             open_source(tmp_path / "alike")
 
 
+CAMERA_INFO = f"""image_width: 160
+image_height: 120
+camera_matrix: {{rows: 3, cols: 3, data: {LENS.matrix.ravel().tolist()}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: {list(LENS.distortion)}}}
+projection_matrix: {{rows: 3, cols: 4, data: [120, 0, 80, 0, 0, 121, 60, 0, 0, 0, 1, 0]}}
+"""
+
+
+@pytest.mark.parametrize("topic", ["image_raw", "image_rect", "image_rect_color", "image_rect/compressed"])
+def test_images_that_are_rectified_are_not_undistorted_by_the_file_of_their_camera(tmp_path, topic):
+    """ROS's image_proc has done it, into the camera of the projection matrix."""
+    recorder = Recorder(tmp_path / "rect", "mcap")
+    for stamp in (1.0, 1.1):
+        if "/" in topic:
+            recorder.compressed(f"/cam/rgb/{topic}", stamp, cv2.imencode(".png", BGRS[0])[1].tobytes(), "png")
+        else:
+            recorder.image(f"/cam/rgb/{topic}", stamp, BGRS[0], "bgr8")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+    recorder.close()
+    file, bare = tmp_path / "info.yaml", tmp_path / "bare.yaml"
+    file.write_text(CAMERA_INFO)
+    bare.write_text("".join(CAMERA_INFO.splitlines(True)[:-1]))
+    found, without = (open_source(tmp_path / "rect", Reading(camera=str(path))) for path in (file, bare))
+    assert isinstance(found, BagSequence) and isinstance(without, BagSequence)
+    if topic == "image_raw":
+        assert found.calibration.color == without.calibration.color == replace(LENS, depth_scale=1000.0)
+        assert found.calibration.origin == str(file)
+        return
+    assert found.calibration.color == replace(CAMERA, fx=120.0, fy=121.0, cx=80.0, cy=60.0, depth_scale=1000.0)
+    assert found.calibration.origin == f"{file}, its lens left aside: the images are rectified"
+    assert without.calibration.color == replace(CAMERA, depth_scale=1000.0)
+    np.testing.assert_array_equal(found[0].grey, cv2.cvtColor(BGRS[0], cv2.COLOR_BGR2GRAY))
+
+
 def test_a_camera_of_numbers_alone_has_the_recordings_size(tmp_path):
     recorder = Recorder(tmp_path / "bare", "mcap")
     for stamp in (1.0, 1.1):
