@@ -29,6 +29,11 @@ def summary(sequence: Sequence) -> str:
     )
 
 
+def left_out(sequence: Sequence) -> list[str]:
+    """What lies in the source and makes no frame, and why, a line each."""
+    return list(getattr(sequence, "left_out", ()))
+
+
 def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: None) -> Facts:
     """Look at every frame and return what there is to know, as JSON has it; see docs/sources.md for the names.
 
@@ -46,7 +51,7 @@ def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: 
         "frames_not_used": looked["not_used"],
         "frames_doubted": looked["doubted"],
         "why_not": looked["reasons"],
-        "left_out": list(getattr(sequence, "left_out", ())),
+        "left_out": left_out(sequence),
         **_times(stamps),
         "delay_of_depth_ms": looked["delay"],
         "image": looked["image"],

@@ -16,7 +16,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.evaluation import is_w_first
-from gavo_jax.inspection import summary
+from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
@@ -87,6 +87,8 @@ def run(options: Run) -> int:
                 if mapper is not None:
                     mapper.replay(sequence, folder.steps())
             say(summary(sequence))
+            if lines := left_out(sequence):
+                say(f"left out: {'; '.join(lines)}")
             if line := settings_line(options):
                 say(line)
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
@@ -151,6 +153,7 @@ def _track(
         "preset": options.preset,
         "seed": options.seed,
         "complete": len(steps) == len(sequence) - 1,
+        "left_out": left_out(sequence),
         **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics[COMPILE_SECONDS]),
         FRAMES_PER_SECOND: speed,
         **of_loops,

@@ -154,6 +154,15 @@ def test_a_wrong_depth_scale_is_refused_and_shown(gavo, clip):
     assert gavo("run", clip, *FAST, "--depth-scale", 1000, "--force", "--frames", 2, "--output", "out").status == 0
 
 
+def test_run_says_what_makes_no_frame(gavo, clip, tmp_path):
+    rows = (clip / "depth.txt").read_text().splitlines(True)
+    (clip / "depth.txt").write_text("".join(rows[:4] + rows[6:]))
+    done = gavo("run", clip, *FAST, "--output", "out")
+    line = "2 colour images: no depth image within 0.02 s that is not another's"
+    assert done.status == 0 and done.out.splitlines()[1] == f"left out: {line}"
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["left_out"] == [line]
+
+
 def test_view_finds_the_source_of_a_run_again(gavo, tmp_path):
     (tmp_path / "clip").mkdir()
     LAYOUTS["seven_scenes"][1](tmp_path / "clip")
