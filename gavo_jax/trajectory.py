@@ -2,6 +2,7 @@
 
 import heapq
 import math
+import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,6 +29,10 @@ TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds 
 
 SEGMENT_COMMENT = "# segment "
 """Start of the comment line before the first pose of a segment, except the first."""
+
+
+W_FIRST = re.compile(r"^#.*\bq\w*w\b.*\bq\w*x\b", re.MULTILINE | re.IGNORECASE)
+"""A comment that names the columns, as EuRoC's does: w before x."""
 
 
 def segment_comment(segment: int, before: float, after: float) -> str:
@@ -81,6 +86,7 @@ class Trajectory:
     def read_tum(path: str | Path) -> "Trajectory":
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
+        Where a comment names the columns with qw before qx, as EuRoC's does, quaternions are read so.
         A comment of `segment_comment` starts a new segment. Rows come back in the order of their stamps; of rows with
         equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite are left out, as
         where a tracker lost its markers, and a `GavoWarning` says how many.
@@ -103,6 +109,8 @@ class Trajectory:
         breaks = [n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
         segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
+        if W_FIRST.search(text):
+            table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
         _, first = np.unique(table[:, 0], return_index=True)
         table = table[first]
         world_T_camera = np.zeros((len(table), 4, 4))

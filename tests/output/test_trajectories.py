@@ -21,6 +21,14 @@ TRAJECTORY = Trajectory(
 )
 
 
+def test_euroc_is_what_we_read_ourselves(tmp_path):
+    """Its header says that w goes first; stamps are nanoseconds."""
+    write_trajectory(TRAJECTORY, tmp_path / "t.csv", "euroc")
+    read = Trajectory.read_tum(tmp_path / "t.csv")
+    np.testing.assert_allclose(read.world_T_camera, TRAJECTORY.world_T_camera, atol=1e-8)
+    np.testing.assert_allclose(1e-9 * read.timestamps, TRAJECTORY.timestamps, atol=1e-6)
+
+
 def test_euroc_is_what_evo_reads(tmp_path):
     write_trajectory(TRAJECTORY, tmp_path / "t.csv", "euroc")
     read = file_interface.read_euroc_csv_trajectory(str(tmp_path / "t.csv"))
