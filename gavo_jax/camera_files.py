@@ -176,6 +176,9 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
     width, height = whole("width"), whole("height")
     distortion, model = _distortion(path, part, values)
+    if isinstance(values["fy"], int | float) and values["fy"] < 0:
+        why = "as ICL-NUIM has it for a world whose y points up: leave the sign out, as rows run from the top"
+        raise GavoError(f"{path}: {part}fy: negative ({shown(values['fy'])}), {why}")
     cx, cy = number("cx", -width, 2 * width), number("cy", -height, 2 * height)
     _check_middle(f"{path}: {part}cx, {part}cy", (cx, cy), (width, height))
     return Camera(

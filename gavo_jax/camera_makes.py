@@ -367,8 +367,8 @@ def _parse_numbers(path: Path, text: str) -> Table:
 
 
 def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None:
-    is_wide = cx > fx * WIDEST_HALF or cy > fy * WIDEST_HALF
-    if is_wide or not SQUARE[0] * fy < fx < SQUARE[1] * fy:
+    is_wide = cx > fx * WIDEST_HALF or cy > abs(fy) * WIDEST_HALF
+    if is_wide or not SQUARE[0] * abs(fy) < fx < SQUARE[1] * abs(fy):
         raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
 
 

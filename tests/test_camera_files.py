@@ -299,6 +299,8 @@ FAULTS = {
     "smaller image.toml": (TOML.replace("640", "1280").replace("480", "960"), "about 639x479, not of 1280x960"),
     "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: turn fx"),
     "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),
+    "negative.toml": (TOML.replace("510", "-510"), "fy: negative (-510), as ICL-NUIM has it"),
+    "negative.txt": ("481.2 -480.0 319.5 239.5\n", "fy: negative (-480.0), as ICL-NUIM has it"),
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
     "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a matrix"),
     "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),

@@ -189,9 +189,14 @@ def common_white(images: Iterable[np.ndarray]) -> int:
 def _check_registered(depth: DepthImage, camera: Camera) -> None:
     height, width = depth.raw.shape
     if (width, height) != (camera.width, camera.height):
+        needed = "to register it, the camera file needs the depth camera (a table [depth]) and colour_T_depth"
+        if width * camera.height == height * camera.width:
+            needed += (
+                f"; where it is only of another size, [depth] has colour's numbers times {width / camera.width:.6g}"
+            )
         raise FrameError(
             f"{depth.name}: is {width}x{height} pixels, the colour camera's images are {camera.width}x{camera.height}: "
-            "to register it, the camera file needs the depth camera (a table [depth]) and colour_T_depth"
+            f"{needed}"
         )
 
 

@@ -160,9 +160,14 @@ def _contents(path: Path) -> str:
         return f"an empty folder, not one of: {known}"
     sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
     if sources:
-        return f"no source itself, but a folder of {len(sources)}: name one of {_listed(sources)}"
+        names = (
+            f"{len(sources)}: name one of {_listed(sources)}" if len(sources) > 1 else f"one: name {sources[0][:60]}"
+        )
+        return f"no source itself, but a folder of {names}"
     if (words := missing_images(path)) is not None:
         return words
+    if film := next((child for child in inside if child.suffix.lower() in FILMS), None):
+        return f"{film.name}: {_inside(film)}"
     if source := source_around(path):
         return f"a folder of a source, whose folder is to be named: {source}"
     here = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
@@ -188,7 +193,9 @@ def _inside(file: Path) -> str | None:
     if endings[-1:] == [".sens"]:
         return "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder"
     if endings[-1:] and endings[-1] in FILMS:
-        return "a film: write its frames as images, with those of depth beside them"
+        return (
+            "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"
+        )
     how = PACKED.get(endings[-1]) if endings else None
     return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
 

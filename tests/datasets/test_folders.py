@@ -476,14 +476,23 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
     (tmp_path / "walk.bag").write_bytes(b"")
-    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of walk\.bag"):
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of one: name walk\.bag"):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
     with pytest.raises(GavoError, match=r"traj\.txt: a file of a source, whose folder is to be named: .*room0$"):
         open_source(tmp_path / "room0/traj.txt")
-    with pytest.raises(GavoError, match=r"no source itself, but a folder of 1: name one of room0"):
+    with pytest.raises(GavoError, match=r"no source itself, but a folder of one: name room0"):
         open_source(tmp_path)
+
+
+def test_a_film_beside_depth_says_how_its_frames_become_images(folder):
+    """As a phone's recorder leaves them."""
+    (folder / "depth").mkdir()
+    image(folder / "depth/000000.png", raw(METRES[0], 1000))
+    (folder / "rgb.mp4").write_bytes(b"hello")
+    with pytest.raises(GavoError, match=r"clip: rgb\.mp4: a film: .*into rgb/ beside depth/ \(ffmpeg"):
+        open_source(folder)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")

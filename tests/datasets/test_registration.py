@@ -147,7 +147,7 @@ def test_a_folder_with_both_cameras(folder):
 def test_depth_of_another_size_asks_for_its_camera(folder):
     plain = Reading(camera=COLOR)
     with pytest.raises(
-        FrameError, match=r"0\.png: is 160x120 pixels, the colour .* 320x240: to register it, .*\[depth\]"
+        FrameError, match=r"0\.png: is 160x120 pixels, the colour .* 320x240: to register it, .*\[depth\].* times 0\.5$"
     ):
         open_source(folder, plain)[0]
     other = Calibration(COLOR, replace(COARSE, width=162), COLOR_T_DEPTH)
