@@ -88,7 +88,8 @@ def run(options: Run) -> int:
                     mapper.replay(sequence, folder.steps())
             say(summary(sequence))
             if lines := left_out(sequence):
-                say(f"left out: {'; '.join(lines)}")
+                counts = ", ".join(line.partition(": ")[0] for line in lines)
+                say(f"left out: {counts}; metrics.json says why (left_out)")
             if line := settings_line(options):
                 say(line)
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
