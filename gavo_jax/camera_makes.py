@@ -343,7 +343,7 @@ def _parse_sens(path: Path, text: str) -> Table:
 
 
 def _parse_numbers(path: Path, text: str) -> Table:
-    """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`; `#` comments."""
+    """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]` or `width height fx fy cx cy`; `#` comments."""
     if "m_calibrationColorIntrinsic" in text:
         return _parse_sens(path, text)
     lines = [re.split(r"[\s,]+", line.split("#")[0].strip(" \t[],")) for line in text.splitlines()]
@@ -351,6 +351,10 @@ def _parse_numbers(path: Path, text: str) -> Table:
         rows = [[number(field) for field in line] for line in lines if line != [""]]
         if len(rows) == 1 and len(rows[0]) == 9 and not any(rows[0][at] for at in (1, 3, 6, 7)):
             return of_matrix(str(path), rows[0])
+        if len(rows) == 1 and len(rows[0]) == 6 and all(side.is_integer() for side in rows[0][:2]):
+            width, height, fx, fy, cx, cy = rows[0]
+            _check_order(path, fx, fy, cx, cy)
+            return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
         if len(rows) == 1 and len(rows[0]) >= 4:
             fx, fy, cx, cy, *distortion = rows[0]
             _check_order(path, fx, fy, cx, cy)
@@ -362,7 +366,9 @@ def _parse_numbers(path: Path, text: str) -> Table:
     except GavoError:
         raise
     except ValueError:
-        raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy") from None
+        named = re.search(r"^\s*fx\s*([:=])", text, re.MULTILINE)
+        hint = f": with names, call it {'.yaml' if named[1] == ':' else '.toml'}" if named else ""
+        raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy{hint}") from None
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 
 
@@ -384,5 +390,6 @@ PARSERS: dict[str, Callable[[Path, str], Table]] = {
     ".xml": _parse_xml,
     ".txt": _parse_numbers,
     ".csv": _parse_numbers,
+    ".pincam": _parse_numbers,
 }
 """By a file's ending."""

@@ -160,6 +160,8 @@ FILES = {
     "transforms fisheye.json": (json.dumps({**NERF, "camera_model": "OPENCV_FISHEYE", **FISH_LENS}), FISH),
     "transforms of frames.json": (json.dumps({"frames": [NERF, {**NERF, "sharpness": 3}]}), NONE),
     "stray scanner.csv": ("500.0, 0.0, 319.5\n0.0, 510.0, 239.5\n0.0, 0.0, 1.0\n", NONE),
+    "with its size.txt": ("640 480 500.0 510.0 319.5 239.5\n", NONE),
+    "arkitscenes.pincam": ("640 480 500.0 510.0 319.5 239.5\n", NONE),
     "own.toml": (TOML + f"distortion={RATIONAL}\nmodel='rational'\n", RATIO),
     "own fisheye.toml": (TOML + f"distortion={EQUIDISTANT}\nmodel='fisheye'\n", FISH),
 }
@@ -302,6 +304,8 @@ FAULTS = {
     "negative.toml": (TOML.replace("510", "-510"), "fy: negative (-510), as ICL-NUIM has it"),
     "negative.txt": ("481.2 -480.0 319.5 239.5\n", "fy: negative (-480.0), as ICL-NUIM has it"),
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
+    "names.txt": ("fx: 500\nfy: 510\n", "nor a row of fx fy cx cy: with names, call it .yaml"),
+    "toml.txt": (TOML, "nor a row of fx fy cx cy: with names, call it .toml"),
     "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a matrix"),
     "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
     "text.txt": ("hello\n", "neither a matrix"),
