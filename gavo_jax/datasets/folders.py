@@ -34,8 +34,8 @@ from gavo_jax.trajectory import Trajectory, associate, inverse
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
-COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
-DEPTH_FOLDERS = ("aligned_depth", "depth_registered", "depth", "depths")
+COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide")
+DEPTH_FOLDERS = ("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth")
 """The first one counts: beside depth that is registered to colour another one is that of its own camera."""
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img", r"^\d+\.")

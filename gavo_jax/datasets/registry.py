@@ -39,7 +39,17 @@ PACKED = {
 }
 """Endings of files from which a source is to be unpacked first, and by what."""
 
-FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+RECORDINGS = {
+    ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
+    ".mkv": "a film, or a recording of Azure Kinect: write its images with Open3D's azure_kinect_mkv_reader.py",
+    ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
+    ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
+    ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
+    ".klg": "a log of ElasticFusion's logger: write its images and depth first",
+}
+"""What holds a source in a form of its maker's alone."""
+
+FILMS = (".mp4", ".avi", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 
 SHOWN = 5
 """Names that a message lists."""
@@ -166,7 +176,7 @@ def _contents(path: Path) -> str:
         return f"no source itself, but a folder of {names}"
     if (words := missing_images(path)) is not None:
         return words
-    if film := next((child for child in inside if child.suffix.lower() in FILMS), None):
+    if film := next((child for child in inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None):
         return f"{film.name}: {_inside(film)}"
     if source := source_around(path):
         return f"a folder of a source, whose folder is to be named: {source}"
@@ -190,8 +200,8 @@ def _inside(file: Path) -> str | None:
     endings = [suffix.lower() for suffix in file.suffixes]
     if endings[-2:] == [".bag", ".active"]:
         return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
-    if endings[-1:] == [".sens"]:
-        return "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder"
+    if endings and endings[-1] in RECORDINGS:
+        return RECORDINGS[endings[-1]]
     if endings[-1:] and endings[-1] in FILMS:
         return (
             "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"

@@ -519,7 +519,9 @@ def test_what_is_compressed_says_how_it_is_to_be_named(tmp_path, kind):
         ("walk.bag.gz", r"packed: unpack it first \(gunzip\)"),
         ("walk.sens", "a scan as ScanNet packs it: export it"),
         ("walk.mp4", "a film.*frames as images"),
-        ("walk.svo", "a file of 5 bytes, not one of"),
+        ("walk.mkv", "a film, or a recording of Azure Kinect: .*Open3D"),
+        ("walk.SVO", "a recording of a ZED"),
+        ("walk.xyz", "a file of 5 bytes, not one of"),
     ],
 )
 def test_files_that_hold_a_source_say_how_to_get_it_out(tmp_path, name, words):

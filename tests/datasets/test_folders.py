@@ -486,6 +486,22 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
         open_source(tmp_path)
 
 
+@pytest.mark.parametrize("names", ["arkitscenes", "tartanair"])
+def test_folders_and_files_as_other_datasets_name_them(folder, names):
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        if names == "arkitscenes":
+            for kind, pixels in (("wide", grey), ("depth", raw(metres, 1000))):
+                image(folder / f"lowres_{kind}/41069021_{4097.9 + i / 30:.3f}.png", pixels)
+        else:
+            image(folder / f"image_left/{i:06}_left.png", grey)
+            image(folder / f"depth_left/{i:06}_left_depth.npy", metres.astype(np.float32))
+    sequence = open_source(folder, Reading(camera=CAMERA, depth_scale=1000.0 if names == "arkitscenes" else None))
+    first = 4097.9 if names == "arkitscenes" else 0.0
+    np.testing.assert_allclose(sequence.timestamps, first + np.arange(4) / 30, atol=1e-3)
+    depth, camera = sequence[2].depth, sequence.camera
+    np.testing.assert_allclose(depth / camera.depth_scale, METRES[2], atol=1e-3)
+
+
 def test_a_film_beside_depth_says_how_its_frames_become_images(folder):
     """As a phone's recorder leaves them."""
     (folder / "depth").mkdir()
