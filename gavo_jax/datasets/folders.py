@@ -27,7 +27,7 @@ from gavo_jax.datasets.files import (
 )
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, nameless, stamps, unpaired
-from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in
+from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -256,7 +256,8 @@ class PlainFolder(FileSequence):
         )
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
-        return cls(root.name, entries, calibration, truth_in(path, seconds, times), reading, left_out)
+        truth = truth_in(path, seconds, times)
+        return cls(root.name, entries, calibration, truth, reading, left_out + unread_truth(path, truth))
 
 
 class Open3DFolder(PlainFolder):

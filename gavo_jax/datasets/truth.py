@@ -15,6 +15,9 @@ from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 TRUTH = "groundtruth.txt"
 """In TUM's form."""
 
+OTHER_NAMES = re.compile(r"(gt|ground[-_]?truth|poses?|traj|trajectory)(_left)?\.(txt|csv|tum)", re.IGNORECASE)
+"""Files that look like one, and are not looked for: their form is open."""
+
 LOG = "trajectory.log"
 """In Redwood's form, which Open3D writes, too."""
 
@@ -58,6 +61,12 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
+
+
+def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:
+    """A line for a file that may be the true trajectory and is not read, where there is no other."""
+    names = sorted(file.name for file in folder.glob("*") if OTHER_NAMES.fullmatch(file.name)) if truth is None else []
+    return [f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in names]
 
 
 def counted_in(trajectory: Trajectory) -> float:

@@ -25,7 +25,7 @@ from gavo_jax.datasets.files import (
     size_of_most,
 )
 from gavo_jax.datasets.names import filled_in, unit_of, unpaired
-from gavo_jax.datasets.truth import truth_in
+from gavo_jax.datasets.truth import truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import associate
 
@@ -108,14 +108,15 @@ class TumSequence(FileSequence):
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry) for entry in entries]
+        truth = truth_in(self.folder, None if unit == 1 else lambda counts: unit * counts)
         why = f"within {max_difference:g} s that is not another's"
         super().__init__(
             name or resolved.name,
             files,
             reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_most, files)),
-            truth_in(self.folder, None if unit == 1 else lambda counts: unit * counts),
+            truth,
             reading,
-            unpaired((len(color_rows), len(depth_rows)), len(entries), why),
+            unpaired((len(color_rows), len(depth_rows)), len(entries), why) + unread_truth(self.folder, truth),
         )
 
     @classmethod

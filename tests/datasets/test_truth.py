@@ -12,6 +12,7 @@ from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.truth import MIRROR
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import left_out
 from gavo_jax.trajectory import Trajectory
 
 STAMPS = np.arange(4) / 30
@@ -209,6 +210,20 @@ def test_infinity_is_no_pose_however_it_is_written(tmp_path, none):
     (tmp_path / "frame-000002.pose.txt").write_text("1 0 0 x " * 4)
     with pytest.raises(GavoError, match=r"frame-000002\.pose\.txt: expected a pose of .*: '1 0 0 x 1"):
         open_source(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["plain", "tum"])
+@pytest.mark.parametrize("name", ["gt.txt", "poses.txt", "groundTruth.csv", "pose_left.txt", "trajectory.tum"])
+def test_a_truth_by_another_name_is_told(tmp_path, layout, name):
+    LAYOUTS[layout][1](tmp_path / "clip")
+    truth = tmp_path / "clip" / "groundtruth.txt"
+    truth.unlink(missing_ok=True)
+    (tmp_path / "clip" / name).write_text("0 0 0 0 0 0 0 1\n")
+    sequence = open_source(tmp_path / "clip")
+    assert sequence.ground_truth is None
+    assert [line for line in left_out(sequence) if line.startswith(f"{name}: if it is the true trajectory")]
+    truth.write_text("0 0 0 0 0 0 0 1\n")
+    assert not left_out(open_source(tmp_path / "clip"))
 
 
 def test_two_trajectories_of_icl_are_refused(tmp_path):
