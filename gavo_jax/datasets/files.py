@@ -226,6 +226,8 @@ CAMERA_FILES = (
     *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
     *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
     *("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt", "camera_matrix.csv", "transforms.json"),
+    *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
+    "calibration.json",
 )
 """Names by which a camera file in a folder, or in the one above, is known."""
 

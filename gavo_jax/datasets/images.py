@@ -102,6 +102,8 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
         image = _decode(data, name, AS_STORED)
     if image.ndim == 3 and image.shape[-1] == 1:
         image = image[..., 0]
+    elif image.ndim == 3 and image.shape[0] == 1:  # as PyTorch has a channel
+        image = image[0]
     if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
         found = _describe(image)
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")

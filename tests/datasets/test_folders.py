@@ -502,6 +502,15 @@ def test_folders_and_files_as_other_datasets_name_them(folder, names):
     np.testing.assert_allclose(depth / camera.depth_scale, METRES[2], atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["intrinsics.json", "intrinsics.yaml", "calibration.json", "transforms.json"])
+def test_a_camera_file_is_found_by_any_of_its_usual_names(folder, name):
+    wrote(folder, "plain")
+    (folder / "camera.yaml").unlink()
+    (folder / name).write_text(json.dumps({"K": MATRIX.tolist(), "width": 160, "height": 120}))
+    sequence = open_source(folder)
+    assert sequence.camera.fx == 131 and sequence.calibration.origin.endswith(name)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def test_a_film_beside_depth_says_how_its_frames_become_images(folder):
     """As a phone's recorder leaves them."""
     (folder / "depth").mkdir()

@@ -156,6 +156,12 @@ def test_a_pfm_has_the_numbers_that_stand_in_it(tmp_path, scale):
     np.testing.assert_array_equal(read_depth(tmp_path / "depth.pfm"), METRES)
 
 
+@pytest.mark.parametrize("axis", [0, 2])
+def test_an_array_of_depth_may_have_an_axis_of_one_channel(tmp_path, axis):
+    np.save(tmp_path / "depth.npy", np.expand_dims(METRES, axis))
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.npy"), METRES)
+
+
 def test_of_several_arrays_one_is_named_depth(tmp_path):
     np.savez(tmp_path / "depth.npz", depth=METRES, confidence=RAW)
     np.testing.assert_array_equal(read_depth(tmp_path / "depth.npz"), METRES)
