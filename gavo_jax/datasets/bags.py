@@ -61,8 +61,11 @@ ROUNDED = 0.05
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """In the name of a topic whose images are free of distortion."""
 
-COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered")
+COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered", "depth_to_rgb", "depth_to_color")
 """Words in the names of topics that are chosen before others."""
+
+MOVED_COLOR = ("rgb_to_depth", "color_to_depth")
+"""In the names of topics of colour as the depth camera would see it, which are chosen last."""
 
 
 class _Topic(NamedTuple):
@@ -372,6 +375,7 @@ class _Bag:
                 continue
             names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
             names = [name for name in names if name not in found] or names
+            names = [name for name in names if not _is_named(name, MOVED_COLOR)] or names
             best = [name for name in names if _is_named(name, words)] or names
             if len(best) != 1:
                 if not depth:

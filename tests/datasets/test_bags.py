@@ -150,6 +150,23 @@ def test_topics_are_found_by_type_or_named(tmp_path):
         open_source(tmp_path / "many", Reading(depth_topic="/nowhere"))
 
 
+def test_the_topics_of_azure_kinect_are_those_of_the_colour_camera(tmp_path):
+    """Its driver publishes each image in the frame of either camera."""
+    recorder = Recorder(tmp_path / "azure", "mcap")
+    for stamp in (1.0, 1.1):
+        for name in ("rgb", "rgb_to_depth", "depth", "depth_to_rgb", "ir"):
+            is_depth, is_wide = name.startswith("depth"), name in ("rgb", "depth_to_rgb")
+            frame = "rgb_camera_link" if is_wide else "depth_camera_link"
+            pixels, encoding = (MILLIMETRES[0], "16UC1") if is_depth else (GREYS[0], "mono8")
+            recorder.image(f"/{name}/image_raw", stamp, pixels, encoding, frame=frame)
+            camera = CAMERA if is_wide else replace(CAMERA, fx=150.0)
+            recorder.info(f"/{name}/camera_info", stamp, camera, frame=frame)
+    recorder.close()
+    sequence = open_source(tmp_path / "azure")
+    assert isinstance(sequence, BagSequence) and sequence.calibration.depth is None
+    assert [topic.name for topic in sequence._topics] == ["/rgb/image_raw", "/depth_to_rgb/image_raw"]
+
+
 def test_a_recording_of_realsenses_own_tools_is_understood(tmp_path):
     """Capital letters, depth as mono16, and camera_info in a folder of its own; its depth is not registered."""
     for fx in (131.0, 150.0):
