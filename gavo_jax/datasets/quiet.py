@@ -7,7 +7,6 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from functools import cache
-from typing import IO
 
 import cv2
 
@@ -49,23 +48,28 @@ def without_lines(*words: str) -> Iterator[list[str]]:
     The list that is yielded has them afterwards; what others write in that time comes after it.
     """
     left_out: list[str] = []
-    with _ASIDE, contextlib.ExitStack() as later:
-        said = _notes()
+    with _ASIDE:
+        said, kept = _notes(), None
         with contextlib.suppress(OSError):  # there may be no standard error
             kept = os.dup(2)
-            os.dup2(said.fileno(), 2)
-            later.callback(_restore, kept, said, words, left_out)
-        yield left_out
+        os.dup2(said, 2)
+        try:
+            yield left_out
+        finally:
+            _restore(kept, said, words, left_out)
 
 
 @cache
-def _notes() -> IO[bytes]:
-    """A file of this process for what is said meanwhile."""
-    return tempfile.TemporaryFile()
+def _notes() -> int:
+    """Descriptor of a file of this process, for what is said meanwhile; it is open as long as the process lives."""
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
 
 
 def _renew() -> None:
     """In a process that was forked: a file of its own."""
+    if _notes.cache_info().currsize:
+        os.close(_notes())
     _notes.cache_clear()
     _ASIDE.release()
 
@@ -74,14 +78,18 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_ASIDE.acquire, after_in_parent=_ASIDE.release, after_in_child=_renew)
 
 
-def _restore(kept: int, said: IO[bytes], words: tuple[str, ...], left_out: list[str]) -> None:
+def _restore(kept: int | None, said: int, words: tuple[str, ...], left_out: list[str]) -> None:
     """Put standard error in its place again, and pass on what was said but for lines with some words."""
-    os.dup2(kept, 2)
-    os.close(kept)
-    said.seek(0)
-    lines = said.readlines()  # at once: where standard error was closed, both may be one file
-    said.seek(0)
-    said.truncate()
+    if kept is None:
+        os.close(2)
+    else:
+        os.dup2(kept, 2)
+        os.close(kept)
+    with os.fdopen(os.dup(said), "rb") as file:
+        file.seek(0)
+        lines = file.readlines()
+        os.ftruncate(said, 0)
+        file.seek(0)
     for line in lines:
         if any(word.encode() in line for word in words):
             left_out.append(line.decode(errors="replace"))
