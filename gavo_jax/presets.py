@@ -143,9 +143,9 @@ def register(method: str, settings: Settings | Solver) -> None:
 
 
 def methods() -> tuple[str, ...]:
-    """All methods that go by a name: `METHODS`, then those that were registered."""
-    _register_plugins()
-    return (*METHODS, *_registered)
+    """All methods that go by a name: `METHODS`, those that were registered, those of packages that cannot be loaded."""
+    faults = faulty_plugins()
+    return (*METHODS, *_registered, *(name for name in faults if name not in (*METHODS, *_registered)))
 
 
 def plugin_names() -> tuple[str, ...]:
@@ -154,12 +154,16 @@ def plugin_names() -> tuple[str, ...]:
 
 
 @cache
-def _register_plugins() -> None:
+def faulty_plugins() -> dict[str, str]:
+    """Register what installed packages bring; what is wrong with those that cannot be loaded, by the method's name."""
+    faults = {}
     for entry in entry_points(group=PLUGINS):
         try:
             register(entry.name, entry.load())
         except Exception as error:  # somebody else's code may fail in any way
-            raise GavoError(f"method {entry.name!r} of {entry.value}: {' '.join(str(error).split())[:200]}") from error
+            words = " ".join(str(error).split())[:200] or type(error).__name__
+            faults[entry.name] = f"method {entry.name!r} of {entry.value}: cannot be loaded: {words}"
+    return faults
 
 
 def preset(method: str = "ga", name: str = "default") -> Settings:
@@ -173,7 +177,7 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
             independent populations at the coarsest level, for motions of tens of degrees.
 
     Raises:
-        GavoError: An unknown method or preset.
+        GavoError: An unknown method or preset, or a method of a package that cannot be loaded.
     """
     if method not in methods():
         raise GavoError(f"unknown method {method!r}: not one of {', '.join(methods())}")
@@ -181,6 +185,8 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         if name != "default":
             raise GavoError(f"method {method!r} has no preset {name!r}, only default")
         return _registered[method]
+    if method not in METHODS:
+        raise GavoError(faulty_plugins()[method])
     return _own(method, name)
 
 

@@ -82,7 +82,8 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     Raises:
         GavoError: It cannot be written, or holds somebody else's code.
     """
-    known = {type(presets.preset(name).solver): name for name in presets.methods()}
+    names = [name for name in presets.methods() if name in presets.METHODS or name not in presets.faulty_plugins()]
+    known = {type(presets.preset(name).solver): name for name in names}
     if type(settings.solver) not in known:
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
     table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}

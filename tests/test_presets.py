@@ -9,6 +9,7 @@ import pytest
 from gavo_jax import presets
 from gavo_jax.errors import GavoError
 from gavo_jax.settings import Settings
+from gavo_jax.settings_file import load_settings, save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 
 QUICK = GaussNewton(iterations=(0, 0, 0, 0, 5))
@@ -17,9 +18,9 @@ QUICK = GaussNewton(iterations=(0, 0, 0, 0, 5))
 @pytest.fixture(autouse=True)
 def _nothing_is_registered(monkeypatch):
     monkeypatch.setattr(presets, "_registered", {})
-    presets._register_plugins.cache_clear()
+    presets.faulty_plugins.cache_clear()
     yield
-    presets._register_plugins.cache_clear()
+    presets.faulty_plugins.cache_clear()
 
 
 def test_a_registered_method_has_a_name_and_one_preset():
@@ -54,11 +55,15 @@ def test_an_installed_package_brings_a_method(monkeypatch):
     assert presets.preset("quick").solver == QUICK
 
 
-def test_a_broken_package_is_one_line(monkeypatch):
-    entry = EntryPoint("broken", "no_such_package:SOLVER", presets.PLUGINS)
-    monkeypatch.setattr(presets, "entry_points", lambda group: [entry])
-    with pytest.raises(GavoError, match="'broken' of no_such_package:SOLVER: No module named"):
-        presets.methods()
+def test_a_broken_package_is_one_line_and_only_where_it_is_asked_for(monkeypatch, tmp_path):
+    entries = [EntryPoint(name, "no_such_package:SOLVER", presets.PLUGINS) for name in ("broken", "ga")]
+    monkeypatch.setattr(presets, "entry_points", lambda group: entries)
+    with pytest.raises(GavoError, match="'broken' of no_such_package:SOLVER: cannot be loaded: No module named"):
+        presets.preset("broken")
+    assert presets.methods() == (*presets.METHODS, "broken")
+    assert presets.names_of(presets.preset("ga", "fast")) == ("ga", "fast")
+    save_settings(tmp_path / "own.toml", presets.preset("ga"))
+    assert load_settings(tmp_path / "own.toml").method == "ga"
 
 
 def test_unknown_names_are_refused():

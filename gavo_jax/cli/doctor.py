@@ -10,9 +10,10 @@ from pathlib import Path
 import jax
 from packaging.requirements import Requirement
 
-from gavo_jax import compiler
+from gavo_jax import compiler, presets
 from gavo_jax.cli.options import Doctor
 from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache, why_not_private
+from gavo_jax.datasets import registry
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.screen import say
 from gavo_jax.selfcheck import checks
@@ -25,7 +26,7 @@ PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
 
 
 def doctor(command: Doctor) -> int:
-    """Print versions, machine, cache, extras, checks and speed; 0 if all is well."""
+    """Print versions, machine, cache, extras, faulty plugins, checks and speed; 0 if all is well."""
     del command
     enable_compilation_cache()
     faults = []
@@ -48,6 +49,11 @@ def doctor(command: Doctor) -> int:
         faults.append("the cache folder")
     for line in _extras():
         say(f"extra {line}")
+    plugins = (*presets.faulty_plugins().values(), *registry.faulty_plugins())
+    for line in plugins:
+        say(f"plugin: WRONG: {line}")
+    if plugins:
+        faults.append("packages that bring methods or datasets")
     faults += interruptible(_print_checks)
     say("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
     return OFF if faults else 0

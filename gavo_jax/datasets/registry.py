@@ -97,20 +97,22 @@ def register_dataset(dataset: Dataset) -> None:
 
 
 def datasets() -> tuple[Dataset, ...]:
-    """All kinds of sources, in the order in which they are asked.
-
-    Raises:
-        GavoError: a package's kind cannot be loaded.
-    """
-    _register_plugins()
+    """All kinds of sources, in the order in which they are asked."""
+    faulty_plugins()
     return (*_registered, *BUILT_IN)
 
 
 @cache
-def _register_plugins() -> None:
+def faulty_plugins() -> tuple[str, ...]:
+    """Register what installed packages bring; what is wrong with those that cannot be loaded."""
+    faults = []
     for entry in entry_points(group=PLUGINS):
-        with blamed(f"dataset {entry.name!r} of {entry.value}"):
-            register_dataset(entry.load())
+        try:
+            with blamed(f"dataset {entry.name!r} of {entry.value}: cannot be loaded"):
+                register_dataset(entry.load())
+        except GavoError as error:
+            faults.append(str(error))
+    return tuple(faults)
 
 
 def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
@@ -145,7 +147,7 @@ def recognise(path: Path) -> Dataset:
     dataset = _kind_of(path)
     if dataset is not None:
         return dataset
-    raise GavoError(f"{path}: {_contents(path)}")
+    raise GavoError("; ".join([f"{path}: {_contents(path)}", *faulty_plugins()]))
 
 
 def _kind_of(path: Path) -> Dataset | None:
@@ -190,7 +192,7 @@ def source_around(path: Path) -> Path | None:
     """The folder of the source that a file or folder is a part of; None where it is of none.
 
     Raises:
-        GavoError: a package's kind cannot be loaded, or fails.
+        GavoError: a package's kind fails.
     """
     return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
 

@@ -1,6 +1,8 @@
 """`gavo doctor`: what it prints and when it says that something is off; other subcommands beside a ruled-out JAX."""
 
 import os
+from functools import cache
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import jax
@@ -8,7 +10,8 @@ import numpy as np
 import pytest
 from command import Done, runner
 
-from gavo_jax import compiler
+from gavo_jax import compiler, presets
+from gavo_jax.datasets import registry
 from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
@@ -59,6 +62,20 @@ def test_doctor_tells_a_wrong_number(gavo, monkeypatch):
     assert done.status == 1 and "check WRONG: inverse of 300 motions: off by " in done.out
     assert "check ok: warp of 300 points" in done.out
     assert done.out.endswith("not as it should be: inverse of 300 motions\n")
+
+
+def test_doctor_tells_packages_that_cannot_be_loaded(gavo, monkeypatch):
+    entries = {
+        module.PLUGINS: [EntryPoint("broken", "no_such_package:KIND", module.PLUGINS)] for module in (presets, registry)
+    }
+    for module in (presets, registry):
+        monkeypatch.setattr(module, "entry_points", lambda group: entries[group])
+        monkeypatch.setattr(module, "faulty_plugins", cache(module.faulty_plugins.__wrapped__))
+    done = gavo("doctor")
+    for what in ("method", "dataset"):
+        assert f"plugin: WRONG: {what} 'broken' of no_such_package:KIND: cannot be loaded: No module" in done.out
+    assert done.status == 1 and not done.err
+    assert done.out.endswith("not as it should be: packages that bring methods or datasets\n")
 
 
 def test_doctor_tells_a_compiler_that_is_ruled_out(gavo, monkeypatch):
