@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import sys
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -33,8 +34,12 @@ from gavo_jax.output.screen import say, waiting
 from gavo_jax.trajectory import inverse
 
 
+MATRIX_DIGITS, TWIST_DIGITS = 7, 4
+"""Significant ones of four and of six numbers in a row, on a terminal; a pipe gets all."""
+
+
 def align(options: Align) -> int:
-    """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance` and `status` of one pair."""
+    """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance`, `status` and more of one pair."""
     check_seed(options.seed)
     check_positive("--depth-scale", options.depth_scale, 1e6)
     settings = choose_settings(options).settings
@@ -62,10 +67,20 @@ def align(options: Align) -> int:
         "camera_from": calibration.origin,
         "depth_units_per_metre": pair.depth_unit.file,
     }
-    print(json_text(answer))
-    if sys.stdout.isatty():
+    on_a_screen = sys.stdout.isatty()
+    print(json_text({name: rounded(value) for name, value in answer.items()} if on_a_screen else answer))
+    if on_a_screen:
         say(in_words(found))
     return 0
+
+
+def rounded(value: Any) -> Any:
+    """An array with as many digits as let its rows fit 80 columns; anything else as it is."""
+    numbers = np.asarray(value)
+    if numbers.ndim == 0:
+        return value
+    digits = MATRIX_DIGITS if numbers.shape[-1] == 4 else TWIST_DIGITS
+    return np.array([float(f"{number:.{digits}g}") for number in numbers.ravel()]).reshape(numbers.shape)
 
 
 def in_words(found: Alignment) -> str:

@@ -16,10 +16,11 @@ from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli import options
-from gavo_jax.cli.align import in_words
+from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.output import tracked
+from gavo_jax.output.files import json_text
 from gavo_jax.output.frames import FRAME_COLUMNS, read_run
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.status import AlignmentStatus
@@ -339,6 +340,18 @@ def test_align_says_the_motion_in_words():
     target_T_reference[:3, 3] = -0.003, 0.0, 0.004
     words = in_words(no_alignment(AlignmentStatus.OK)._replace(target_T_reference=target_T_reference))
     assert "moved by 5.0 mm (3.0 mm right, 0.0 mm down, 4.0 mm back) and turned by 0.00 degrees" in words
+
+
+def test_align_fits_a_terminal():
+    longest = {
+        "target_T_reference": np.full((4, 4), -1.23456789e-05),
+        "xi": np.full(6, -1.23456789e-05),
+        "covariance": np.full((6, 6), -1.23456789e-05),
+    }
+    text = json_text({name: rounded(value) for name, value in longest.items()})
+    assert max(map(len, text.splitlines())) <= 80
+    assert json.loads(text)["xi"][0] == -1.235e-05 and rounded(None) is None and rounded("ok") == "ok"
+    assert np.isnan(rounded(np.array([np.nan])))
 
 
 @pytest.mark.parametrize("role", range(4))
