@@ -345,12 +345,12 @@ def test_align_says_the_motion_in_words():
 def test_align_fits_a_terminal():
     longest = {
         "target_T_reference": np.full((4, 4), -1.23456789e-05),
-        "xi": np.full(6, -1.23456789e-05),
+        "xi": np.full(6, -1.23456789e-04),
         "covariance": np.full((6, 6), -1.23456789e-05),
     }
     text = json_text({name: rounded(value) for name, value in longest.items()})
     assert max(map(len, text.splitlines())) <= 80
-    assert json.loads(text)["xi"][0] == -1.235e-05 and rounded(None) is None and rounded("ok") == "ok"
+    assert json.loads(text)["xi"][0] == -0.0001235 and rounded(None) is None and rounded("ok") == "ok"
     assert np.isnan(rounded(np.array([np.nan])))
 
 
