@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import io
-import itertools
 import os
 import sys
 import warnings
@@ -27,6 +26,7 @@ from gavo_jax.cli.options import (
     Tune,
     View,
 )
+from gavo_jax.cli.usage import fault_of_usage
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, GavoWarning, printable
 from gavo_jax.version import __version__
@@ -196,19 +196,7 @@ def _parse(arguments: list[str]) -> Command | None:
     except SystemExit as stop:
         if not stop.code:
             return None
-    raise GavoError(_first_paragraph(messages.getvalue()) + f" (see gavo {_help_of(arguments)}--help)")
-
-
-def _first_paragraph(box: str) -> str:
-    """Return what the first paragraph of tyro's message box says, as one line."""
-    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
-    paragraph = list(itertools.takewhile(lambda line: line and not line.startswith("─"), lines))
-    return " ".join((" ".join(paragraph) or box).split())
-
-
-def _help_of(arguments: list[str]) -> str:
-    known = "run compare view align evaluate experiment download tune doctor inspect calibrate".split()
-    return f"{arguments[0]} " if arguments and arguments[0] in known else ""
+    raise GavoError(fault_of_usage(messages.getvalue(), arguments))
 
 
 def _silence_output() -> None:

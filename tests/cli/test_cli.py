@@ -17,6 +17,7 @@ from small import CAMERA
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli import options
 from gavo_jax.cli.align import in_words, rounded
+from gavo_jax.cli.usage import COMMANDS
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.output import tracked
@@ -316,6 +317,34 @@ def test_bad_option_is_refused(gavo, clip, name):
     assert is_refused(gavo("run", "clip", *camera, *bad), *words)
 
 
+USAGE = {
+    "": ("a command is missing: one of run, compare,",),
+    "runn": ("unknown command 'runn'; did you mean 'run'?",),
+    "help": ("unknown command 'help'; one of run, compare,",),
+    "run --frame 3": ("unknown option --frame; did you mean --frames? (see gavo run --help)",),
+    "run --xyzzy": ("unknown option --xyzzy (see",),
+    "doctor --json": ("unknown option --json (see gavo doctor --help)",),
+    "run one two": ("one argument too many: 'two'",),
+    "run --frames ten": ("--frames: must be a whole number, not 'ten'",),
+    "run --seed 1.5": ("--seed: must be a whole number, not '1.5'",),
+    "run --voxel 1cm": ("--voxel: must be a number, not '1cm'",),
+    "run --rate x": ("--rate: must be a number, not 'x'",),
+    "run --seed": ("--seed: a value is missing",),
+    "run --preset fst": ("--preset: 'fst' is not one of default, paper, fast, wide",),
+    "run --bodies on": ("--bodies: 'on' is not one of mask, off, track",),
+    "align a.png": ("missing: DEPTH0, RGB1, DEPTH1 (see gavo align --help)",),
+}
+
+
+@pytest.mark.parametrize("arguments", USAGE)
+def test_usage_error_says_what_would_help(gavo, arguments):
+    assert is_refused(gavo(*arguments.split()), *USAGE[arguments])
+
+
+def test_every_command_is_one_that_usage_knows():
+    assert set(COMMANDS) == {get_args(one)[1].name for one in get_args(options.Command)}
+
+
 @pytest.mark.parametrize("arguments", [(), ("nonsense",), ("align", "a.png"), ("evaluate", "one.txt")], ids=str)
 def test_usage_error_is_one_line(gavo, arguments):
     assert is_refused(gavo(*arguments), "--help")
@@ -345,12 +374,12 @@ def test_align_says_the_motion_in_words():
 def test_align_fits_a_terminal():
     longest = {
         "target_T_reference": np.full((4, 4), -1.23456789e-05),
-        "xi": np.full(6, -1.23456789e-04),
+        "xi": np.full(6, -1.23456789e-03),
         "covariance": np.full((6, 6), -1.23456789e-05),
     }
     text = json_text({name: rounded(value) for name, value in longest.items()})
     assert max(map(len, text.splitlines())) <= 80
-    assert json.loads(text)["xi"][0] == -0.0001235 and rounded(None) is None and rounded("ok") == "ok"
+    assert json.loads(text)["xi"][0] == -0.001235 and rounded(None) is None and rounded("ok") == "ok"
     assert np.isnan(rounded(np.array([np.nan])))
 
 

@@ -1,0 +1,72 @@
+"""What tyro says of arguments that it does not take, in this command's words: one line, with what would help."""
+
+import difflib
+import itertools
+import re
+from collections.abc import Sequence
+
+COMMANDS = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor", "inspect")
+COMMANDS += ("calibrate",)
+NUMBER = r"(?:could not convert string to float|invalid literal for int\(\) with base 10): (?P<value>.*)"
+UNION = r"no type matching .*(?P<kind>INT|FLOAT) could be instantiated from \[(?P<values>.*)\]\."
+CHOICE = r"invalid choice (?P<value>.*) for argument '(?P<name>[^']*)'\. Expected one of \((?P<choices>.*)\)\."
+
+
+def fault_of_usage(box: str, arguments: Sequence[str]) -> str:
+    """Return one line on what is wrong with the arguments.
+
+    Args:
+        box: tyro's message, framed by lines, or by blanks where the screen's encoding has none.
+        arguments: what it was given.
+    """
+    lines = [line[2:].rstrip(" │") for line in box.splitlines() if line.startswith(("│ ", "  "))]
+    first = list(itertools.takewhile(lambda line: line.strip(" ─-"), lines))
+    said = " ".join((" ".join(first) or box).split())
+    command = arguments[0] if arguments and arguments[0] in COMMANDS else ""
+    return f"{_in_words(said, first, lines, arguments, command)} (see gavo {command}{' ' * bool(command)}--help)"
+
+
+def _in_words(
+    said: str, first: Sequence[str], lines: Sequence[str], arguments: Sequence[str], command: str
+) -> str:
+    """What the first lines of a box said, in other words; as it was, where it is none of the usual faults."""
+    if not command and (not arguments or not arguments[0].startswith("-")):
+        return _no_command(arguments)
+    if found := re.match(r"Unrecognized (?:or misplaced )?options: (\S+)", said):
+        return _unknown(found[1].rstrip(","), lines, f"gavo {command} --help")
+    if said.startswith("Missing from"):
+        names = [words[1] for line in first if (words := re.match(r" {4}(\S+)", line))]
+        return f"missing: {', '.join(names)}"
+    if found := re.match(r"Missing value for argument '([^']*)'", said):
+        return f"{found[1]}: a value is missing"
+    if found := re.fullmatch(CHOICE, said):
+        choices = re.findall(r"'([^']*)'", found["choices"])
+        if "None" in choices:  # of an option that may be left out; in no order
+            choices = sorted({*choices} - {"None"})
+        return f"{found['name']}: {found['value']} is not one of {', '.join(choices)}"
+    if found := re.fullmatch(rf"Error parsing (?P<name>\S+): (?:{NUMBER}|{UNION})", said):
+        is_whole = found["kind"] == "INT" or "int()" in said
+        value = found["value"] or found["values"]
+        return f"{found['name']}: must be a {'whole ' * is_whole}number, not {value}"
+    return said
+
+
+def _no_command(arguments: Sequence[str]) -> str:
+    if not arguments:
+        return f"a command is missing: one of {', '.join(COMMANDS)}"
+    near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(COMMANDS)} is needed"
+    return f"unknown command {arguments[0][:100]!r}; {hint}"
+
+
+def _unknown(name: str, lines: Sequence[str], page: str) -> str:
+    """An option that there is none of, or an argument too many; of the options like it, one that the page has."""
+    if not name.startswith("-"):
+        return f"one argument too many: {name[:100]!r}"
+    like = ""
+    for line in lines:
+        if found := re.match(r" +(--[\w-]+)", line):
+            like = found[1]
+        elif like and line.endswith(f"in {page}"):
+            return f"unknown option {name[:100]}; did you mean {like}?"
+    return f"unknown option {name[:100]}"
