@@ -10,7 +10,7 @@ import json
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import optax
 import tomli_w
@@ -65,8 +65,8 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
         }
     refuse_unknown(str(path), table, ("method", "preset", *ROOMS))
     method, preset = str(table.pop("method", method)), str(table.pop("preset", preset))
-    refuse_unknown(f"{path}: method", [method], presets.methods())
-    refuse_unknown(f"{path}: preset", [preset], presets.PRESETS)
+    refuse_unknown(f"{path}: method", [method], presets.methods(), "name")
+    refuse_unknown(f"{path}: preset", [preset], presets.PRESETS, "name")
     return NamedSettings(method, preset, override(presets.preset(method, preset), flatten(str(path), table), str(path)))
 
 
@@ -150,14 +150,14 @@ def name_of(function: Any) -> str | None:
     return next((name for name, known in (LOSSES | OPTIMIZERS).items() if known is function), None)
 
 
-def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str]) -> None:
-    """Raise GavoError for the first key that is not known, and name the nearest one that is."""
+def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str], what: str = "key") -> None:
+    """Raise GavoError for the first key (or `what` else they are) that is not known, and name the nearest that is."""
     known = tuple(known)
     for key in keys:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
             hint = f"; did you mean {shown(near[0])}?" if near else ""
-            raise GavoError(f"{place}: unknown key {shown(key)}{hint}")
+            raise GavoError(f"{place}: unknown {what} {shown(key)}{hint}")
 
 
 def override(settings: Settings, values: Mapping[str, Any], place: str = "settings") -> Settings:
@@ -175,7 +175,8 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
     """
     for name, value in values.items():
         room, _, rest = name.partition(".")
-        refuse_unknown(place, [room], ROOMS)
+        if room not in ROOMS:
+            _refuse_part(place, room, settings)
         if not rest:
             raise GavoError(f"{place}: {room}: not a table of settings")
         part = getattr(settings, room)
@@ -190,6 +191,16 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
         settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
     _check_schedules(place, settings.solver)
     return settings
+
+
+def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
+    """Raise GavoError for a name that begins with no part of the settings; a field of that name is of one of them."""
+    parts = {room: [field.name for field in dataclasses.fields(getattr(settings, room))] for room in ROOMS}
+    whole = {field: f"{room}.{field}" for room, names in parts.items() for field in names} | {
+        room: room for room in ROOMS
+    }
+    near = difflib.get_close_matches(name, whole, n=1, cutoff=0.0)[0]
+    raise GavoError(f"{place}: unknown key {shown(name)}; did you mean {shown(whole[near])}?")
 
 
 def flatten(place: str, table: Mapping[str, Any], is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
@@ -258,7 +269,7 @@ def _callable(where: str, field: str, value: Any) -> Any:
     known = LOSSES if field == "loss" else OPTIMIZERS
     if not isinstance(value, str):
         raise GavoError(f"{where}: must be a name, not {shown(value)}")
-    refuse_unknown(where, [value], known)
+    refuse_unknown(where, [value], known, "name")
     return known[value]
 
 

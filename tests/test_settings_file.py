@@ -140,6 +140,12 @@ def test_a_wrong_file_is_one_line(text, words, tmp_path):
     assert all(word in str(refused.value) for word in (str(path), *words)) and "\n" not in str(refused.value)
 
 
+def test_a_name_without_its_part_is_told_with_it():
+    for name, whole in (("points", "alignment.points"), ("population.4", "solver.population"), ("solvr.a", "solver")):
+        with pytest.raises(GavoError, match=f"did you mean '{whole}'"):
+            override(presets.preset("ga", "default"), {name: 3})
+
+
 def test_somebody_elses_code_is_not_written(tmp_path):
     own = replace(presets.preset(), alignment=replace(presets.preset().alignment, loss=lambda s: s))
     with pytest.raises(GavoError, match="loss"):

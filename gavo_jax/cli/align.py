@@ -33,7 +33,6 @@ from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.trajectory import inverse
 
-
 MATRIX_DIGITS, TWIST_DIGITS = 7, 4
 """Significant ones of four and of six numbers in a row, on a terminal; a pipe gets all."""
 

@@ -26,9 +26,7 @@ def fault_of_usage(box: str, arguments: Sequence[str]) -> str:
     return f"{_in_words(said, first, lines, arguments, command)} (see gavo {command}{' ' * bool(command)}--help)"
 
 
-def _in_words(
-    said: str, first: Sequence[str], lines: Sequence[str], arguments: Sequence[str], command: str
-) -> str:
+def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: Sequence[str], command: str) -> str:
     """What the first lines of a box said, in other words; as it was, where it is none of the usual faults."""
     if not command and (not arguments or not arguments[0].startswith("-")):
         return _no_command(arguments)

@@ -303,6 +303,16 @@ def missing_images(path: Path) -> str | None:
     return None
 
 
+def missing_folder(path: Path) -> str | None:
+    """Which folder of images a folder lacks that has that of the other kind."""
+    names = {child.name.lower() for child in path.glob("*") if child.is_dir()}
+    color, depth = (names & {*known} for known in (COLOR_FOLDERS, DEPTH_FOLDERS))
+    if bool(color) == bool(depth):
+        return None
+    kind, known = ("depth", DEPTH_FOLDERS) if color else ("colour", COLOR_FOLDERS)
+    return f"no folder of {kind} beside {min(color or depth)}/; {kind} is looked for in {', '.join(known)}"
+
+
 def _plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth files, each in the order of their names."""
     folders = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}

@@ -16,6 +16,7 @@ from gavo_jax.datasets.folders import (
     Replica,
     ScanNet,
     SevenScenes,
+    missing_folder,
     missing_images,
 )
 from gavo_jax.datasets.tum import TumSequence
@@ -163,7 +164,7 @@ def _contents(path: Path) -> str:
     known = ", ".join(dataset.kind for dataset in datasets())
     if not path.is_dir():
         if path.is_file() and (source := source_around(path)):
-            return f"a file of a source, whose folder is to be named: {source}"
+            return f"a file of a source: name its folder, {source}"
         return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     inside = sorted(path.iterdir())
     if len(inside) == 1 and inside[0].is_file() and (words := _inside(inside[0])):
@@ -181,8 +182,11 @@ def _contents(path: Path) -> str:
     if film := next((child for child in inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None):
         return f"{film.name}: {_inside(film)}"
     if source := source_around(path):
-        return f"a folder of a source, whose folder is to be named: {source}"
-    here = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}: not one of: {known}"
+        return f"a folder inside a source: name the source, {source}"
+    there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}"
+    if (words := missing_folder(path)) is not None:
+        return f"{there}, and {words}"
+    here = f"{there}: not one of: {known}"
     if not any(child.is_dir() for child in inside):
         return here
     return f"{here}; colour is looked for in {', '.join(COLOR_FOLDERS)}, depth in {', '.join(DEPTH_FOLDERS)}"

@@ -125,7 +125,10 @@ def read_run(folder: str | Path) -> RecordedRun:
         GavoError: a file is missing or damaged, or trajectory.txt and frames.csv are not of the same run.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder / CONFIG).exists():
+    if not folder.is_dir():
+        fault = "no folder" if folder.exists() else "no such folder"
+        raise GavoError(f"{folder}: {fault}: name the output folder of a run")
+    if not (folder / CONFIG).exists():
         raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
     config = read_json(folder / CONFIG)
     trajectory = Trajectory.read_tum(folder / TRAJECTORY)

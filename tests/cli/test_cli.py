@@ -511,6 +511,8 @@ def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("fault", ["frames.csv", "trajectory.txt", "config.json"])
 def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
+    assert is_refused(gavo("view", "nowhere"), "nowhere: no such folder", "output folder")
+    assert is_refused(gavo("view", clip / "camera.toml"), "camera.toml: no folder", "output folder")
     assert gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", "out").status == 0
     path = tmp_path / "out" / fault
     path.write_text("index\n7\n" if fault == "frames.csv" else "{")

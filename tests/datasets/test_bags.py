@@ -518,7 +518,7 @@ def test_what_is_compressed_says_how_it_is_to_be_named(tmp_path, kind):
         open_source(file)
     path = record(tmp_path / "file", kind, "raw", shots(), CAMERA, "FILE")
     file = next(one for one in path.iterdir() if one.suffix != ".yaml")
-    with pytest.raises(GavoError, match=f"a file of a source, whose folder is to be named: {path}"):
+    with pytest.raises(GavoError, match=f"a file of a source: name its folder, {path}"):
         open_source(file)
     (path / "metadata.yaml").unlink()
     for place in (file, path):

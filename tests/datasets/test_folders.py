@@ -252,8 +252,16 @@ def test_folders_of_other_names_say_which_are_known(folder):
     wrote(folder, "plain")
     (folder / "rgb").rename(folder / "left")
     with pytest.raises(
-        GavoError, match=r"left/: .*; colour is looked for in color, colour, rgb, .* depth in aligned_depth, "
+        GavoError, match=r"left/, and no folder of colour beside depth/; colour is looked for in color, colour, rgb, "
     ):
+        open_source(folder)
+    (folder / "depth").rename(folder / "right")
+    with pytest.raises(
+        GavoError, match=r"right/: .*; colour is looked for in color, colour, rgb, .* depth in aligned_depth, "
+    ):
+        open_source(folder)
+    (folder / "left").rename(folder / "RGB")
+    with pytest.raises(GavoError, match=r"no folder of depth beside rgb/; depth is looked for in .*, depth, depths$"):
         open_source(folder)
 
 
@@ -415,7 +423,7 @@ def test_what_lacks_images_says_which(folder):
 def test_a_part_of_a_source_names_its_folder(folder, inside):
     wrote(folder, "plain")
     with pytest.raises(
-        GavoError, match=rf"{inside}: a (file|folder) of a source, whose folder is to be named: {folder}$"
+        GavoError, match=rf"{inside}: a (file of|folder inside) a source: name (its folder|the source), {folder}$"
     ):
         open_source(folder / inside)
 
@@ -480,7 +488,7 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
-    with pytest.raises(GavoError, match=r"traj\.txt: a file of a source, whose folder is to be named: .*room0$"):
+    with pytest.raises(GavoError, match=r"traj\.txt: a file of a source: name its folder, .*room0$"):
         open_source(tmp_path / "room0/traj.txt")
     with pytest.raises(GavoError, match=r"no source itself, but a folder of one: name room0"):
         open_source(tmp_path)
