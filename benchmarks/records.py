@@ -183,10 +183,14 @@ def sources_of_summary(records: Records) -> str:
     for column, benchmark in columns.items():
         by_version.setdefault(jax_of(records.of(benchmark)[0]) or UNKNOWN, []).append(column)
     parts = [
-        f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} of JAX {version}"
+        f"{_listed(names)} {'is' if len(names) == 1 else 'are'} of JAX {version}"
         for version, names in by_version.items()
     ]
     return "; ".join(parts) + "."
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def section(records: Sequence[Record]) -> str:

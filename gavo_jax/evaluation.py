@@ -29,7 +29,7 @@ class ErrorSeries:
     """One kind of error, value by value.
 
     Attributes:
-        values: one error a pair of poses, or a pose.
+        values: one error per pair of poses, or per pose.
         timestamps: seconds; stamp of the estimate's pose, the first one of a pair.
         unit: of the values: "m" or "deg".
         definition: what each value is, in a sentence.
@@ -80,7 +80,14 @@ class ErrorSeries:
 
 @dataclass(frozen=True, eq=False)
 class RelativePoseError:
-    """Translational (m) and rotational (deg) part of the relative pose error, over the same pairs."""
+    """Both parts of the relative pose error, over the same pairs.
+
+    Attributes:
+        translation: metres.
+        rotation: angles, degrees.
+        delta: how far apart the poses of a pair are.
+        unit: of `delta`.
+    """
 
     translation: ErrorSeries
     rotation: ErrorSeries
@@ -102,6 +109,15 @@ def relative_pose_error(
     Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is as
     printed in the paper: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations
     differ by about the rotation error times the distance travelled. Neither kind pairs poses of different segments.
+
+    Args:
+        estimate: what was found, camera to world.
+        truth: what it is compared with; its world may be another one.
+        delta: how far apart the poses of a pair are, in `unit`.
+        unit: seconds or frames.
+
+    Returns:
+        One error of translation and one of rotation per pair.
 
     Raises:
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive

@@ -56,7 +56,7 @@ class SceneMap:
         normals: unit vectors, towards where the camera was.
         triangles: three indices of vertices each; None of a cloud.
         frames: that went into it.
-        left_out: why others did not, a line each.
+        left_out: why others did not, one line each.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -129,7 +129,12 @@ class MapBuilder:
         self.frames, self.is_full = 0, False
 
     def add(self, frame: Frame, world_T_camera: Float[np.ndarray, "4 4"]) -> None:
-        """Fuse one more frame."""
+        """Fuse one more frame.
+
+        Args:
+            frame: of the camera that the map was made for; its `color` is used where it has one.
+            world_T_camera: its pose; the map is in that world, metres.
+        """
         image, core = self._open3d.t.geometry.Image, self._open3d.core
         metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
         self.frames += 1

@@ -36,12 +36,12 @@ class AlignmentOptions:
         precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
         points: Largest number of reference points per level, one per square block of pixels, or an entry per level
             (static); None takes every pixel.
-        estimation_points: Largest number of points a view from which brightness, scales and curvature are estimated
+        estimation_points: Largest number of points per view from which brightness, scales and curvature are estimated
             before a level is searched (static); None takes all.
         views: Largest number of reference frames that are scored together, an entry per level (static); the first ones
             are.
         islands: Independent populations, an entry per level (static); the best ones go on to the next level.
-        depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry a
+        depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry per
             level.
         doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
             err by whole surfaces (static); see `objective.depth_trust`.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 class AlignmentStatus(enum.IntEnum):
-    """What is known of a pair's result; `sentence` says it for people."""
+    """What is known of a pair's result; `sentence` says it for people, and docs/frames.md what becomes of the frame."""
 
     OK = 0
     LOW_OVERLAP = 1

@@ -133,7 +133,7 @@ class Trajectory:
         write_lines(path, lines)
 
     def write_kitti(self, path: str | Path) -> None:
-        """Write the upper 3×4 of each matrix, row by row, twelve numbers a line (KITTI odometry format, no stamps).
+        """Write the upper 3×4 of each matrix, row by row, twelve numbers per line (KITTI odometry format, no stamps).
 
         Raises:
             GavoError: the file cannot be written; nothing is left under its name then.

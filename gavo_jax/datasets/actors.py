@@ -46,7 +46,7 @@ def _poses(rotation: Float[np.ndarray, "n 3 3"], place: Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """A path to and fro about a place, turning to and fro: one sinusoid an axis.
+    """A path to and fro about a place, turning to and fro: one sinusoid per axis.
 
     Attributes:
         middle: `world_T_part` in the middle.

@@ -64,7 +64,7 @@ class Sequence(Protocol):
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """The true trajectory with its own stamps (not one pose a frame), or None."""
+        """The true trajectory with its own stamps (not one pose per frame), or None."""
         ...
 
     @property

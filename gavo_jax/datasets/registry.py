@@ -92,6 +92,9 @@ def register_dataset(dataset: Dataset) -> None:
     """Add a kind of source of one's own; it is asked before those that are built in.
 
     A package that is installed can do without a call: an entry point of the group `gavo_jax.datasets` leads to it.
+
+    Args:
+        dataset: has `kind` (what it is called), `recognises(path) -> bool` and `open(path, reading) -> Sequence`.
     """
     if dataset not in _registered:
         _registered.insert(0, dataset)

@@ -174,7 +174,7 @@ class SyntheticSequence:
             With a `readout` its shutter rolls: each frame is seen from where the camera is as its rows are read.
         trajectory: what to follow instead of the built-in path: a Trajectory or a TUM file (camera to world, z up). It
             is shifted into the room's free middle (the room is built larger where it must); scale and rotation stay.
-        rate: frames a second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
+        rate: frames per second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
         speed: the motion is played this many times faster.
         color: also give RGB images; grey is then computed from them as OpenCV does.
         bodies: what moves through the room: bodies with paths of their own (`speed` is the camera's alone), or how many

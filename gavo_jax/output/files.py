@@ -84,7 +84,7 @@ def describe(value: Any) -> Any:
 
 
 ROW = re.compile(r'\[\n\s*([^][{}"]*?)\n\s*\]')
-"""A list of numbers as `json` writes it, one a line. No string has a line break that is not escaped."""
+"""A list of numbers as `json` writes it, one per line. No string has a line break that is not escaped."""
 
 
 def json_text(value: Any, ensure_ascii: bool = True) -> str:

@@ -68,7 +68,9 @@ CAPTIONS = {
     "rotation between the frames of a pair.",
 }
 """By the name of the figure's files."""
-WITH_TRUTH = " Ground truth: interpolated at the frames' stamps, from the first estimate's first pose that it covers."
+WITH_TRUTH = (
+    " Ground truth: interpolated at the frames' stamps, laid on the first estimate at the first pose that it covers."
+)
 """Of the trajectories' caption."""
 SEVERAL_RUNS = " Bars: median over the runs; whiskers: smallest and largest."
 """Of the drift's caption."""

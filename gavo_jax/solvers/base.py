@@ -45,7 +45,7 @@ class Solver(Protocol):
     """A frozen dataclass pytree of hyperparameters.
 
     Sizes (population, iterations) are static, every rate is a leaf: a sweep over rates is one `vmap` and never
-    recompiles. A field that is a tuple holds one entry a pyramid level, level 0 first. One compiled program serves
+    recompiles. A field that is a tuple holds one entry per pyramid level, level 0 first. One compiled program serves
     every level, so arrays are made for the largest entry and what counts on a level is a number in the program:
     `PerLevel` brings what that needs.
     """
