@@ -79,7 +79,7 @@ class Entry(NamedTuple):
 
 def compare(options: Compare) -> int:
     """Run the methods one after the other; write comparison.json, trajectories and figures; print a table."""
-    methods = _parse_methods(options.methods)
+    methods = _parse_methods(options.methods, options.preset)
     if not 1 <= options.seeds <= MAX_SEED:
         raise GavoError(f"--seeds: must be from 1 to {MAX_SEED}, not {options.seeds}")
     sequence = open_sequence(options)
@@ -174,8 +174,8 @@ def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder
     return pictures
 
 
-def _parse_methods(text: str) -> list[str]:
-    """Return the names between the commas; raise GavoError for an unknown or repeated one."""
+def _parse_methods(text: str, preset: str) -> list[str]:
+    """Return the names between the commas; raise GavoError for an unknown or repeated one, or one without the preset."""
     names = [name.strip() for name in text.split(",")]
     known = (*presets.methods(), *PEERS)
     for name in names:
@@ -184,6 +184,8 @@ def _parse_methods(text: str) -> list[str]:
             raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}{hint}")
         if names.count(name) > 1:
             raise GavoError(f"--methods: {name} is given twice")
+        if name not in PEERS:
+            presets.preset(name, preset)
     return names
 
 

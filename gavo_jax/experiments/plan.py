@@ -332,7 +332,7 @@ def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
 def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
     refuse_unknown(place, entry, METHOD_KEYS)
     method = str(entry.get("name"))
-    refuse_unknown(f"{place}: name", [method], (*presets.methods(), *PEERS))
+    refuse_unknown(f"{place}: name", [method], (*presets.methods(), *PEERS), "name")
     printed = {
         text_of(place, name): real_of(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()

@@ -79,8 +79,8 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, _ = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
-    refuse_unknown(f"{path}: method", [str(method)], presets.methods())
-    refuse_unknown(f"{path}: preset", [str(preset)], PRESETS)
+    refuse_unknown(f"{path}: method", [str(method)], presets.methods(), "name")
+    refuse_unknown(f"{path}: preset", [str(preset)], PRESETS, "name")
     space = flatten(f"{path}: space", table.get("space", {}), lambda value: "low" in value or "high" in value)
     if not space:
         raise GavoError(f"{path}: space: nothing to tune")

@@ -14,6 +14,7 @@ import pytest
 from command import Done, runner
 from small import CAMERA
 
+from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli import options
 from gavo_jax.cli.align import in_words, rounded
@@ -526,6 +527,16 @@ def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
 @pytest.mark.parametrize("methods", ["nonsense", "", "ga,,pso", "ga,ga"])
 def test_compare_refuses_methods(gavo, clip, methods):
     assert is_refused(gavo("compare", clip, "--camera", clip / "camera.toml", "--methods", methods), "--methods")
+
+
+def test_compare_refuses_a_method_without_the_preset_before_it_replaces_anything(gavo, clip, monkeypatch):
+    monkeypatch.setattr(presets, "_registered", {"own": presets.preset("gauss-newton", "fast")})
+    out = clip / "out"
+    out.mkdir()
+    (out / "comparison.json").write_text("{}")
+    command = ("compare", clip, "--methods", "ga,own", "--preset", "fast", "--output", out)
+    assert is_refused(gavo(*command), "'own' has no preset 'fast'")
+    assert (out / "comparison.json").read_text() == "{}"
 
 
 def test_names_of_options_are_those_of_the_presets():
