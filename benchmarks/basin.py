@@ -300,7 +300,7 @@ def _draw(records: list[dict[str, Any]], clip: str, folder: Path) -> None:
     motion = np.array([row["motion_deg"] for row in rates])
     success = {name: np.array([row["success"][name] for row in rates]) for name in rates[0]["success"]}
     ours = [name for name in success if name not in PEERS]
-    common.save_figure(plots.plot_basin(motion, success, clip, ours), folder, "basin")
+    common.save_figure(plots.plot_basin(motion, success, clip, ours), folder, "basin", [motion, success])
 
 
 def _draw_records(found: Iterable[Record], folder: Path) -> None:
@@ -317,7 +317,7 @@ def _draw_records(found: Iterable[Record], folder: Path) -> None:
     ours = sorted((name for name in success if name not in PEERS), key=METHODS.split(",").index)
     success = {name: success[name] for name in (*ours, *(name for name in success if name in PEERS))}
     clip = tables[0].title.removeprefix(TITLE)
-    common.save_figure(plots.plot_basin(np.array(gaps), success, clip, ours), folder, "basin")
+    common.save_figure(plots.plot_basin(np.array(gaps), success, clip, ours), folder, "basin", [gaps, success])
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What the benchmarks share: clips and methods by name, drift over seeds, tables and the record of a run."""
 
+import hashlib
 import json
 import os
 import shlex
@@ -314,9 +315,22 @@ def read_records(paths: str, benchmark: str) -> list[dict[str, Any]]:
     return records
 
 
-def save_figure(figure: Any, folder: Path, name: str) -> None:
-    """Write a figure of `plots` into a folder, which is made where it is missing, as PNG and SVG."""
+def save_figure(figure: Any, folder: Path, name: str, drawn: Any) -> None:
+    """Write a figure of `plots` into a folder, which is made where it is missing, as PNG and SVG.
+
+    The PNG holds a digest of what is drawn, so that a test can tell a picture of older figures.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
     plots.save(figure, prepare_folder(folder), name)
+    words = json.dumps(drawn, sort_keys=True, default=lambda array: np.asarray(array).tolist())
+    info = PngInfo()
+    info.add_text("drawn", hashlib.sha256(words.encode()).hexdigest())
+    path = folder / f"{name}.png"
+    with Image.open(path) as image:
+        image.load()
+    image.save(path, pnginfo=info, optimize=True)
 
 
 def machine() -> dict[str, Any]:

@@ -9,7 +9,7 @@ which need not be the same one) and of the GA to Gauss-Newton, clip by clip, wit
     python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
     python benchmarks/drift.py --figure docs
     python benchmarks/drift.py --recorded ours.json,peers.json --figure docs
-    python benchmarks/drift.py --recorded benchmarks/records/drift.toml --figure docs
+    python benchmarks/drift.py --recorded benchmarks/records/drift.toml,… --figure docs
 
 Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
 METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
@@ -143,7 +143,7 @@ def main(
 
 def _draw(clips: dict[str, dict[str, np.ndarray]], folder: Path) -> None:
     ours = [name for methods in clips.values() for name in methods if name not in PEERS]
-    common.save_figure(plots.plot_drift(clips, ours), folder, "drift")
+    common.save_figure(plots.plot_drift(clips, ours), folder, "drift", clips)
 
 
 if __name__ == "__main__":

@@ -175,7 +175,7 @@ def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder
 
 
 def _parse_methods(text: str, preset: str) -> list[str]:
-    """Return the names between the commas; raise GavoError for an unknown or repeated one, or one without the preset."""
+    """Return the names between the commas; raise GavoError for one that is unknown, repeated or without the preset."""
     names = [name.strip() for name in text.split(",")]
     known = (*presets.methods(), *PEERS)
     for name in names:

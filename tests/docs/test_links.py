@@ -8,7 +8,8 @@ from types import ModuleType
 
 import pytest
 import yaml
-from pages import PAGES, ROOT, anchors, links, name
+from pages import PAGES, ROOT, anchors, inline_commands, links, name
+from PIL import Image
 
 import gavo_jax as gavo
 
@@ -63,6 +64,27 @@ def test_figures_are_drawn_from_the_records(monkeypatch: pytest.MonkeyPatch, tmp
     records = importlib.import_module("records").Records()
     drawn = importlib.import_module("drift").medians(records.of("drift"))
     assert drawn["fr1_xyz"]["ga"][0, 0] == float(records.cell("drift", "drift on fr1_xyz", "ga", "m/s"))
+
+
+def mark_of(picture: Path) -> str:
+    """The digest of what a benchmark drew."""
+    with Image.open(picture) as image:
+        return image.info["drawn"]
+
+
+def test_pictures_on_pages_are_of_the_present_records(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.chdir(ROOT)
+    drawn = {"drift": "", "basin": ""}
+    for command in inline_commands(ROOT / "docs" / "viewer.md"):
+        for benchmark in drawn:
+            if command.startswith(f"python benchmarks/{benchmark}.py --recorded"):
+                recorded = command.split()[3]
+                importlib.import_module(benchmark).main(recorded=recorded, figure=tmp_path)
+                drawn[benchmark] = command
+    for benchmark, command in drawn.items():
+        now, shown = (mark_of(folder / f"{benchmark}.png") for folder in (tmp_path, ROOT / "docs"))
+        assert now == shown, f"draw it again: {command}"
 
 
 def test_a_record_reads_back_as_it_was_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
