@@ -209,7 +209,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "plain: folders of other names": (
         "plain",
         lambda clip: (clip / "depth").rename(clip / "range"),
-        ["clip: a folder of camera.yaml, range/, rgb/", "depth in aligned_depth"],
+        ["clip: a folder of camera.yaml, range/, rgb/", "depth is looked for in aligned_depth"],
     ),
     "plain: numbers longer than any float": (
         "plain",
@@ -241,7 +241,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("camera.yaml", "cam0:\n  camera_model: omni\n"),
         ["camera.yaml: camera_model 'omni': pinhole"],
     ),
-    "plain: only colour": ("plain", remove("depth"), ["clip", "a folder of", "not one of"]),
+    "plain: only colour": ("plain", remove("depth"), ["clip: a folder of", "no folder of depth beside rgb/"]),
     "nothing at all": (
         "plain",
         lambda clip: [remove(n)(clip) for n in ("rgb", "depth", "camera.yaml")],
