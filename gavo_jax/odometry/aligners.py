@@ -194,6 +194,49 @@ class Recovering:
         return self.first.predict(state, elapsed)
 
 
+POLISHED = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR)
+"""What a finer search may say of a motion that another one has found."""
+SAME_BASIN = (0.05, 0.05)
+"""Metres and radians within which it ends in the same minimum."""
+
+
+@dataclass(frozen=True)
+class Polished:
+    """A search from whose motion another one begins, which sees it more exactly: it has the keyframe as well.
+
+    Attributes:
+        first: Finds the motion, and says whether the images match.
+        fine: Begins there.
+    """
+
+    first: Search
+    fine: Search
+
+    def warm_up(self) -> float:
+        """That of the first one: the other one serves every frame."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> TrackerState:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
+        """The first one's attempt, with the finer motion if that ends in the same minimum."""
+        attempt = self.first.align(state, frame, clock)
+        if not attempt.usable:
+            return attempt
+        guess = attempt.result.xi * (state.seconds / clock.elapsed)
+        again = self.fine.align(state._replace(guess=guess), frame, clock)
+        if again.result.status not in POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
+            return attempt
+        result = again.result._replace(status=attempt.result.status, findings=attempt.result.findings)
+        return attempt._replace(state=again.state, result=result)
+
+    def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
 @dataclass(frozen=True)
 class DoubtingDepth:
     """An aligner that doubts a frame's depth before it doubts the motion.
@@ -277,7 +320,7 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
 
     def behind() -> Aligner:
         wide = wide_search(search)
-        return with_bodies(wide, wide)
+        return with_bodies(Polished(wide, search), wide)
 
     # loading it takes seconds, which a short run had better spare and a long one had better not stop for
     return Recovering(careful, behind, wide_search(search) if search.settings.odometry.loops else None)

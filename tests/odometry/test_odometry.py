@@ -27,7 +27,15 @@ from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.warp import Points
 from gavo_jax.objective.points import make_references, move_reference
-from gavo_jax.odometry.aligners import Attempt, DoubtingDepth, Recovering, Search
+from gavo_jax.odometry.aligners import (
+    BEGINNING,
+    Attempt,
+    DoubtingDepth,
+    Polished,
+    Recovering,
+    Search,
+    blank_of,
+)
 from gavo_jax.odometry.driver import Odometry, Step, track
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
@@ -624,6 +632,25 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
     assert odometry.progress.tracker == (sequence[0].timestamp if x is None else sequence[1].timestamp)
 
 
+@pytest.mark.parametrize(
+    ("first", "fine", "x"),
+    [
+        (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.HIGH_ERROR, 0.12), 0.12),
+        (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.OK, 0.12), 0.12),
+        (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.OK, 0.16), 0.10),
+        (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.LOW_TEXTURE, 0.12), 0.10),
+        (found(AlignmentStatus.AMBIGUOUS, 0.10), found(AlignmentStatus.OK, 0.12), 0.10),
+    ],
+)
+def test_what_the_wide_search_finds_is_polished(first: Alignment, fine: Alignment, x: float) -> None:
+    """By the search that has the keyframe, if it ends in the same minimum; the wide one says what it is worth."""
+    state = blank_of(Odometry(CAMERA, SEARCH_ALONE).aligner)
+    polished = Polished(Told(first), Told(fine))  # pyright: ignore[reportArgumentType]
+    attempt = polished.align(state, Rendered(frames=1, camera=CAMERA, noise=NONE)[0], BEGINNING)
+    assert attempt.result.target_T_reference[0, 3] == x
+    assert attempt.result.status is first.status and attempt.usable is (first.status is AlignmentStatus.OK)
+
+
 class Guessing(Told):
     """An aligner that guesses its motions, or says of how many it has guessed, where it is told so."""
 
@@ -665,7 +692,8 @@ def test_the_wide_search_stands_behind_the_default_one() -> None:
     first, alone, second = (one.first for one in rivalled if isinstance(one, WithRival))
     assert isinstance(first, BodyAware) and isinstance(alone, BodyAware) and isinstance(second, BodyAware)
     search, wide = first.search, second.search
-    assert first.first is search and alone.search is search and second.first is wide and wide.key == search.key
+    assert first.first is search and alone.search is search and wide.key == search.key
+    assert second.first == Polished(wide, search)
     assert wide.settings.alignment.scouts > 0 and wide.settings.odometry.reference == "previous"
     assert wide.settings.solver.levels == SOLVER.levels
     assert wide.settings.alignment.points == search.settings.alignment.points
