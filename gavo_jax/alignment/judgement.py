@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.alignment.evidence import Evidence as Chosen
@@ -214,6 +215,8 @@ def find_against(
 
 UNDETERMINED = 0.5
 """Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
+UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
+"""Covariance of a motion that images do not tell."""
 LARGEST_STEP = 0.01
 """Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
 images leave open; it is not taken."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float64, Integer
 
-from gavo_jax.alignment.judgement import UNDETERMINED
+from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.identity import LEAST, Roll, parts
@@ -64,8 +64,6 @@ SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
 """Deviation, metres and radians, of a motion that goes on as before."""
-UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
-"""Covariance of a motion that images do not tell."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)

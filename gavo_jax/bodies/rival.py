@@ -15,8 +15,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
+from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.bodies.aligner import UNKNOWN, BodyAware, deviation, mistrusted
+from gavo_jax.bodies.aligner import BodyAware, deviation, mistrusted
 from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import Roll
 from gavo_jax.bodies.scene import AwareState
@@ -203,7 +204,8 @@ class WithRival:
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
         unknown = max(open_for - int(rival.age) - 1, 0)
-        return mistrusted(other._replace(state=self._alone(other.state, open_after), result=result, unknown=unknown))
+        taken = other._replace(state=self._alone(other.state, open_after), result=result, unknown=unknown)
+        return mistrusted(taken._replace(revises=unknown + int(rival.age)))
 
     @cached_property
     def _nobody(self) -> Rival:

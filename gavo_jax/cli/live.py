@@ -21,6 +21,7 @@ from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
@@ -57,7 +58,7 @@ def run_live(options: Run) -> int:
         seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
         if odometry.progress.last_index < 1:
             raise GavoError(f"{device.name}: ended after {newest.received} frames: at least two are needed")
-        steps = folder.steps()
+        steps = revised(folder.steps())
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         metrics: dict[str, Any] = {
             **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed, "complete": True},

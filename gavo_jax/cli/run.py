@@ -23,6 +23,7 @@ from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics, errors_before
 from gavo_jax.odometry.run import guessed, trajectory_of
 from gavo_jax.output.drawing import draw, draw_search
@@ -134,7 +135,7 @@ def _track(
     tracked = track_visibly(name, sequence, odometry, on_step, viewer, mapper)
     if tracked.interrupted:
         folder.save_checkpoint()
-    steps = folder.steps()
+    steps = revised(folder.steps())
     causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     speed, of_loops = tracked.metrics[FRAMES_PER_SECOND], {}
     if mapper is not None:

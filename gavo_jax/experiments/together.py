@@ -25,6 +25,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recovery
 from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, decoded
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
@@ -107,7 +108,7 @@ def _drive(
             on_frame()
         if all(stopped):
             break
-    return steps
+    return [revised(of_one) for of_one in steps]
 
 
 def _of_program(settings: Settings) -> Settings:

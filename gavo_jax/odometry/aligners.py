@@ -46,6 +46,8 @@ class Attempt(NamedTuple):
     """What moves on its own, as far as that was asked."""
     unknown: int = 0
     """So many of the last motions, this one included, are guesses."""
+    revises: int = 0
+    """So many of the motions before this one were a body's, as is seen now."""
 
     @property
     def is_found(self) -> bool:

@@ -57,6 +57,8 @@ class Step:
     (a lost pair, or a motion that is taken to have gone on behind a body)."""
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
+    revises: int = 0
+    """So many of the pairs before followed a body, as is seen now; see `odometry.hindsight`."""
 
 
 class Found(NamedTuple):
@@ -182,6 +184,7 @@ class Odometry:
             usable = without_depth(usable)
         candidates: tuple[Population, ...] = ()
         bodies: tuple[Body, ...] = ()
+        revises = 0
         if before.tracker is None:
             fit = usable if finding.use is Use.ALL else None
             after = before if fit is None else self._restart(before, fit)
@@ -193,7 +196,7 @@ class Odometry:
             attempt, leap = align_leaping(self.aligner, before.tracker, usable, clock, before.leap)
             after, result, lost = self._advance(before, usable, finding, attempt)
             after = after._replace(leap=leap if after.held else None)
-            candidates = attempt.candidates
+            candidates, revises = attempt.candidates, attempt.revises
             size = (self.camera.height, self.camera.width)
             bodies = tuple(
                 in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
@@ -228,6 +231,7 @@ class Odometry:
             after.segment,
             origin,
             bodies,
+            revises,
         )
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:

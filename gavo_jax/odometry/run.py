@@ -15,6 +15,7 @@ from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
@@ -102,6 +103,7 @@ def run_odometry(
         steps.append(step)
         if on_step is not None:
             on_step(step)
+    steps = revised(steps)
     causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     loops = mapper.finish() if mapper else None
     if loops is not None:

@@ -1,7 +1,8 @@
 """frames.csv: a step as a row, and the steps of a run read back."""
 
 import csv
-from collections.abc import Mapping
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY, read_json
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse
@@ -18,13 +20,14 @@ DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"
 FRAME_COLUMNS = (
     ("index", "reference_timestamp", "timestamp", "error", "overlap", "status", "undetermined", "lost", "on_lost")
     + DEVIATIONS
-    + ("milliseconds", "segment", "statuses", "origin")
+    + ("milliseconds", "segment", "statuses", "origin", "revises")
 )
 """Of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction
 that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations
 of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
 0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the reference is
-then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body)."""
+then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body). The last one is how many
+of the pairs before followed a body, as is seen then: their status says so once the run has come to its end."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
@@ -84,7 +87,33 @@ def _read_step(
         row["on_lost"],  # pyright: ignore[reportArgumentType]
         int(row.get("segment") or 0),
         row.get("origin") or ("guessed" if row["lost"] == "1" else "tracked"),  # pyright: ignore[reportArgumentType]
+        revises=int(row.get("revises") or 0),
     )
+
+
+def with_hindsight(lines: Sequence[str], steps: Sequence[Step]) -> list[str]:
+    """The lines of frames.csv, with what is known at the end of pairs that a later one revises.
+
+    Args:
+        lines: Of the file.
+        steps: Revised, one per row.
+    """
+    lines = list(lines)
+    revises = {step.index - back for step in steps for back in range(1, step.revises + 1)}
+    for place, step in enumerate(steps, start=1):
+        if step.index in revises and not step.lost:
+            said, known = next(csv.reader([lines[place]])), dict(zip(FRAME_COLUMNS, frame_row(step), strict=True))
+            for name in ("status", "statuses", *DEVIATIONS):
+                said[FRAME_COLUMNS.index(name)] = str(known[name])
+            lines[place] = as_line(said)
+    return lines
+
+
+def as_line(values: Iterable[Any]) -> str:
+    """Values as a line of CSV."""
+    row = io.StringIO()
+    csv.writer(row, lineterminator="").writerow(values)
+    return row.getvalue()
 
 
 def frame_row(step: Step) -> list[Any]:
@@ -106,6 +135,7 @@ def frame_row(step: Step) -> list[Any]:
         step.segment,
         " ".join(str(status) for status in alignment.statuses),
         step.origin,
+        step.revises,
     ]
 
 
@@ -132,7 +162,7 @@ def read_run(folder: str | Path) -> RecordedRun:
         raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
     config = read_json(folder / CONFIG)
     trajectory = Trajectory.read_tum(folder / TRAJECTORY)
-    return RecordedRun(config, trajectory, read_steps(folder, trajectory))
+    return RecordedRun(config, trajectory, revised(read_steps(folder, trajectory)))
 
 
 def _digits(value: Any) -> str:

@@ -4,9 +4,7 @@ A checkpoint beside them lets a run that was cut short go on where it was.
 """
 
 import contextlib
-import csv
 import hashlib
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -15,9 +13,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, read_text
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Progress, Step
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (
@@ -40,11 +39,11 @@ from gavo_jax.output.files import (
     remove_files,
     write_json,
 )
-from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_steps
+from gavo_jax.output.frames import FRAME_COLUMNS, as_line, frame_row, read_steps, with_hindsight
 from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, segment_comment
+from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, segment_comment, write_lines
 
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
 IDENTITY_OPTIONS = ("method", "preset", "seed")
@@ -226,12 +225,12 @@ class RunFolder:
         Raises:
             GavoError: the disk is full, or the like; the files then end with the last whole row.
         """
-        self._files[FRAMES].append(_as_line(frame_row(step)))
+        self._files[FRAMES].append(as_line(frame_row(step)))
         if BODIES in self._files:
             for body in body_rows(step):
-                self._files[BODIES].append(_as_line(body))
+                self._files[BODIES].append(as_line(body))
         if MOTIONS in self._files:
-            self._files[MOTIONS].append(_as_line(motion_row(step)))
+            self._files[MOTIONS].append(as_line(motion_row(step)))
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
             if step.segment != self._segment:
                 comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
@@ -258,7 +257,9 @@ class RunFolder:
         return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
 
     def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
-        """Write metrics.json, whole or not at all; after it a run that is complete needs no checkpoint any more.
+        """Write metrics.json, whole or not at all.
+
+        After it a run that is complete needs no checkpoint any more, and its rows say what is known at the end.
 
         Raises:
             GavoError: it cannot be written.
@@ -266,6 +267,18 @@ class RunFolder:
         write_json(self.path / METRICS, metrics)
         if complete:
             remove_files(self.path, CHECKPOINT)
+            self._revise()
+
+    def _revise(self) -> None:
+        """Replace frames.csv where pairs were taken back; then it does not grow any more."""
+        self._cut()
+        steps = read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
+        if any(step.revises for step in steps):
+            marks, images, progress = self._whole
+            self._whole = ({name: mark for name, mark in marks.items() if name != FRAMES}, images, progress)
+            self._files.pop(FRAMES).close()
+            rows = read_text(self.path / FRAMES)
+            write_lines(self.path / FRAMES, with_hindsight(rows.splitlines(), revised(steps)))
 
     def _open(self, files: Mapping[str, Mark | None]) -> None:
         for name, mark in files.items():
@@ -293,12 +306,6 @@ class RunFolder:
             self._cut()
             for file in self._files.values():
                 file.close()
-
-
-def _as_line(values: Sequence[Any]) -> str:
-    row = io.StringIO()
-    csv.writer(row, lineterminator="").writerow(values)
-    return row.getvalue()
 
 
 def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:

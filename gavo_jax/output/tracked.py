@@ -8,6 +8,7 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import pair_progress, tell
@@ -64,6 +65,7 @@ def track_visibly(
         seconds = time.perf_counter() - start
     if interrupted:
         tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
+    steps = revised(steps)
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
     return Tracked(trajectory, steps, metrics, interrupted)

@@ -221,7 +221,7 @@ def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> No
         state = attempt.state
         assert attempt.unknown == 0 and not state.rival.is_there
     taken = aligner.align(state._replace(rival=seen.rival), frame, CLOCK)
-    assert taken.unknown == 6 and int(taken.state.open_for) < 0
+    assert taken.unknown == taken.revises == 6 and int(taken.state.open_for) < 0
 
 
 def test_motions_that_part_slowly_are_told_apart_by_how_far_they_are_apart_since_the_anchor() -> None:
@@ -231,6 +231,7 @@ def test_motions_that_part_slowly_are_told_apart_by_how_far_they_are_apart_since
     assert first.state.rival.is_there and AlignmentStatus.MOVING_BODY not in first.result.statuses
     second = aligner.align(first.state, frame, CLOCK)
     assert not second.state.rival.is_there and AlignmentStatus.MOVING_BODY in second.result.statuses
+    assert first.revises == 0 and second.revises == 1, "the first pair followed the body, too"
     assert np.asarray(second.result.target_T_reference)[0, 3] == pytest.approx(-0.01, abs=1e-6)  # the way back and on
 
 
@@ -267,7 +268,7 @@ def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(
         assert state.rival.is_there and attempt.unknown == 0
     taken = aligner.align(state, frame, CLOCK)
     assert not taken.state.rival.is_there and int(taken.state.open_for) < 0
-    assert taken.unknown == unknown and AlignmentStatus.MOVING_BODY in taken.result.statuses
+    assert taken.unknown == taken.revises == unknown and AlignmentStatus.MOVING_BODY in taken.result.statuses
     assert taken.result.target_T_reference[0, 3] == pytest.approx(0.0, abs=1e-6)
 
 

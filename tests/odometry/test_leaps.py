@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import no_alignment, with_finding
-from gavo_jax.bodies.aligner import UNKNOWN
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA
 from gavo_jax.datasets.tum import TumSequence

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment, no_alignment
-from gavo_jax.bodies.aligner import UNKNOWN
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.files import describe, json_text, prepare_folder, write_json
@@ -56,6 +56,29 @@ def test_rows_are_on_disk_as_soon_as_added(tmp_path):
         assert len((folder.path / "trajectory.txt").read_text().splitlines()) == 3
         assert len((folder.path / "frames.csv").read_text().splitlines()) == 2
         assert not (folder.path / "metrics.json").exists()
+
+
+def test_rows_of_a_run_that_came_to_its_end_say_what_was_seen_later(tmp_path: Path) -> None:
+    def pair(index: int, revises: int = 0) -> Step:
+        result = no_alignment(AlignmentStatus.OK)._replace(covariance=np.eye(6, dtype=np.float32) / 3e6)
+        return Step(index, index - 1.0, float(index), result, np.eye(4), 12.5, False, revises=revises)
+
+    with RunFolder(tmp_path / "run") as folder:
+        folder.start({}, 0.0)
+        for index, revises in ((1, 0), (2, 0), (3, 2), (4, 0)):
+            folder.add(pair(index, revises))
+        rows = (folder.path / "frames.csv").read_text().splitlines()
+        assert not any("moving_body" in row for row in rows), "it is not known yet"
+        folder.finish({}, complete=False)
+        assert (folder.path / "frames.csv").read_text().splitlines() == rows, "a checkpoint knows it as it was"
+        assert [step.alignment.status for step in folder.steps()] == [AlignmentStatus.OK] * 4
+        folder.finish({})
+        assert len(folder.steps()) == 4
+    after = (tmp_path / "run" / "frames.csv").read_text().splitlines()
+    assert [place for place, (row, was) in enumerate(zip(after, rows, strict=True)) if row != was] == [1, 2]
+    said = dict(zip(FRAME_COLUMNS, after[1].split(","), strict=True))
+    assert (said["status"], said["statuses"], said["std_vx"]) == ("moving_body", "moving_body", "0.5")
+    assert dict(zip(FRAME_COLUMNS, after[3].split(","), strict=True))["revises"] == "2"
 
 
 def test_describe_is_strict_json():
