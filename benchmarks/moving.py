@@ -170,12 +170,13 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
     first = float(sequence.timestamps[0])
     world_T_first = truth.interpolate(sequence.timestamps[:1], max_gap=np.inf)[0][0]
     poses: dict[float, np.ndarray] = {first: np.eye(4)}
+    wrong: list[bool] = []
 
     def on_step(step: Step) -> None:
         poses[step.timestamp] = step.world_T_camera
         if score is None:
             return
-        count(score, is_wrong(step, poses, truth), step.alignment.status != 0)
+        wrong.append(is_wrong(step, poses, truth))
         labels = sequence.part_labels(step.index)
         masks = {body.number: body.mask for body in step.bodies}
         bodies = {body.number: body for body in step.bodies}
@@ -188,6 +189,9 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
                 score.rotations_deg += [] if turned is None else [turned]
 
     steps = track_visibly(label, sequence, odometry, on_step).steps
+    if score is not None:
+        for is_off, step in zip(wrong, steps, strict=True):
+            count(score, is_off, step.alignment.status != 0)
     return trajectory_of(first, steps)
 
 
