@@ -31,6 +31,7 @@ from gavo_jax.datasets.files import open_pair
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
 from gavo_jax.odometry.driver import Step, track
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory, inverse
@@ -312,7 +313,7 @@ def drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> floa
 
 def follow(sequence: Any, contender: common.Contender, seed: int) -> tuple[list[Step], Trajectory]:
     """Steps and trajectory of one run."""
-    steps = list(track(sequence, odometry=contender.make(sequence.camera, seed)))
+    steps = revised(track(sequence, odometry=contender.make(sequence.camera, seed)))
     return steps, trajectory_of(float(sequence.timestamps[0]), steps)
 
 
