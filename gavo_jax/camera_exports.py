@@ -62,6 +62,8 @@ def sdk_distortion(whose: str, model: Any, coefficients: Any, table: Table) -> l
         return []
     if name not in LENSES:
         raise GavoError(f"{whose} lens model is {name[:60]}: not one of none, {', '.join(LENSES)}")
+    if k.shape != (5,) or not np.all(np.isfinite([*k, table["fx"], table["fy"]])) or 0 in (table["fx"], table["fy"]):
+        raise GavoError(f"{whose} lens model needs a focal length that is not 0, and five finite coefficients")
     u, v = np.meshgrid(np.linspace(0, table["width"] - 1, GRID), np.linspace(0, table["height"] - 1, GRID))
     (x, y), seen = LENSES[name]((u - table["cx"]) / table["fx"], (v - table["cy"]) / table["fy"], k)
     columns = [np.stack(_brown(x, y, unit)) - np.stack([x, y]) for unit in np.eye(5)]
@@ -83,6 +85,10 @@ def read_realsense(path: Path, values: Table) -> Table:
     return {**table, **({"distortion": lens} if lens else {})}
 
 
+NERF_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
+"""Of a camera in NeRF's transforms, where each frame has its own."""
+
+
 def is_nerfstudio(values: Table) -> bool:
     """Whether a file has the names of NeRF's transforms."""
     return "fl_x" in values or isinstance(values.get("frames"), list)
@@ -91,7 +97,7 @@ def is_nerfstudio(values: Table) -> bool:
 def read_nerfstudio(path: Path, values: Table) -> Table:
     """Looks like NeRF's transforms."""
     if "fl_x" not in values and values["frames"]:
-        own = [{key: frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")} for frame in values["frames"]]
+        own = [{key: frame[key] for key in NERF_KEYS if key in frame} for frame in values["frames"]]
         if any(camera != own[0] for camera in own):
             raise GavoError(f"{path}: each frame has a camera of its own: write the one of most as a camera file")
         values = {**own[0], **values}

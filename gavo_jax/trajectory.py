@@ -31,8 +31,11 @@ SEGMENT_COMMENT = "# segment "
 """Start of the comment line before the first pose of a segment, except the first."""
 
 
-W_FIRST = re.compile(r"^#.*\bq\w*w\b.*\bq\w*x\b", re.MULTILINE | re.IGNORECASE)
-"""A comment that names the columns, as EuRoC's does: w before x."""
+_APART = r"[^\w\n]+"
+W_FIRST = re.compile(
+    rf"^#.*\bq\w*w{_APART}q\w*x{_APART}q\w*y{_APART}q\w*z[^\w\n]*$", re.MULTILINE | re.IGNORECASE | re.ASCII
+)
+"""A comment that ends with the names of the last columns, as EuRoC's does: w before x."""
 
 
 def segment_comment(segment: int, before: float, after: float) -> str:

@@ -267,7 +267,15 @@ FAULTS = {
     "open3d list.json": ("[1, 2]", "not a camera file"),
     "realsense ftheta.json": (json.dumps({**REALSENSE, "model": "ftheta", "coeffs": RADTAN}), "the lens model is fth"),
     "realsense short.json": (json.dumps({"ppx": 3}), "RealSense's SDK. Its entry 'fx' is missing"),
-    "realsense of two.json": (json.dumps({**REALSENSE, "coeffs": [1.0, 2.0]}), "RealSense's SDK. Entries are missing"),
+    "realsense of two.json": (json.dumps({**REALSENSE, "coeffs": [1.0, 2.0]}), "and five finite coefficients"),
+    "realsense of 0.json": (
+        json.dumps({**REALSENSE, "fx": 0, "coeffs": [0.1] * 5}),
+        "needs a focal length that is not 0",
+    ),
+    "transforms of lenses.json": (
+        json.dumps({"frames": [NERF, {**NERF, "k1": 0.2}]}),
+        "each frame has a camera of its",
+    ),
     "transforms of many.json": (json.dumps({"frames": [NERF, {**NERF, "fl_x": 3}]}), "each frame has a camera of its"),
     "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
     "transforms round.json": (json.dumps({**NERF, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),

@@ -1,5 +1,7 @@
 """Trajectory files, interpolation and association."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from evo.tools import file_interface
@@ -242,3 +244,20 @@ def test_association_takes_the_nearest_first_and_excludes_the_limit():
 def test_inverse_undoes():
     world_T_camera = random_trajectory(5, 3).world_T_camera
     np.testing.assert_allclose(inverse(world_T_camera) @ world_T_camera, np.tile(np.eye(4), (5, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("comment", "w_first"),
+    [
+        ("#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []", True),
+        ("# t x y z qw qx qy qz", True),
+        ("# converted from (qw qx qy qz): timestamp tx ty tz qx qy qz qw", False),
+        ("# qw is last: qx qy qz qw", False),
+    ],
+)
+def test_a_comment_that_ends_with_the_names_of_columns_says_where_w_stands(
+    tmp_path: Path, comment: str, w_first: bool
+) -> None:
+    (tmp_path / "poses.txt").write_text(f"{comment}\n0.0 0 0 0 0 0 0 1\n")
+    turned = np.diag([-1.0, -1.0, 1.0]) if w_first else np.eye(3)
+    np.testing.assert_allclose(Trajectory.read_tum(tmp_path / "poses.txt").world_T_camera[0, :3, :3], turned)

@@ -205,7 +205,8 @@ class WithRival:
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
         unknown = max(open_for - int(rival.age) - 1, 0)
         taken = other._replace(state=self._alone(other.state, open_after), result=result, unknown=unknown)
-        return mistrusted(taken._replace(revises=unknown + int(rival.age)))
+        parted = int(rival.age) == 0 or _exceeds(_between(rival.first_T_anchor, rival.rival_T_anchor), TOGETHER)
+        return mistrusted(taken._replace(revises=(unknown + int(rival.age)) * parted))
 
     @cached_property
     def _nobody(self) -> Rival:

@@ -10,12 +10,19 @@ from gavo_jax.cli.options import Evaluate
 from gavo_jax.datasets.names import INTERVALS
 from gavo_jax.datasets.truth import counted_in
 from gavo_jax.errors import GavoError
-from gavo_jax.evaluation import ErrorSeries, absolute_trajectory_error, distance_error, is_w_first, relative_pose_error
+from gavo_jax.evaluation import (
+    MAX_DIFFERENCE,
+    ErrorSeries,
+    absolute_trajectory_error,
+    distance_error,
+    is_w_first,
+    relative_pose_error,
+)
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import prepare_folder
 from gavo_jax.output.screen import number, print_table, say, waiting
-from gavo_jax.trajectory import Trajectory
+from gavo_jax.trajectory import Trajectory, associate
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """What stamps count instead of seconds."""
@@ -29,7 +36,7 @@ def evaluate(options: Evaluate) -> int:
     if options.plot is not None and not plots.available():
         raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
     paths = options.estimate, options.groundtruth
-    (estimate, *_), (truth, *_) = read = [_read(path) for path in paths]
+    (estimate, *_), (truth, *_) = read = _read(*paths)
     try:
         _check_units(estimate.timestamps, truth.timestamps)
         relative = relative_pose_error(estimate, truth, options.delta, options.unit)
@@ -63,11 +70,17 @@ def evaluate(options: Evaluate) -> int:
     return 0
 
 
-def _read(path: Path) -> tuple[Trajectory, float]:
-    """A trajectory with stamps in seconds, and the seconds of what they count in the file."""
-    trajectory = Trajectory.read_tum(path)
-    unit = counted_in(trajectory)
-    return replace(trajectory, timestamps=unit * trajectory.timestamps), unit
+def _read(*paths: Path) -> list[tuple[Trajectory, float]]:
+    """Trajectories with stamps in seconds, and the seconds of what they count in the files: where most of the stamps of
+    two files are alike as they stand, they count the same.
+    """
+    written = [Trajectory.read_tum(path) for path in paths]
+    units = [counted_in(one) for one in written]
+    first, second = (one.timestamps for one in written)
+    alike = len(associate(first, second, MAX_DIFFERENCE)[0])
+    if units[0] != units[1] and 2 * alike > min(len(first), len(second)):
+        units = [1.0, 1.0]
+    return [(replace(one, timestamps=unit * one.timestamps), unit) for one, unit in zip(written, units, strict=True)]
 
 
 def _check_units(estimate: np.ndarray, truth: np.ndarray) -> None:

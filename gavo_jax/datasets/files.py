@@ -225,16 +225,35 @@ class FileSequence:
 CAMERA_FILES = (
     *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
     *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
-    *("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt", "camera_matrix.csv", "transforms.json"),
-    *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
-    "calibration.json",
+    *("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt"),
 )
 """Names by which a camera file in a folder, or in the one above, is known."""
+
+EXPORTED_CAMERA_FILES = (
+    *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
+    *("calibration.json", "camera_matrix.csv", "transforms.json"),
+)
+"""Names that other programs give their cameras, which may be estimates: asked where nothing else tells the camera."""
 
 
 def own_camera_file(folder: Path) -> Path | None:
     """The camera file that lies in a folder, if one does."""
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calibration:
+    """The preset that a folder's name speaks of, else a camera that another program has exported to it.
+
+    Raises:
+        GavoError: there is neither, or the file cannot be read.
+    """
+    try:
+        return preset_by_name(folder)
+    except GavoError:
+        file = next((folder / name for name in EXPORTED_CAMERA_FILES if (folder / name).is_file()), None)
+        if file is None:
+            raise
+    return load(file)
 
 
 def preset_by_name(folder: Path) -> Calibration:

@@ -21,7 +21,7 @@ from gavo_jax.datasets.files import (
     FileSequence,
     Reading,
     own_camera_file,
-    preset_by_name,
+    preset_or_export,
     resolve_folder,
     size_of_most,
 )
@@ -237,10 +237,9 @@ class PlainFolder(FileSequence):
         Raises:
             GavoError: there is none.
         """
+        load = partial(load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES)
         file = own_camera_file(path) or own_camera_file(path.parent)
-        if file is None:
-            return preset_by_name(path)
-        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
+        return preset_or_export(path, load) if file is None else load(file)
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:

@@ -35,6 +35,9 @@ MOST_DIGITS = 15
 FEWEST = 10
 """Images of each kind, numbered without a gap, of which it is told that the two count from different numbers."""
 
+FEWEST_OF_A_CLOCK = 6
+"""Stamps that can be even by more than chance."""
+
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)(?:[.,_-](\d{3,9}))?$"
 )
@@ -179,11 +182,13 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
 def filled_in(numbers: Sequence[str]) -> list[float]:
     """Numbers with decimals as seconds, with zeros filled in where they are missing after the point, see `_with_zeros`.
 
-    They are where this makes a clock and, as elsewhere zeros are missing at the end, some of the numbers end in one.
+    They are where this makes a clock of enough numbers and, as elsewhere zeros are missing at the end, some of them end
+    in one.
     """
     seconds, filled = [float(number) for number in numbers], _with_zeros(numbers)
-    is_cut = not any(re.search(r"\.\d+0$", number) for number in numbers)
-    return filled if not is_cut and _even_share(filled) > max(MOST_STEPS, _even_share(seconds)) else seconds
+    if len(numbers) < FEWEST_OF_A_CLOCK or not any(re.search(r"\.\d+0$", number) for number in numbers):
+        return seconds
+    return filled if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)) else seconds
 
 
 def _with_zeros(numbers: Sequence[str]) -> list[float]:

@@ -1,6 +1,7 @@
 """What libraries of images say past Python, on standard error and output, kept from there and handed to who asks."""
 
 import contextlib
+import errno
 import io
 import os
 import tempfile
@@ -49,14 +50,26 @@ def without_lines(*words: str) -> Iterator[list[str]]:
     """
     left_out: list[str] = []
     with _ASIDE:
-        said, kept = _notes(), None
-        with contextlib.suppress(OSError):  # there may be no standard error
-            kept = os.dup(2)
-        os.dup2(said, 2)
         try:
+            said, kept = _notes(), _standard_error()
+        except OSError:  # no descriptors are left: nothing is put aside
+            yield left_out
+            return
+        try:
+            os.dup2(said, 2)
             yield left_out
         finally:
             _restore(kept, said, words, left_out)
+
+
+def _standard_error() -> int | None:
+    """Another descriptor of it; None where it is closed."""
+    try:
+        return os.dup(2)
+    except OSError as error:
+        if error.errno == errno.EBADF:
+            return None
+        raise
 
 
 @cache

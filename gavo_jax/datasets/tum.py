@@ -20,7 +20,7 @@ from gavo_jax.datasets.files import (
     FileSequence,
     Reading,
     own_camera_file,
-    preset_by_name,
+    preset_or_export,
     resolve_folder,
     size_of_most,
 )
@@ -140,8 +140,9 @@ class TumSequence(FileSequence):
 
 def _own_calibration(folder: Path, entries: list[Entry]) -> Calibration:
     """The camera file in the folder, else the preset that its name speaks of."""
+    load = partial(load_calibration, size=partial(size_of_most, entries))
     file = own_camera_file(folder)
-    return preset_by_name(folder) if file is None else load_calibration(file, partial(size_of_most, entries))
+    return preset_or_export(folder, load) if file is None else load(file)
 
 
 class _Row(NamedTuple):

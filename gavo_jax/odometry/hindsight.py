@@ -1,6 +1,6 @@
 """What is known of earlier pairs only later: that they followed a body."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from gavo_jax.alignment.judgement import UNKNOWN
@@ -18,12 +18,24 @@ def revised(steps: Iterable[Step]) -> list[Step]:
         steps: As the driver made them, one after the other; revising them again changes nothing.
     """
     whole = list(steps)
-    for place, step in enumerate(list(whole)):
-        for earlier in range(max(place - step.revises, 0), place):
-            whole[earlier] = whole[earlier] if whole[earlier].lost else _of_a_body(whole[earlier])
+    for place in taken_back(whole):
+        result = with_finding(whole[place].alignment, AlignmentStatus.MOVING_BODY)
+        whole[place] = replace(whole[place], alignment=result._replace(covariance=UNKNOWN))
     return whole
 
 
-def _of_a_body(step: Step) -> Step:
-    result = with_finding(step.alignment, AlignmentStatus.MOVING_BODY)
-    return replace(step, alignment=result._replace(covariance=UNKNOWN))
+def taken_back(steps: Sequence[Step]) -> list[int]:
+    """Places, in a list of steps, of those that a later one revises.
+
+    A step revises so many frames that became the reference. Frames between them that did not, as their images were
+    doubted, do not count, and are revised as well where they are not lost.
+    """
+    places: set[int] = set()
+    for last, step in enumerate(steps):
+        place, left = last, step.revises
+        while left > 0 and place > 0:
+            left -= steps[place].reference_timestamp == steps[place - 1].timestamp
+            place -= 1
+            if not steps[place].lost:
+                places.add(place)
+    return sorted(places)

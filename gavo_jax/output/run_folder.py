@@ -213,6 +213,7 @@ class RunFolder:
         path = self.path / METRICS
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
+        self._revise()  # it may have been killed before it did
         return read_json(path)
 
     def add(self, step: Step, progress: Progress | None = None) -> None:
@@ -276,7 +277,8 @@ class RunFolder:
         if any(step.revises for step in steps):
             marks, images, progress = self._whole
             self._whole = ({name: mark for name, mark in marks.items() if name != FRAMES}, images, progress)
-            self._files.pop(FRAMES).close()
+            if FRAMES in self._files:
+                self._files.pop(FRAMES).close()
             rows = read_text(self.path / FRAMES)
             write_lines(self.path / FRAMES, with_hindsight(rows.splitlines(), revised(steps)))
 

@@ -279,6 +279,7 @@ def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation:
     both = aligner.align(aligner.start(frame), frame, CLOCK)
     assert both.usable and both.state.rival.is_there and both.result.status == AlignmentStatus.OK
     ended = aligner.align(both.state, frame, CLOCK)
+    assert ended.revises == usable, "both had parted"
     assert ended.usable == usable and not ended.state.rival.is_there, "it would have missed a frame"
     assert int(ended.state.open_for) == 2, "nobody has said whose motion either is"
     if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be

@@ -442,6 +442,16 @@ def test_evaluate_refuses_stamps_of_another_unit(gavo, tmp_path, first, whose):
     assert is_refused(gavo("evaluate", *pair), f"the stamps of the {whose} look like milliseconds", "seconds")
 
 
+def test_evaluate_takes_numbers_of_frames_for_the_same_in_both_files(gavo, tmp_path):
+    """Keyframes, of which the truth has every frame: their steps alone would be those of milliseconds."""
+    sparse, every = tmp_path / "sparse.txt", tmp_path / "every.txt"
+    row = "{} {:.3f} 0 0 0 0 0 1\n".format
+    sparse.write_text("".join(row(i, 0.01 * i) for i in (0, 12, 25, 37, 50, 62, 74, 87, 99, 112)))
+    every.write_text("".join(row(i, 0.01 * i) for i in range(140)))
+    done = gavo("evaluate", sparse, every, "--unit", "frames", "--json")
+    assert done.status == 0 and json.loads(done.out)["ate"]["count"] == 10, done.err
+
+
 def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     rows = [(i / 30, np.cos(i / 60), np.sin(i / 60) * 0.6, np.sin(i / 60) * 0.8) for i in range(60)]
     lines = {

@@ -24,7 +24,7 @@ def test_pairs_that_followed_a_body_say_so_once_it_is_seen() -> None:
     ok, high_error, body = AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.MOVING_BODY
     steps = ran(ok, ok, high_error, ok, body, ok)
     steps[3] = replace(steps[3], lost=True)
-    steps[4] = replace(steps[4], revises=3)
+    steps[4] = replace(steps[4], revises=2, reference_timestamp=3.0)
     after = revised(steps)
     assert [step.alignment.statuses for step in after] == [(ok,), (body,), (high_error, body), (ok,), (body,), (ok,)]
     assert [np.array_equal(step.alignment.covariance, UNKNOWN) for step in after] == [False, True, True] + [False] * 3
