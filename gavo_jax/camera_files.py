@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import MAX_SIDE, PRESETS, Camera
-from gavo_jax.camera_makes import MODELS, PARSERS, Table
+from gavo_jax.camera_makes import MODELS, PARSERS, PROJECTION, Table
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
@@ -41,8 +41,6 @@ CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model",
 DEVICE_KEYS = ("depth_delay",)
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
-PROJECTION = "projection_matrix"
-"""Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
 
 Size = tuple[int, int]

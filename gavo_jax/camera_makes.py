@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gavo_jax.camera_exports import is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
+from gavo_jax.camera_exports import Table, is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
-Table = dict[str, Any]
+PROJECTION = "projection_matrix"
+"""Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
 MODELS = {
     "pinhole": "pinhole",
@@ -160,7 +161,7 @@ def _read_ros(path: Path, values: Table) -> Table:
         **{key: value for key, value in sizes.items() if value is not None},
         **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
         **{key: values[key] for key in ("depth_scale", "readout") if key in values},
-        "projection_matrix": numbers(first("projection_matrix", "P", "p")),
+        PROJECTION: numbers(first(PROJECTION, "P", "p")),
     }
 
 

@@ -253,9 +253,13 @@ class RunFolder:
 
     def steps(self) -> list[Step]:
         """The steps of the run so far, as the files tell them: see `read_steps`, and with loops to all digits."""
-        self._cut()
-        steps = read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
+        steps = self._said()
         return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
+
+    def _said(self) -> list[Step]:
+        """The steps as frames.csv and the poses tell them, without what an interruption left of one."""
+        self._cut()
+        return read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
 
     def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
         """Write metrics.json, whole or not at all.
@@ -272,8 +276,7 @@ class RunFolder:
 
     def _revise(self) -> None:
         """Replace frames.csv where pairs were taken back; then it does not grow any more."""
-        self._cut()
-        steps = read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
+        steps = self._said()
         if any(step.revises for step in steps):
             marks, images, progress = self._whole
             self._whole = ({name: mark for name, mark in marks.items() if name != FRAMES}, images, progress)
