@@ -1,5 +1,6 @@
 """`gavo calibrate`: what a recording does not say of its camera, found from its images, as a camera file."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,8 @@ def calibrate(options: Calibrate) -> int:
         raise GavoError(f"{output}: no such folder: {output.parent}")
     if output.is_dir():
         raise GavoError(f"{output}: a folder: name a file for the camera")
+    if options.output is None and os.path.lexists(output):
+        raise GavoError(f"{output}: is there already: name another with --output, or say --output {output} to replace it")
     wanted: list[Wanted] = [*ALWAYS]
     if options.focal_length:
         wanted.append("focal_length")

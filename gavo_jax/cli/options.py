@@ -252,7 +252,7 @@ class Calibrate(Source):
     principal_point: bool = False
     """Find the principal point, too."""
     output: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="(default: camera.toml)")] = None
-    """The camera file, for --camera."""
+    """The camera file, for --camera. One that is there already is replaced only where it is named."""
     json: bool = False
     """Print what was found as JSON."""
 

@@ -99,6 +99,14 @@ def test_a_folder_in_the_place_of_a_file_is_refused_before_the_run(gavo, clip):
     assert is_refused(gavo("calibrate", clip), "camera.toml: a folder") and not Path("out").exists()
 
 
+def test_calibrate_replaces_no_camera_file_that_nobody_named(gavo, clip, monkeypatch):
+    """In the folder of a sequence that file may be the dataset's own."""
+    monkeypatch.chdir(clip)
+    before = Path("camera.toml").read_bytes()
+    assert is_refused(gavo("calibrate", "."), "camera.toml: is there already", "--output camera.toml")
+    assert Path("camera.toml").read_bytes() == before
+
+
 def test_inspect_says_what_a_source_is(gavo, clip):
     done = gavo("inspect", clip)
     assert done.status == 0 and not done.err
