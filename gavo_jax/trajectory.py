@@ -24,6 +24,13 @@ MAX_STAMP = 1e19
 """The same of a time stamp, which may count nanoseconds since 1970."""
 
 
+SHORTEST_QUATERNION = 1e-6
+"""Length below which a quaternion is none."""
+
+NO_POSE = "numbers that are not finite, or a zero quaternion"
+"""What a row of a trajectory holds where a tracker saw nothing."""
+
+
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
 
@@ -91,12 +98,12 @@ class Trajectory:
 
         Where a comment names the columns with qw before qx, as EuRoC's does, quaternions are read so.
         A comment of `segment_comment` starts a new segment. Rows come back in the order of their stamps; of rows with
-        equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite are left out, as
-        where a tracker lost its markers, and a `GavoWarning` says how many.
+        equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of a zero
+        quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
 
         Raises:
-            GavoError: unreadable or empty file, or a row (named as file:line) that is malformed, absurdly large or
-                without a rotation (zero quaternion); no row is finite.
+            GavoError: unreadable or empty file, or a row (named as file:line) that is malformed or absurdly large; no
+                row has a pose.
         """
         text = read_text(path)
         all_places = rows_of(text, path)
@@ -106,9 +113,9 @@ class Trajectory:
         places = [place for place, row in zip(all_places, parsed, strict=True) if row is not None]
         rows = [row for row in parsed if row is not None]
         if not rows:
-            raise GavoError(f"{all_places[0][0]}: holds a value that is not finite, as every row does")
+            raise GavoError(f"{all_places[0][0]}: no pose in it, nor in any other row: {NO_POSE}")
         if lost := len(parsed) - len(rows):
-            warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: not finite", GavoWarning, stacklevel=2)
+            warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
         breaks = [n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
         segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
@@ -300,7 +307,7 @@ def _slerp(
 
 
 def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
-    """The numbers of a row; None where they are not all finite."""
+    """The numbers of a row; None where they are no pose."""
     if len(fields) != 8:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
     try:
@@ -311,9 +318,7 @@ def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
         return None
     if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_STAMP:
         raise GavoError(f"{place}: holds an absurdly large value")
-    if math.hypot(*values[4:]) < 1e-6:
-        raise GavoError(f"{place}: its quaternion is zero, which is no rotation")
-    return values
+    return values if math.hypot(*values[4:]) >= SHORTEST_QUATERNION else None
 
 
 def _digits(value: float, decimals: int) -> str:
