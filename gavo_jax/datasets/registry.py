@@ -8,17 +8,8 @@ from typing import Protocol
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import (
-    COLOR_FOLDERS,
-    DEPTH_FOLDERS,
-    Open3DFolder,
-    PlainFolder,
-    Replica,
-    ScanNet,
-    SevenScenes,
-    missing_folder,
-    missing_images,
-)
+from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
