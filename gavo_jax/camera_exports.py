@@ -85,6 +85,42 @@ def read_realsense(path: Path, values: Table) -> Table:
     return {**table, **({"distortion": lens} if lens else {})}
 
 
+LIKE = 0.01
+"""By how much of the focal length the cameras of single frames may differ; a phone's autofocus moves it by less."""
+
+FOCUS_KEYS = ("fx", "fy", "cx", "cy", "fl_x", "fl_y")
+"""Of a camera, what its focus moves."""
+
+
+def common_camera(place: str, cameras: list[Table]) -> Table:
+    """The one camera of frames that each have their own, where these differ by no more than focus moves them.
+
+    Args:
+        place: names the file in messages.
+        cameras: of the frames, by the same keys.
+
+    Returns:
+        The median of what the focus moves, and the rest, which has to be the same.
+
+    Raises:
+        GavoError: they differ by more.
+    """
+    moved = [key for key in FOCUS_KEYS if key in cameras[0]]
+    rest = [{key: value for key, value in camera.items() if key not in moved} for camera in cameras]
+    fault = f"{place}: each frame has a camera of its own: write the one of most as a camera file"
+    if any(camera != rest[0] for camera in rest) or any(key not in camera for key in moved for camera in cameras):
+        raise GavoError(fault)
+    try:
+        table = np.array([[camera[key] for key in moved] for camera in cameras], float)
+    except (TypeError, ValueError):
+        return cameras[0]
+    middle = np.median(table, axis=0)
+    off = np.abs(table - middle).max(initial=0.0)
+    if middle.size and not off <= LIKE * middle[0]:
+        raise GavoError(f"{fault} ({moved[int(np.abs(table - middle).max(axis=0).argmax())]} differs by {off:.4g})")
+    return {**rest[0], **dict(zip(moved, middle.tolist(), strict=True))}
+
+
 NERF_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
 """Of a camera in NeRF's transforms, where each frame has its own."""
 
@@ -98,9 +134,7 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
     """Looks like NeRF's transforms."""
     if "fl_x" not in values and values["frames"]:
         own = [{key: frame[key] for key in NERF_KEYS if key in frame} for frame in values["frames"]]
-        if any(camera != own[0] for camera in own):
-            raise GavoError(f"{path}: each frame has a camera of its own: write the one of most as a camera file")
-        values = {**own[0], **values}
+        values = {**common_camera(str(path), own), **values}
     size = {ours: _whole(values[theirs]) for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
     model = values.get("camera_model", "OPENCV")

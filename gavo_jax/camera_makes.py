@@ -155,7 +155,7 @@ def _read_ros(path: Path, values: Table) -> Table:
     def numbers(entry: Any) -> list[Any]:
         return list(entry["data"] if isinstance(entry, dict) else entry or [])
 
-    sizes = {"width": first("image_width", "width"), "height": first("image_height", "height")}
+    sizes = {"width": first("image_width", "width", "w"), "height": first("image_height", "height", "h")}
     return {
         **of_matrix(str(path), numbers(first("camera_matrix", "K", "k"))),
         **{key: value for key, value in sizes.items() if value is not None},

@@ -10,6 +10,7 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.depth_unit import KINECT_STEP
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+from gavo_jax.trajectory import quaternion_from_rotation
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 ROOM = SyntheticSequence(frames=4, camera=CAMERA)
@@ -17,6 +18,8 @@ GREYS, DEPTHS = [frame.grey for frame in ROOM], [frame.depth for frame in ROOM]
 METRES = [depth / CAMERA.depth_scale for depth in DEPTHS]
 assert ROOM.ground_truth is not None
 POSES = ROOM.ground_truth.interpolate(ROOM.timestamps)[0]
+STRAY_STAMPS = [round(9000.5 + i / 60, 6) for i in range(4)]
+ARKIT_STAMPS = [f"{4097.9 + i / 30:.3f}" for i in range(4)]
 MATRIX = np.array([[131.0, 0, 79.5], [0, 131.0, 59.5], [0, 0, 1]])
 
 
@@ -94,6 +97,46 @@ def one_folder(folder: Path) -> None:
     (folder / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
 
 
+def stray(folder: Path) -> None:
+    """As Stray Scanner leaves it, at 60 Hz; the film's frames written at depth's size, its camera that of the film."""
+    film = np.array([[12 * 131.0, 0, 959.5], [0, 12 * 131.0, 719.5], [0, 0, 1]])
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"rgb/{i:06}.png", grey)
+        image(folder / f"depth/{i:06}.png", raw(metres, 1000))
+        numbers = [*pose[:3, 3], *quaternion_from_rotation(pose[:3, :3])]
+        rows.append(f"{STRAY_STAMPS[i]}, {i:06}, {', '.join(map(str, numbers))}")
+    np.savetxt(folder / "camera_matrix.csv", film, delimiter=", ")
+    (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
+
+
+def arkit_scenes(folder: Path) -> None:
+    """Poses are axis, angle and shift of the world into the camera; each frame has its camera."""
+    rows = []
+    for stamp, grey, metres, pose in zip(ARKIT_STAMPS, GREYS, METRES, POSES, strict=True):
+        image(folder / f"lowres_wide/41069021_{stamp}.png", grey)
+        image(folder / f"lowres_depth/41069021_{stamp}.png", raw(metres, 1000))
+        pincam = folder / f"lowres_wide_intrinsics/41069021_{stamp}.pincam"
+        pincam.parent.mkdir(exist_ok=True)
+        pincam.write_text("160 120 131 131 79.5 59.5\n")
+        camera_T_world = np.linalg.inv(pose)
+        turn = cv2.Rodrigues(camera_T_world[:3, :3])[0].ravel()
+        rows.append(" ".join(map(str, [stamp, *turn, *camera_T_world[:3, 3]])))
+    (folder / "lowres_wide.traj").write_text("\n".join(rows) + "\n")
+
+
+def nerf(folder: Path) -> None:
+    """NeRF's cameras look along -z, their y points up."""
+    frames = []
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True), 1):
+        image(folder / f"images/frame_{i:05}.png", grey)
+        image(folder / f"depths/frame_{i:05}.png", raw(metres, 1000))
+        matrix = (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+        frames.append({"file_path": f"./images/frame_{i:05}.png", "transform_matrix": matrix})
+    camera = {"fl_x": 131.0, "fl_y": 131.0, "cx": 79.5, "cy": 59.5, "w": 160, "h": 120}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames[::-1]}))
+
+
 def tum(folder: Path) -> None:
     write_tum(ROOM, folder)
 
@@ -118,5 +161,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "open3d_image": ("Open3D reconstruction folder", open3d_image),
     "plain": ("folder of colour and depth images", plain),
     "one_folder": ("folder of colour and depth images", one_folder),
+    "stray": ("scan of Stray Scanner", stray),
+    "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
+    "nerf": ("folder of colour and depth images", nerf),
 }
 """By name: what the layout is recognised as, and who writes it."""

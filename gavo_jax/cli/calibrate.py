@@ -27,7 +27,7 @@ def calibrate(options: Calibrate) -> int:
     if output.is_dir():
         raise GavoError(f"{output}: a folder: name a file for the camera")
     if options.output is None and os.path.lexists(output):
-        raise GavoError(f"{output}: is there already: name another with --output, or say --output {output} to replace it")
+        raise GavoError(f"{output}: is there already: name another file with --output, or this one to replace it")
     wanted: list[Wanted] = [*ALWAYS]
     if options.focal_length:
         wanted.append("focal_length")

@@ -28,6 +28,7 @@ from gavo_jax.datasets.files import (
 from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, nameless, stamps, unpaired
+from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
@@ -35,12 +36,15 @@ from gavo_jax.trajectory import Trajectory, associate, inverse
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
+
 class NumberedFolder(FileSequence):
     """Frames of which colour and depth have the same number; their time is that number over the rate."""
 
     kind: ClassVar[str] = "folder of numbered images"
     poses_of_depth: ClassVar[bool] = False
     """Whether the poses are those of the depth camera, where it is another than the colour camera."""
+    STAMPS: ClassVar[str] = ""
+    """The file of `stamps`."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -67,6 +71,11 @@ class NumberedFolder(FileSequence):
         return {}
 
     @classmethod
+    def stamps(cls, path: Path) -> dict[int, float]:
+        """Seconds by the numbers of frames; empty where nothing says them, so that the rate does."""
+        return {}
+
+    @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
         """Find the files and read camera and poses; no image is read, but where the camera's file lacks the size.
 
@@ -80,7 +89,15 @@ class NumberedFolder(FileSequence):
         if not numbers:
             counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
             raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
-        entries = [Entry(number / rate, found.color[number], found.depth[number]) for number in numbers]
+        times = {} if reading.rate else cls.stamps(path)
+        left_out = found.unpaired(len(numbers))
+        if times and (untimed := len(numbers) - len(times.keys() & set(numbers))):
+            left_out.append(f"{untimed} frames: no row in {cls.STAMPS}")
+        times = times or {number: number / rate for number in numbers}
+        numbers = [number for number in numbers if number in times]
+        if not numbers:
+            raise GavoError(f"{path / cls.STAMPS}: has no row of any frame that is there")
+        entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
         poses = cls.poses(path)
@@ -89,8 +106,10 @@ class NumberedFolder(FileSequence):
         if known:
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
-            truth = Trajectory(np.array(known) / rate, np.stack([poses[number] @ posed_T_color for number in known]))
-        return cls(root.name, entries, calibration, truth, reading, found.unpaired(len(numbers)))
+            truth = Trajectory(
+                np.array([times[n] for n in known]), np.stack([poses[number] @ posed_T_color for number in known])
+            )
+        return cls(root.name, entries, calibration, truth, reading, left_out)
 
 
 class SevenScenes(NumberedFolder):
@@ -242,13 +261,24 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = plain_files(path)
-        entries, left_out, times, seconds = _by_stamp(path, color, depth, reading) or _by_number(
-            path, color, depth, reading
-        )
-        own = partial(cls.calibrate, path, entries, reading)
-        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
-        truth = truth_in(path, seconds, times)
-        return cls(root.name, entries, calibration, truth, reading, left_out + unread_truth(path, truth))
+        paired = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
+        own = partial(cls.calibrate, path, paired.entries, reading)
+        calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
+        truth, unread = cls.truth(path, paired)
+        left_out = paired.left_out + unread + unread_truth(path, truth)
+        return cls(root.name, paired.entries, calibration, truth, reading, left_out)
+
+    @classmethod
+    def truth(cls, path: Path, paired: "Paired") -> tuple[Trajectory | None, list[str]]:
+        """The true trajectory that lies in the folder, if one does; why poses that lie there are none, a line each.
+
+        Raises:
+            GavoError: it cannot be read.
+        """
+        found = truth_in(path, paired.seconds, paired.times)
+        if found is not None or not (path / TRANSFORMS).is_file():
+            return found, []
+        return read_transforms(path / TRANSFORMS, {entry.color.stem: entry.stamp for entry in paired.entries})
 
 
 class Open3DFolder(PlainFolder):
@@ -282,7 +312,7 @@ def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
-class _Paired(NamedTuple):
+class Paired(NamedTuple):
     """Frames of a plain folder."""
 
     entries: list[Entry]
@@ -293,7 +323,7 @@ class _Paired(NamedTuple):
     """Times by numbers, where the names are those."""
 
 
-def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired | None:
+def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired | None:
     """Frames by the stamps that all names are; None where they are none, or the rate is said."""
     others = [file for file in (*color, *depth) if not re.search(r"\d", file.stem)]
     color, depth = ([file for file in files if re.search(r"\d", file.stem)] for files in (color, depth))
@@ -312,10 +342,10 @@ def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading
     of_frames = second.copy()
     of_frames[j] = first[i]
     times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
-    return _Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
+    return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
 
 
-def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> _Paired:
+def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired:
     """Frames by the numbers in the names."""
     found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
@@ -325,7 +355,7 @@ def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Readin
     rate = reading.rate or RATE
     entries = [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers]
     times = {n: n / rate for n in found.depth}
-    return _Paired(entries, found.unpaired(len(numbers)), times, lambda counts: counts / rate)
+    return Paired(entries, found.unpaired(len(numbers)), times, lambda counts: counts / rate)
 
 
 def _millimetres(calibration: Calibration) -> Calibration:

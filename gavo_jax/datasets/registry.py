@@ -10,6 +10,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images
+from gavo_jax.datasets.phones import ArkitScenes, StrayScan
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -37,6 +38,7 @@ RECORDINGS = {
     ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
     ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
     ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
+    ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
     ".klg": "a log of ElasticFusion's logger: write its images and depth first",
 }
 """What holds a source in a form of its maker's alone."""
@@ -68,7 +70,9 @@ class Dataset(Protocol):
         ...
 
 
-BUILT_IN: tuple[Dataset, ...] = (TumSequence, SevenScenes, ScanNet, Replica, BagSequence, Open3DFolder, PlainFolder)
+BUILT_IN: tuple[Dataset, ...] = (
+    *(TumSequence, SevenScenes, ScanNet, Replica, BagSequence, StrayScan, ArkitScenes, Open3DFolder, PlainFolder),
+)
 """In the order in which they are asked."""
 
 TOPICS = {"--colour-topic", "--depth-topic"}
@@ -173,6 +177,8 @@ def _contents(path: Path) -> str:
         return f"no source itself, but a folder of {names}"
     if (words := missing_images(path)) is not None:
         return words
+    if stereo := next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data").is_dir()), None):
+        return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
     if film := next((child for child in inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None):
         return f"{film.name}: {_inside(film)}"
     if source := source_around(path):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command import runner
-from layouts import CAMERA, GREYS, LAYOUTS, METRES, image, raw
+from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, image, raw
 from recordings import COLOR, DEPTH, Recorder, Shot, record
 
 SHOTS = [
@@ -167,6 +167,30 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         lambda clip: np.savetxt(clip / "intrinsic/intrinsic_color.txt", np.zeros((4, 4))),
         ["intrinsic_color.txt: ", "matrix is zero", "--camera"],
     ),
+    "stray: frames of another size": (
+        "stray",
+        lambda clip: [image(clip / f"rgb/{i:06}.png", cv2.resize(GREYS[i], (320, 240))) for i in range(4)],
+        ["clip: colour images of 320x240", "depth of 160x120", "ffmpeg -i rgb.mp4 -vf scale=160:120 -start_number 0"],
+    ),
+    "stray: poses of other frames": (
+        "stray",
+        edit("odometry.csv", ", 0000", ", 0050"),
+        ["odometry.csv: has no row of any frame"],
+    ),
+    "stray: poses of prose": ("stray", write("odometry.csv", "up\n"), ["odometry.csv:1: expected 9 numbers"]),
+    "arkitscenes: cameras of two lenses": (
+        "arkit_scenes",
+        lambda clip: write(f"lowres_wide_intrinsics/41069021_{ARKIT_STAMPS[1]}.pincam", "160 120 140 131 79.5 59.5")(
+            clip
+        ),
+        ["lowres_wide_intrinsics: each frame has a camera of its own", "fx differs by 9"],
+    ),
+    "arkitscenes: poses of prose": (
+        "arkit_scenes",
+        write("lowres_wide.traj", "up\n"),
+        ["lowres_wide.traj:1: expected 7"],
+    ),
+    "nerf: poses of prose": ("nerf", edit("transforms.json", "0.0, 1.0", "0.0, 2.0"), ["transforms.json: frames[0]"]),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
     "replica: a list for a camera": (
@@ -297,10 +321,18 @@ def file_of(name: str, content: bytes) -> Callable[[Path], Path]:
     return make
 
 
+def euroc(path: Path) -> Path:
+    for camera in ("cam0", "cam1"):
+        image(path / f"room/mav0/{camera}/data/1403636579763555584.png", GREYS[0])
+    return path / "room"
+
+
 OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "nowhere": (lambda path: path / "nowhere", ["nowhere", "no such folder or file", "synthetic"]),
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
     "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
+    "record3d": (file_of("walk.r3d", b"PK"), ["walk.r3d", "Record3D", "EXR + RGB"]),
+    "euroc": (euroc, ["mav0/cam0: a recording as EuRoC has it", "without depth"]),
     "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
     "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),
     "bag: torn": (torn_bag, ["x.bag"]),

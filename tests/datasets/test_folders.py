@@ -9,7 +9,20 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, MATRIX, METRES, POSES, image, kinect, raw
+from layouts import (
+    ARKIT_STAMPS,
+    CAMERA,
+    DEPTHS,
+    GREYS,
+    LAYOUTS,
+    MATRIX,
+    METRES,
+    POSES,
+    STRAY_STAMPS,
+    image,
+    kinect,
+    raw,
+)
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files import load_calibration
@@ -44,8 +57,11 @@ def test_every_layout_gives_the_same_frames(folder, name):
     assert sequence.name == "clip" and len(sequence) == 4
     camera = sequence.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (131, 131, 79.5, 59.5, 160, 120)
-    first = 1 / 30 if "open3d" in name else 0.0
-    np.testing.assert_allclose(sequence.timestamps - first, np.arange(4) / 30, atol=1e-6)
+    first = {"stray": STRAY_STAMPS[0], "arkit_scenes": float(ARKIT_STAMPS[0]), "nerf": 1 / 30}.get(name, 0.0)
+    first = 1 / 30 if "open3d" in name else first
+    expected = np.arange(4) / (60 if name == "stray" else 30)
+    tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
+    np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
     for i, frame in enumerate(sequence):
         assert isinstance(frame, Frame)
         lossy = name in ("scannet", "replica", "open3d", "open3d_image")
@@ -105,12 +121,13 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
         load_calibration(tmp_path / "k.txt", (640, 480))
 
 
-@pytest.mark.parametrize("name", ["seven_scenes", "replica", "scannet"])
+@pytest.mark.parametrize("name", ["seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf"])
 def test_poses_are_the_truth(folder, name):
-    truth = open_source(wrote(folder, name)).ground_truth
+    sequence = open_source(wrote(folder, name))
+    truth = sequence.ground_truth
     assert truth is not None
     kept = [0, 1, 3] if name == "scannet" else [0, 1, 2, 3]
-    np.testing.assert_allclose(truth.timestamps, np.array(kept) / 30)
+    np.testing.assert_array_equal(truth.timestamps, sequence.timestamps[kept])
     np.testing.assert_allclose(truth.world_T_camera, POSES[kept], atol=1e-6)
 
 

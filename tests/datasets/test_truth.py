@@ -1,11 +1,12 @@
 """The true trajectory that lies beside the frames, in every form that a dataset has it."""
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, image, raw
+from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, STRAY_STAMPS, image, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.files import Reading
@@ -245,4 +246,64 @@ def test_what_is_no_pose_is_refused_in_every_dataset(tmp_path, layout, fault):
     else:
         np.savetxt(tmp_path / ("frame-000001.pose.txt" if layout == "seven_scenes" else "pose/1.txt"), pose)
     with pytest.raises(GavoError, match=r"(traj\.txt:2|pose\.txt|pose/1\.txt): the pose is no rotation and shift"):
+        open_source(tmp_path)
+
+
+def test_frames_of_a_phone_have_its_stamps_unless_the_rate_is_said(tmp_path):
+    """Frames without a row have none, and are left out."""
+    LAYOUTS["stray"][1](tmp_path)
+    rows = (tmp_path / "odometry.csv").read_text().splitlines()
+    (tmp_path / "odometry.csv").write_text("\n".join(rows[:2] + rows[3:]))
+    sequence = open_source(tmp_path)
+    np.testing.assert_allclose(sequence.timestamps, np.array(STRAY_STAMPS)[[0, 2, 3]])
+    assert left_out(sequence) == ["1 frames: no row in odometry.csv"]
+    np.testing.assert_allclose(open_source(tmp_path, Reading(rate=10.0)).timestamps, np.arange(4) / 10)
+
+
+def test_a_phones_first_poses_had_no_stamps(tmp_path):
+    LAYOUTS["stray"][1](tmp_path)
+    rows = [row.split(",")[2:] for row in (tmp_path / "odometry.csv").read_text().splitlines()[1:]]
+    (tmp_path / "odometry.csv").write_text("\n".join(map(",".join, rows)))
+    truth = truth_of(tmp_path)
+    np.testing.assert_allclose(truth.timestamps, np.arange(4) / 30)
+    np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
+
+
+@pytest.mark.parametrize(("text", "fault"), [("", "holds no trajectory"), ("1, 2, 3\n", "odometry.csv:1: expected 9")])
+def test_faulty_poses_of_a_phone_are_refused(tmp_path, text, fault):
+    LAYOUTS["stray"][1](tmp_path)
+    (tmp_path / "odometry.csv").write_text(text)
+    with pytest.raises(GavoError, match=fault):
+        open_source(tmp_path)
+
+
+def change_transforms(folder: Path, **entries: object) -> None:
+    path = folder / "transforms.json"
+    values = json.loads(path.read_text())
+    for frame in values["frames"]:
+        frame |= entries
+    path.write_text(json.dumps(values))
+
+
+def test_poses_of_structure_from_motion_are_no_truth(tmp_path):
+    """How long their unit is, is open."""
+    LAYOUTS["nerf"][1](tmp_path)
+    change_transforms(tmp_path, colmap_im_id=3)
+    sequence = open_source(tmp_path)
+    assert sequence.ground_truth is None
+    assert left_out(sequence) == ["transforms.json: its poses are of structure from motion, whose unit is open"]
+
+
+def test_poses_of_other_images_are_told(tmp_path):
+    LAYOUTS["nerf"][1](tmp_path)
+    change_transforms(tmp_path, file_path="train/r_0")
+    sequence = open_source(tmp_path)
+    assert sequence.ground_truth is None
+    assert left_out(sequence) == ["transforms.json: its poses are of none of these images"]
+
+
+def test_no_pose_of_nerf_is_refused_with_its_place(tmp_path):
+    LAYOUTS["nerf"][1](tmp_path)
+    change_transforms(tmp_path, transform_matrix=[[3.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]])
+    with pytest.raises(GavoError, match=r"transforms\.json: frames\[0\]: the pose is no rotation and shift"):
         open_source(tmp_path)

@@ -1,0 +1,66 @@
+"""Poses in NeRF's `transforms.json`, as nerfstudio, Polycam's converters and others write it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.camera_files import MAX_JSON_BYTES
+from gavo_jax.datasets.truth import pose_of
+from gavo_jax.errors import GavoError, read_text
+from gavo_jax.trajectory import Trajectory
+
+TRANSFORMS = "transforms.json"
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From our camera's axes to NeRF's: its y points up, and it looks along -z."""
+
+WITHOUT_SCALE = ("colmap_im_id", "sharpness", "colmap_pose")
+"""Of frames whose poses structure from motion made: how long its unit is, is open."""
+
+
+def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory | None, list[str]]:
+    """The poses of images, world_T_camera.
+
+    Args:
+        path: the file.
+        stamps: seconds of each image, by its name without the ending.
+
+    Returns:
+        The poses; or None, and a line that says why: they are of none of these images, or their unit is open
+        (`WITHOUT_SCALE`). None and no line where the file has no poses.
+
+    Raises:
+        GavoError: no JSON, or a pose that is none.
+    """
+    frames = [(at, frame) for at, frame in enumerate(_frames(path)) if "transform_matrix" in frame]
+    if any(key in frame for _, frame in frames for key in WITHOUT_SCALE):
+        return None, [f"{path.name}: its poses are of structure from motion, whose unit is open"]
+    poses: dict[float, np.ndarray] = {}
+    for at, frame in frames:
+        stamp = stamps.get(PureWindowsPath(str(frame.get("file_path"))).stem)
+        pose = pose_of(f"{path}: frames[{at}]", _fields(frame["transform_matrix"]))
+        if stamp is not None and pose is not None:
+            poses[stamp] = pose @ FLIP
+    if not poses:
+        return None, [f"{path.name}: its poses are of none of these images"] if frames else []
+    times = sorted(poses)
+    return Trajectory(np.array(times), np.stack([poses[time] for time in times])), []
+
+
+def _frames(path: Path) -> list[dict[str, Any]]:
+    try:
+        values = json.loads(read_text(path, MAX_JSON_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise error if isinstance(error, GavoError) else GavoError(f"{path}: not JSON: {error}") from None
+    frames = values.get("frames") if isinstance(values, dict) else None
+    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+
+
+def _fields(matrix: Any) -> list[str]:
+    """Sixteen numbers as text; the last row may be left out."""
+    rows = matrix if isinstance(matrix, list) else [matrix]
+    fields = [str(value) for row in rows for value in (row if isinstance(row, list) else [row])]
+    return fields + ["0", "0", "0", "1"] * (len(fields) == 12)

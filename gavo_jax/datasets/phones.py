@@ -1,0 +1,175 @@
+"""Scans of phones: Stray Scanner's folders, and ARKitScenes."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_exports import common_camera
+from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.datasets.assembly import MILLIMETRES
+from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.folders import NumberedFolder, Paired, PlainFolder
+from gavo_jax.datasets.image_folders import plain_files
+from gavo_jax.datasets.images import read_depth
+from gavo_jax.datasets.names import Found, by_number
+from gavo_jax.errors import GavoError, data_rows, number
+from gavo_jax.trajectory import Trajectory, inverse, rotation_from_quaternion
+
+
+class StrayScan(NumberedFolder):
+    """A scan of the app Stray Scanner, once the frames of its film are images: `rgb/`, `depth/`, `odometry.csv`.
+
+    Depth is registered to colour, in millimetres. `odometry.csv` has a stamp and a pose for each frame, by its number:
+    of a camera whose y points down, as ours. Older versions wrote poses alone.
+    """
+
+    kind: ClassVar[str] = "scan of Stray Scanner"
+    STAMPS: ClassVar[str] = "odometry.csv"
+    MATRIX: ClassVar[str] = "camera_matrix.csv"
+    FILM: ClassVar[tuple[int, int]] = (1920, 1440)
+    """Pixels, of which the camera matrix is."""
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By its own files, beside images."""
+        return all((path / name).is_file() for name in (cls.STAMPS, cls.MATRIX)) and all(plain_files(path))
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Colour lies where it was written to."""
+        return by_number(*plain_files(path))
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else the film's camera, at the size of the images."""
+        if (file := own_camera_file(path)) is not None:
+            return load_calibration(file, lambda: size_of_most(entries), MILLIMETRES)
+        width, height = size_of_most(entries)
+        cls._check_size(path, entries, width, height)
+        if width * cls.FILM[1] != height * cls.FILM[0]:
+            film = "x".join(map(str, cls.FILM))
+            raise GavoError(
+                f"{path}: images of {width}x{height}, of a film of {film}: say --camera, or do not crop them"
+            )
+        found = load_calibration(path / cls.MATRIX, cls.FILM, MILLIMETRES)
+        return replace(found, color=_at_width(found.color, width))
+
+    @classmethod
+    def _check_size(cls, path: Path, entries: Sequence[Entry], width: int, height: int) -> None:
+        """Refuse colour that is larger than depth: spread over its pixels, depth would cover a few of them."""
+        depth = entries[0].depth
+        shape = read_depth(depth).shape if depth is not None else (height, width)
+        if shape != (height, width):
+            how = f"ffmpeg -i rgb.mp4 -vf scale={shape[1]}:{shape[0]} -start_number 0 rgb/%06d.png"
+            sizes = f"colour images of {width}x{height}, depth of {shape[1]}x{shape[0]}"
+            raise GavoError(f"{path}: {sizes}: write them at that size ({how})")
+
+    @classmethod
+    def stamps(cls, path: Path) -> dict[int, float]:
+        """The column of stamps, where there is one."""
+        return {n: stamp for n, (stamp, _) in _odometry(path / cls.STAMPS).items() if stamp is not None}
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """What ARKit found."""
+        return {n: pose for n, (_, pose) in _odometry(path / cls.STAMPS).items()}
+
+
+class ArkitScenes(PlainFolder):
+    """A scan of ARKitScenes (Baruch et al. 2021): `lowres_wide/`, `lowres_depth/`, a camera for each frame, poses.
+
+    A row of `lowres_wide.traj` is a stamp, the turn as axis times angle and the shift of the world into the camera.
+    """
+
+    kind: ClassVar[str] = "scan of ARKitScenes"
+    scale_is_open: ClassVar[bool] = False
+    CAMERAS: ClassVar[str] = "lowres_wide_intrinsics"
+    POSES: ClassVar[str] = "lowres_wide.traj"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the cameras beside the images."""
+        return (path / cls.CAMERAS).is_dir() and (path / "lowres_wide").is_dir() and super().recognises(path)
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else what the frames' cameras have in common."""
+        files = sorted((path / cls.CAMERAS).glob("*.pincam"))
+        if own_camera_file(path) is not None or not files:
+            return super().calibrate(path, entries, reading)
+        cameras = [load_calibration(file).color for file in files]
+        found = common_camera(str(path / cls.CAMERAS), [_numbers(camera) for camera in cameras])
+        camera = replace(cameras[0], **found, depth_scale=MILLIMETRES)
+        return Calibration(camera, origin=f"{path / cls.CAMERAS}, the median of {len(files)}", states_depth_scale=False)
+
+    @classmethod
+    def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
+        """What ARKit found, unless a better one lies there."""
+        found, unread = super().truth(path, paired)
+        if found is not None or not (path / cls.POSES).is_file():
+            return found, unread
+        return _read_turns(path / cls.POSES), []
+
+
+def _at_width(camera: Camera, width: int) -> Camera:
+    """The camera of the same images at another size; pixel centres are whole numbers."""
+    share = width / camera.width
+    cx, cy = (share * (middle + 0.5) - 0.5 for middle in (camera.cx, camera.cy))
+    size = {"width": width, "height": round(share * camera.height)}
+    return replace(camera, fx=share * camera.fx, fy=share * camera.fy, cx=cx, cy=cy, **size)
+
+
+def _numbers(camera: Camera) -> dict[str, float]:
+    return {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
+
+
+def _numbered(place: str, fields: list[str], count: int) -> list[float] | None:
+    """The numbers of a row; None where they are not all finite.
+
+    Raises:
+        GavoError: there are not so many, or it is text.
+    """
+    try:
+        values = [number(field) for field in fields]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise GavoError(f"{place}: expected {count} numbers, found {' '.join(fields)[:60]!r}")
+    return values if np.isfinite(values).all() else None
+
+
+def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
+    """Stamps and poses by the numbers of frames; the first line may name the columns."""
+    rows, found = data_rows(path), {}
+    if rows and "qx" in rows[0][1]:
+        rows = rows[1:]
+    for at, (place, fields) in enumerate(rows):
+        is_bare = len(fields) == 7
+        values = _numbered(place, fields, 7 if is_bare else 9)
+        if values is None or np.linalg.norm(values[-4:]) < 1e-6:
+            continue
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(np.array(values[-4:])), values[-7:-4]
+        found[at if is_bare else int(values[1])] = None if is_bare else values[0], pose
+    if not found:
+        raise GavoError(f"{path}: holds no trajectory (no rows)")
+    return found
+
+
+def _read_turns(path: Path) -> Trajectory:
+    """Rows of a stamp, axis times angle and shift, camera_T_world."""
+    rows = [values for place, fields in data_rows(path) if (values := _numbered(place, fields, 7)) is not None]
+    if not rows:
+        raise GavoError(f"{path}: holds no trajectory (no rows)")
+    table = np.array(rows)
+    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    camera_T_world = np.tile(np.eye(4), (len(table), 1, 1))
+    camera_T_world[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in table[:, 1:4]]
+    camera_T_world[:, :3, 3] = table[:, 4:]
+    return Trajectory(table[:, 0], inverse(camera_T_world))
