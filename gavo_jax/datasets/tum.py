@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -239,9 +239,19 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
             raise ValueError("too long")
     except (OSError, RuntimeError, ValueError):
         raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
-    if not any(found.is_relative_to(root) for found in places):
-        raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}")
+    if not any(found.is_relative_to(root) for found in places) or PureWindowsPath(image).drive:
+        raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}: {_back(root, image)}")
     return _Row(stamp, path.parent / image, place, time)
+
+
+def _back(root: Path, image: str) -> str:
+    """What helps where a list's path is of another place: its end may be a path of this folder."""
+    parts = PurePosixPath(image).parts
+    ends = ("/".join(parts[at:]) for at in range(1, len(parts)) if ".." not in parts[at:])
+    end = next((end for end in ends if (root / end).is_file()), None)
+    if end is None:
+        return "link the images' folder into this one (ln -s), and list them by that"
+    return f"it lies here as {end[:200]}: leave {image.removesuffix(end)[:200]!r} out of the list"
 
 
 def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
