@@ -144,8 +144,14 @@ def register(method: str, settings: Settings | Solver) -> None:
 
 def methods() -> tuple[str, ...]:
     """All methods that go by a name: `METHODS`, those that were registered, those of packages that cannot be loaded."""
-    faults = faulty_plugins()
-    return (*METHODS, *_registered, *(name for name in faults if name not in (*METHODS, *_registered)))
+    known = usable_methods()
+    return (*known, *(name for name in faulty_plugins() if name not in known))
+
+
+def usable_methods() -> tuple[str, ...]:
+    """The methods that have settings: `methods()` without those of packages that cannot be loaded."""
+    faulty_plugins()
+    return (*METHODS, *_registered)
 
 
 def plugin_names() -> tuple[str, ...]:
@@ -180,7 +186,7 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         GavoError: An unknown method or preset, or a method of a package that cannot be loaded.
     """
     if method not in methods():
-        raise GavoError(f"unknown method {method!r}: not one of {', '.join(methods())}")
+        raise GavoError(f"unknown method {method!r}: not one of {', '.join(usable_methods())}")
     if method in _registered:
         if name != "default":
             raise GavoError(f"method {method!r} has no preset {name!r}, only default")

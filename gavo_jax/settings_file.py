@@ -65,7 +65,7 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
         }
     refuse_unknown(str(path), table, ("method", "preset", *ROOMS))
     method, preset = str(table.pop("method", method)), str(table.pop("preset", preset))
-    refuse_unknown(f"{path}: method", [method], presets.methods(), "name")
+    refuse_unknown_method(f"{path}: method", method)
     refuse_unknown(f"{path}: preset", [preset], presets.PRESETS, "name")
     return NamedSettings(method, preset, override(presets.preset(method, preset), flatten(str(path), table), str(path)))
 
@@ -82,8 +82,7 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     Raises:
         GavoError: It cannot be written, or holds somebody else's code.
     """
-    names = [name for name in presets.methods() if name in presets.METHODS or name not in presets.faulty_plugins()]
-    known = {type(presets.preset(name).solver): name for name in names}
+    known = {type(presets.preset(name).solver): name for name in presets.usable_methods()}
     if type(settings.solver) not in known:
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
     table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}
@@ -158,6 +157,18 @@ def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str], what: 
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
             hint = f"; did you mean {shown(near[0])}?" if near else ""
             raise GavoError(f"{place}: unknown {what} {shown(key)}{hint}")
+
+
+def refuse_unknown_method(place: str, method: str, others: Iterable[str] = ()) -> None:
+    """Raise GavoError for a name that is no method's; the nearest that is suggested can be used.
+
+    Args:
+        place: Begins the message.
+        method: The name.
+        others: Names that may stand in its place.
+    """
+    if method not in (others := tuple(others)) + presets.methods():
+        refuse_unknown(place, [method], (*presets.usable_methods(), *others), "name")
 
 
 def override(settings: Settings, values: Mapping[str, Any], place: str = "settings") -> Settings:

@@ -1,6 +1,6 @@
 """Names of methods: ours, and those of others."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -64,6 +64,32 @@ def test_a_broken_package_is_one_line_and_only_where_it_is_asked_for(monkeypatch
     assert presets.names_of(presets.preset("ga", "fast")) == ("ga", "fast")
     save_settings(tmp_path / "own.toml", presets.preset("ga"))
     assert load_settings(tmp_path / "own.toml").method == "ga"
+
+
+def test_a_method_that_cannot_be_loaded_is_no_suggestion(monkeypatch, tmp_path):
+    monkeypatch.setattr(presets, "entry_points", lambda group: [EntryPoint("gapp", "no_such_package:S", group)])
+    (tmp_path / "own.toml").write_text('method = "gap"\n')
+    with pytest.raises(GavoError, match=r"unknown name 'gap'; did you mean 'ga'\?"):
+        load_settings(tmp_path / "own.toml")
+    with pytest.raises(GavoError, match=r"not one of ga, pso, gauss-newton, adam$"):
+        presets.preset("gap")
+    (tmp_path / "own.toml").write_text('method = "gapp"\n')
+    with pytest.raises(GavoError, match="cannot be loaded"):
+        load_settings(tmp_path / "own.toml")
+
+
+def test_a_method_that_is_registered_goes_before_a_broken_package_of_its_name(monkeypatch, tmp_path):
+    """Then it is what the name stands for, and settings of it can be kept."""
+    monkeypatch.setattr(presets, "entry_points", lambda group: [EntryPoint("quick", "no_such_package:S", group)])
+
+    @dataclass(frozen=True)
+    class Own(GaussNewton):
+        """Its type tells whose it is."""
+
+    presets.register("quick", Own(iterations=(0, 0, 0, 0, 5)))
+    save_settings(tmp_path / "own.toml", presets.preset("quick"))
+    assert 'method = "quick"' in (tmp_path / "own.toml").read_text()
+    assert load_settings(tmp_path / "own.toml").settings == presets.preset("quick")
 
 
 def test_unknown_names_are_refused():

@@ -181,7 +181,9 @@ def _parse_methods(text: str, preset: str) -> list[str]:
     for name in names:
         if name not in known:
             hint = "; the preset is said once, by --preset" if name.partition(":")[0] in known else ""
-            raise GavoError(f"--methods: unknown method {name!r}: not one of {', '.join(known)}{hint}")
+            raise GavoError(
+                f"--methods: unknown method {name!r}: not one of {', '.join((*presets.usable_methods(), *PEERS))}{hint}"
+            )
         if names.count(name) > 1:
             raise GavoError(f"--methods: {name} is given twice")
         if name not in PEERS:

@@ -67,7 +67,7 @@ def choose_settings(search: Search) -> NamedSettings:
         GavoError: what is wrong with the file or with a single setting.
     """
     if search.method not in presets.methods():
-        raise GavoError(f"--method: {search.method!r} is not one of {', '.join(presets.methods())}")
+        raise GavoError(f"--method: {search.method!r} is not one of {', '.join(presets.usable_methods())}")
     if search.settings is None:
         named = NamedSettings(search.method, search.preset, presets.preset(search.method, search.preset))
     else:

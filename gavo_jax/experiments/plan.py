@@ -33,7 +33,7 @@ from gavo_jax.output.files import describe
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
-from gavo_jax.settings_file import flatten, override, refuse_unknown
+from gavo_jax.settings_file import flatten, override, refuse_unknown, refuse_unknown_method
 
 KEYS = ("name", "output", "seeds", "batch", "sequences", "methods", "ray")
 SEQUENCE_KEYS = ("path", "name", "camera", "start", "frames", "stride", "optional")
@@ -332,7 +332,7 @@ def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
 def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ...]) -> list[_Variant]:
     refuse_unknown(place, entry, METHOD_KEYS)
     method = str(entry.get("name"))
-    refuse_unknown(f"{place}: name", [method], (*presets.methods(), *PEERS), "name")
+    refuse_unknown_method(f"{place}: name", method, PEERS)
     printed = {
         text_of(place, name): real_of(f"{place}: printed.{name}", value)
         for name, value in flatten(f"{place}: printed", entry.get("printed", {})).items()

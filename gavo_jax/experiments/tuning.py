@@ -22,7 +22,7 @@ from gavo_jax.odometry.run import run_odometry
 from gavo_jax.output.files import describe, differences
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
-from gavo_jax.settings_file import flatten, override, refuse_unknown
+from gavo_jax.settings_file import flatten, override, refuse_unknown, refuse_unknown_method
 
 KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
 RANGE_KEYS = ("low", "high", "step", "log")
@@ -79,7 +79,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     name = text_of(f"{path}: name", table.get("name", path.stem))
     parts, _ = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
-    refuse_unknown(f"{path}: method", [str(method)], presets.methods(), "name")
+    refuse_unknown_method(f"{path}: method", str(method))
     refuse_unknown(f"{path}: preset", [str(preset)], PRESETS, "name")
     space = flatten(f"{path}: space", table.get("space", {}), lambda value: "low" in value or "high" in value)
     if not space:
