@@ -31,6 +31,12 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
     "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
     "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+    "bayer_rggb16": ("u2", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr16": ("u2", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2BGR),
+    "nv12": ("u1", 1, cv2.COLOR_YUV2BGR_NV12),
+    "nv21": ("u1", 1, cv2.COLOR_YUV2BGR_NV21),
     "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUYV),
@@ -39,6 +45,9 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "64FC1": ("f8", 1, None),
 }
 """Of an encoding: the number type, channels, and what makes BGR of it (None: it is, or it is depth)."""
+
+HALVED = ("nv12", "nv21")
+"""Below the rows of brightness half as many of colour, at half the width."""
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16")
 
@@ -101,7 +110,8 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
         return decode_depth(data, name)
     if len(data) < DEPTH_HEADER or not data[DEPTH_HEADER:].startswith(PNG_SIGNATURE):
         raise FrameError(
-            f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read"
+            f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read: record "
+            "that, or raw images"
         )
     _, slope, offset = struct.unpack_from("<iff", data)
     stored = decode_depth(data[DEPTH_HEADER:], name)
@@ -119,6 +129,10 @@ def _pixels(message: Any, name: str) -> np.ndarray:
     number, channels, _ = layout
     dtype = np.dtype(number).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
+    if message.encoding in HALVED:
+        if height % 2 or width % 2:
+            raise FrameError(f"{name}: {width}x{height} pixels of {message.encoding}, which needs even numbers")
+        height = height * 3 // 2
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, np.uint8)
     if min(height, width) < 1 or step < row or data.size < step * (height - 1) + row:

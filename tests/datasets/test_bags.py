@@ -22,7 +22,7 @@ from gavo_jax.datasets import bags as bags_module
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.messages import LAYOUTS, color_of, depth_of
+from gavo_jax.datasets.messages import HALVED, LAYOUTS, color_of, depth_of
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 
@@ -599,13 +599,21 @@ def test_every_encoding_of_colour_becomes_bgr(encoding):
         expected = np.full((8, 12, 3), (blue, green, red))
     elif encoding.startswith("bayer"):
         tile = np.array([{"r": red, "g": green, "b": blue}[letter] for letter in encoding[6:10]], np.uint8)
-        pixels, expected = np.tile(tile.reshape(2, 2), (4, 6)), np.full((8, 12, 3), (blue, green, red))
+        pixels, expected = np.tile(tile.reshape(2, 2).astype(number), (4, 6)), np.full((8, 12, 3), (blue, green, red))
     elif channels == 2:
         luma = (90, 128) if "yuy" in encoding else (128, 90)
         pixels, expected = np.full((8, 12, 2), luma, np.uint8), np.full((8, 12, 3), round(1.164 * (90 - 16)))
     else:
         pixels, expected = np.full((8, 12), 77, number), np.full((8, 12, 3), 77)
-    found = color_of(IMAGE, message(pixels, encoding), "x")
+    changes = {}
+    if encoding in HALVED:
+        bgr = np.full((8, 12, 3), (blue, green, red), np.uint8)
+        planar = cv2.cvtColor(bgr, cv2.COLOR_BGR2YUV_I420)
+        colors = planar[8:].reshape(2, -1)[:: 1 if encoding == "nv12" else -1]
+        pixels, expected = np.vstack([planar[:8], colors.T.reshape(4, 12)]), bgr
+        changes = {"height": 8}
+    found = color_of(IMAGE, message(pixels, encoding, **changes), "x")
+    assert found.shape == (8, 12, 3)
     assert np.abs(found[2:-2, 2:-2].astype(int) - expected[2:-2, 2:-2]).max() <= 2
 
 
@@ -630,6 +638,8 @@ def test_rows_may_be_padded_and_numbers_of_either_end():
         (color_of, IMAGE, message(PLAIN, "bgr8", height=9)),
         (color_of, IMAGE, message(PLAIN, "bgr8", step=3)),
         (color_of, IMAGE, message(PLAIN, "bgr8", height=0)),
+        (color_of, IMAGE, message(np.zeros((12, 12), np.uint8), "nv12", height=9)),
+        (color_of, IMAGE, message(np.zeros((12, 12), np.uint8), "nv12", height=10)),
         (color_of, IMAGE, message(np.zeros((4, 4), np.float32), "32FC1")),
         (depth_of, IMAGE, message(PLAIN, "bgr8")),
         (color_of, COMPRESSED, SimpleNamespace(format="jpeg", data=b"\xff\xd8\xff")),
