@@ -4,9 +4,10 @@ Tracks a clip, fuses every frame but one (by default the middle one) into a mesh
 far the left-out frame's depth, put where the run says that it was taken, lies from it. Needs the extra `[map]`.
 
     python benchmarks/map.py
-    python benchmarks/map.py --clip FOLDER --picture map.png --json map.json
+    python benchmarks/map.py --record benchmarks/records/map.toml --picture-file docs/map.png
+    python benchmarks/map.py --clip FOLDER --voxels 0.02 --json map.json
 
-On 2 cores the defaults take about a minute.
+On 2 cores the defaults take about two minutes.
 """
 
 from pathlib import Path
@@ -17,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from gavo_jax import Reading, open_source, run_odometry
+from gavo_jax import Camera, Frame, Reading, open_source, run_odometry
 from gavo_jax.output.screen import number
 from gavo_jax.scene_map import VOXEL, SceneMap, build_map, import_open3d
 from gavo_jax.trajectory import inverse
@@ -40,6 +41,14 @@ def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.nda
     rays = open3d.t.geometry.RaycastingScene()
     rays.add_triangles(tensor(scene.points.astype(np.float32)), tensor(faces))
     return rays.compute_distance(tensor(points.astype(np.float32))).numpy()
+
+
+def points_of(frame: Frame, camera: Camera, world_T_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
+    """Where a frame's depth lies in the world, metres."""
+    depth = frame.depth / camera.depth_scale
+    v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
+    points = np.asarray(camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u]))
+    return points @ world_T_camera[:3, :3].T + world_T_camera[:3, 3]
 
 
 def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -73,7 +82,7 @@ def looking_on() -> Float[np.ndarray, "4 4"]:
 def main(
     clip: str = "fr1_xyz:60",
     method: str = "ga:fast",
-    voxel: float = VOXEL,
+    voxels: str = f"{VOXEL:g},0.005",
     left_out: int | None = None,
     picture_file: Path | None = None,
     json: Path | None = None,
@@ -83,9 +92,9 @@ def main(
     Args:
         clip: see `common.open_clip`.
         method: METHOD or METHOD:PRESET.
-        voxel: side, metres.
+        voxels: sides, metres, with commas between.
         left_out: number of the frame that is no part of the map; the middle one by default.
-        picture_file: where a picture of the map of all frames is written.
+        picture_file: where a picture of the map of all frames is written, of the last voxels.
         json: file for the figures.
     """
     plain = common.open_clip(clip)
@@ -95,22 +104,22 @@ def main(
     run = run_odometry(sequence, common.preset_of(method))
     index = len(sequence) // 2 if left_out is None else left_out
     step = next(step for step in run.steps if step.index == index)
-    scene = build_map(sequence, [other for other in run.steps if other.index != index], "mesh", voxel)
-    camera, frame = sequence.camera, sequence[index]
-    depth = frame.depth / camera.depth_scale
-    v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
-    points = np.asarray(camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u]))
-    away = distances(scene, points @ step.world_T_camera[:3, :3].T + step.world_T_camera[:3, 3])
-    figures = {"median_m": float(np.median(away)), "p90_m": float(np.percentile(away, 90)), "points": len(away)}
-    rows = [
-        ("frames in the map", str(scene.frames), ""),
-        ("triangles", str(len(np.asarray(scene.triangles))), ""),
-        (f"depth of frame {index} from it, median", number(1e3 * figures["median_m"], 2), "mm"),
-        ("90th percentile", number(1e3 * figures["p90_m"], 2), "mm"),
-    ]
-    common.print_table(f"map of {clip} by {method}, voxels of {1e3 * voxel:g} mm", ("", "", "unit"), rows)
+    points = points_of(sequence[index], sequence.camera, step.world_T_camera)
+    others = [other for other in run.steps if other.index != index]
+    sides = [float(voxel) for voxel in common.names(voxels)]
+    figures: dict[str, Any] = {}
+    rows = []
+    for side in sides:
+        scene = build_map(sequence, others, "mesh", side)
+        away = 1e3 * distances(scene, points)
+        median, most = float(np.median(away)), float(np.percentile(away, 90))
+        figures[f"{side:g}"] = {"median_mm": median, "p90_mm": most, "frames": scene.frames, "points": len(away)}
+        triangles = len(np.asarray(scene.triangles))
+        rows.append((f"{1e3 * side:g} mm", number(median, 2), number(most, 2), str(scene.frames), str(triangles)))
+    columns = ("voxel", "median, mm", "90th percentile, mm", "frames", "triangles")
+    common.print_table(f"distance of frame {index} of {clip} from the map of the others, {method}", columns, rows)
     if picture_file is not None:
-        image = picture(build_map(sequence, run.steps, "mesh", voxel), looking_on())
+        image = picture(build_map(sequence, run.steps, "mesh", sides[-1]), looking_on())
         cv2.imwrite(str(picture_file), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     common.record(json, "map", figures)
     return figures
