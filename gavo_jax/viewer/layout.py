@@ -14,7 +14,7 @@ IMAGES = {
     "reference": "Reference",
     "target": "Target",
     "warped": "Target, warped",
-    "residual": "Residual (blue below, orange above)",
+    "residual": "Residual: blue is below",
 }
 """Entities below `images`, and the titles of their views."""
 
@@ -59,8 +59,9 @@ def make_blueprint() -> Blueprint:
     )
     curves = layout.Vertical(
         layout.TextDocumentView(origin="state", name="State"),
-        layout.TimeSeriesView(origin="curves/rmse", name="RMSE of the best particle (grey levels)"),
+        layout.TimeSeriesView(origin="curves/rmse", name="RMSE (grey levels)"),
         layout.TimeSeriesView(origin="curves/distance_error", name="Distance error (m)"),
+        row_shares=[4, 3, 3],
     )
     images = [layout.Spatial2DView(origin=f"images/{name}", name=title) for name, title in IMAGES.items()]
     return layout.Blueprint(

@@ -16,7 +16,7 @@ MILLIMETRES = 1e3
 """Of the search space: its particles lie millimetres apart."""
 KEY = (
     "RMSE of the best particle, in grey levels. Particles: blue is best. White: the last camera. Green star: the true "
-    "next one. Arrow: from the best particle to it. Step through a search on the time line `generation`."
+    "next one, where the arrow leads. The time line `generation` steps through."
 )
 
 
