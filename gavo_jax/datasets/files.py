@@ -19,7 +19,7 @@ from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.images import read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory
 
 SAMPLED = 3
@@ -231,7 +231,7 @@ CAMERA_FILES = (
 
 EXPORTED_CAMERA_FILES = (
     *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
-    *("calibration.json", "camera_matrix.csv", "transforms.json"),
+    *("calibration.json", "camera_matrix.csv", "transforms.json", "metadata.json"),
 )
 """Names that other programs give their cameras, which may be estimates: asked where nothing else tells the camera."""
 
@@ -250,7 +250,8 @@ def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calib
     try:
         return preset_by_name(folder)
     except GavoError:
-        file = next((folder / name for name in EXPORTED_CAMERA_FILES if (folder / name).is_file()), None)
+        files = (folder / name for name in EXPORTED_CAMERA_FILES if (folder / name).is_file())
+        file = next((file for file in files if file.stem != "metadata" or '"K"' in read_text(file)), None)
         if file is None:
             raise
     return load(file)

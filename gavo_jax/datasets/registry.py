@@ -179,6 +179,11 @@ def _contents(path: Path) -> str:
         return words
     if stereo := next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data").is_dir()), None):
         return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
+    if any(path.glob("d-*.pgm")) and any(path.glob("r-*.ppm")):
+        return (
+            "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
+            "dataset's toolbox first"
+        )
     if film := next((child for child in inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None):
         return f"{film.name}: {_inside(film)}"
     if source := source_around(path):

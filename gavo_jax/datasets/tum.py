@@ -45,6 +45,10 @@ COLOR_LIST, DEPTH_LIST = "rgb.txt", "depth.txt"
 ASSOCIATIONS = tuple(f"{name}.txt" for name in ("associations", "association", "associated", "associate", "assoc"))
 """Both lists in one, as ICL-NUIM has it and `associate.py` prints it: `stamp path stamp path`."""
 
+OPENLORIS = ("color.txt", "aligned_depth.txt")
+"""Lists whose depth is registered, beside a `depth.txt` whose is not. Their camera and the body of their truth lie in
+files of their own, so that they are not read as they stand."""
+
 INDEX_RATE = 30.0
 """Frames per second where the stamps are nothing but the numbers of the frames."""
 
@@ -175,6 +179,9 @@ def _files(entry: _Entry) -> Entry:
 def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row], float]:
     """Rows of colour and of depth, from two lists or one of pairs, and the seconds of what their stamps counted."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
+    if all((folder / name).exists() for name in OPENLORIS) and not (folder / COLOR_LIST).exists():
+        names, ours = " and ".join(OPENLORIS), f"{COLOR_LIST} and {DEPTH_LIST}"
+        raise GavoError(f"{folder / COLOR_LIST}: no such file; {names}, as OpenLORIS has them: copy them to {ours}")
     if both is None or (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists():
         color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
     else:

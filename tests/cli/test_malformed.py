@@ -191,6 +191,14 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["lowres_wide.traj:1: expected 7"],
     ),
     "nerf: poses of prose": ("nerf", edit("transforms.json", "0.0, 1.0", "0.0, 2.0"), ["transforms.json: frames[0]"]),
+    "openloris: lists of other names": (
+        "tum",
+        lambda clip: [
+            (clip / "rgb.txt").rename(clip / "color.txt"),
+            write("aligned_depth.txt", (clip / "depth.txt").read_text())(clip),
+        ],
+        ["rgb.txt: no such file", "color.txt and aligned_depth.txt", "copy them to rgb.txt and depth.txt"],
+    ),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
     "replica: a list for a camera": (
@@ -327,11 +335,19 @@ def euroc(path: Path) -> Path:
     return path / "room"
 
 
+def nyu(path: Path) -> Path:
+    (path / "room").mkdir()
+    for name in ("a-1.0-1.dump", "d-1.0-1.pgm", "r-1.0-1.ppm", "INDEX.txt"):
+        (path / "room" / name).write_bytes(b"x")
+    return path / "room"
+
+
 OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "nowhere": (lambda path: path / "nowhere", ["nowhere", "no such folder or file", "synthetic"]),
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
     "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
     "record3d": (file_of("walk.r3d", b"PK"), ["walk.r3d", "Record3D", "EXR + RGB"]),
+    "nyu": (nyu, ["room: the raw recording of NYU Depth", "toolbox", "rgb/ and depth/"]),
     "euroc": (euroc, ["mav0/cam0: a recording as EuRoC has it", "without depth"]),
     "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
     "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),

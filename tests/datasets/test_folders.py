@@ -536,6 +536,17 @@ def test_a_camera_file_is_found_by_any_of_its_usual_names(folder, name):
     assert sequence.camera.fx == 131 and sequence.calibration.origin.endswith(name)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):
+    wrote(folder, "plain")
+    (folder / "camera.yaml").unlink()
+    (folder / "metadata.json").write_text(json.dumps({"title": "a walk", "fps": 30}))
+    with pytest.raises(GavoError, match="no camera file in it"):
+        open_source(folder)
+    recorded = {"w": 160, "h": 120, "K": MATRIX.T.ravel().tolist(), "fps": 30, "poses": []}
+    (folder / "metadata.json").write_text(json.dumps(recorded))
+    assert open_source(folder).camera.fx == 131
+
+
 def test_a_film_beside_depth_says_how_its_frames_become_images(folder):
     """As a phone's recorder leaves them."""
     (folder / "depth").mkdir()
