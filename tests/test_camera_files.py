@@ -284,6 +284,7 @@ FAULTS = {
     "transforms of many.json": (json.dumps({"frames": [NERF, {**NERF, "fl_x": 3}]}), "each frame has a camera of its"),
     "transforms of text.json": (json.dumps({"frames": [{**NERF, "fl_x": "long"}]}), "fx: must be a number"),
     "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
+    "transforms of poses.json": (json.dumps({"frames": [{"file_path": "a"}] * 2}), "Its entry 'fl_x' is missing"),
     "transforms round.json": (json.dumps({**NERF, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),
     "torn.json": ('{"width": 3', "not JSON"),
     "torn.yaml": ("a: [1, 2", "not YAML"),

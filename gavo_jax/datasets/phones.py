@@ -21,6 +21,9 @@ from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import Trajectory, inverse, rotation_from_quaternion
 
+LARGEST = 1e10
+"""Of a file of poses, seconds since 1970 included."""
+
 
 class StrayScan(NumberedFolder):
     """A scan of the app Stray Scanner, once the frames of its film are images: `rgb/`, `depth/`, `odometry.csv`.
@@ -141,7 +144,11 @@ def _numbered(place: str, fields: list[str], count: int) -> list[float] | None:
         values = []
     if len(values) != count:
         raise GavoError(f"{place}: expected {count} numbers, found {' '.join(fields)[:60]!r}")
-    return values if np.isfinite(values).all() else None
+    if not np.isfinite(values).all():
+        return None
+    if np.abs(values).max() > LARGEST:
+        raise GavoError(f"{place}: holds an absurdly large value")
+    return values
 
 
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:

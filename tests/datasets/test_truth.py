@@ -269,7 +269,14 @@ def test_a_phones_first_poses_had_no_stamps(tmp_path):
     np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
 
 
-@pytest.mark.parametrize(("text", "fault"), [("", "holds no trajectory"), ("1, 2, 3\n", "odometry.csv:1: expected 9")])
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("", "holds no trajectory"),
+        ("1, 2, 3\n", "odometry.csv:1: expected 9"),
+        ("0, 0, 1e200, 0, 0, 0, 0, 0, 1\n", "odometry.csv:1: holds an absurdly large value"),
+    ],
+)
 def test_faulty_poses_of_a_phone_are_refused(tmp_path, text, fault):
     LAYOUTS["stray"][1](tmp_path)
     (tmp_path / "odometry.csv").write_text(text)
