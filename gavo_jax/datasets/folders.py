@@ -4,7 +4,7 @@ Each class says how its folder is recognised, where the images and poses lie, an
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among, nameless, stamps, unpaired
 from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
-from gavo_jax.datasets.truth import Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
+from gavo_jax.datasets.truth import TRUTH, Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, associate, inverse
 
@@ -93,6 +93,7 @@ class NumberedFolder(FileSequence):
         left_out = found.unpaired(len(numbers))
         if times and (untimed := len(numbers) - len(times.keys() & set(numbers))):
             left_out.append(f"{untimed} frames: no row in {cls.STAMPS}")
+        is_stamped = bool(times)
         times = times or {number: number / rate for number in numbers}
         numbers = [number for number in numbers if number in times]
         if not numbers:
@@ -100,16 +101,23 @@ class NumberedFolder(FileSequence):
         entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
-        poses = cls.poses(path)
-        known = [number for number in numbers if number in poses]
-        truth = None
-        if known:
+        if (path / TRUTH).exists():  # somebody's own, which is better than the dataset's poses
+            truth = truth_in(path, None if is_stamped else lambda counts: counts / rate)
+        else:
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
-            truth = Trajectory(
-                np.array([times[n] for n in known]), np.stack([poses[number] @ posed_T_color for number in known])
-            )
+            truth = _trajectory(cls.poses(path), {number: times[number] for number in numbers}, posed_T_color)
         return cls(root.name, entries, calibration, truth, reading, left_out)
+
+
+def _trajectory(
+    poses: Mapping[int, np.ndarray], times: Mapping[int, float], posed_T_color: np.ndarray
+) -> Trajectory | None:
+    """Poses of the frames that have one, at their times; None where none has."""
+    known = [number for number in times if number in poses]
+    if not known:
+        return None
+    return Trajectory(np.array([times[n] for n in known]), np.stack([poses[n] @ posed_T_color for n in known]))
 
 
 class SevenScenes(NumberedFolder):

@@ -314,3 +314,14 @@ def test_no_pose_of_nerf_is_refused_with_its_place(tmp_path):
     change_transforms(tmp_path, transform_matrix=[[3.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]])
     with pytest.raises(GavoError, match=r"transforms\.json: frames\[0\]: the pose is no rotation and shift"):
         open_source(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["stray", "seven_scenes", "scannet", "arkit_scenes", "nerf"])
+def test_a_groundtruth_of_ones_own_goes_before_the_datasets_poses(tmp_path, layout):
+    """As of motion capture, beside what a phone's own tracking found."""
+    LAYOUTS[layout][1](tmp_path)
+    stamps = open_source(tmp_path).timestamps
+    (tmp_path / "groundtruth.txt").write_text("".join(f"{stamp!r} 1 2 3 0 0 0 1\n" for stamp in stamps.tolist()))
+    truth = truth_of(tmp_path)
+    np.testing.assert_array_equal(truth.timestamps, stamps)
+    np.testing.assert_array_equal(truth.world_T_camera[:, :3, 3], np.tile([1.0, 2, 3], (4, 1)))
