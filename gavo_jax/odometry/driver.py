@@ -23,6 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.leaps import Leap, align_leaping
+from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -58,7 +59,8 @@ class Step:
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
     revises: int = 0
-    """So many of the pairs before followed a body, as is seen now; see `odometry.hindsight`."""
+    """So many of the pairs before are wrong, as is seen now: they followed a body, or led to a frame that does not
+    belong to its stamp; see `odometry.hindsight`."""
 
 
 class Found(NamedTuple):
@@ -113,6 +115,8 @@ class Progress(NamedTuple):
     """So many of the last motions are guesses that frames have been chained by."""
     leap: Leap | None = None
     """What the last frame may have been; it is lost until the next one confirms that."""
+    arrival: Arrival | None = None
+    """How the reference was reached, where its image may be of another moment."""
 
 
 class Odometry:
@@ -194,8 +198,10 @@ class Odometry:
         else:
             clock = clock_of(before, usable)
             attempt, leap = align_leaping(self.aligner, before.tracker, usable, clock, before.leap)
+            renewed = arrival_of(self.aligner, before.tracker, clock, attempt)
+            attempt, kept = doubt_reference(before.arrival, clock, attempt)
             after, result, lost = self._advance(before, usable, finding, attempt)
-            after = after._replace(leap=leap if after.held else None)
+            after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
             candidates, revises = attempt.candidates, attempt.revises
             size = (self.camera.height, self.camera.width)
             bodies = tuple(

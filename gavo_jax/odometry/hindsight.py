@@ -1,4 +1,4 @@
-"""What is known of earlier pairs only later: that they followed a body."""
+"""What is known of earlier pairs only later: that they followed a body, or led to an image of another moment."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -10,7 +10,8 @@ from gavo_jax.status import AlignmentStatus
 
 
 def revised(steps: Iterable[Step]) -> list[Step]:
-    """The steps of a run, those that a later one revises as `moving_body`, with the covariance of what is unknown.
+    """The steps of a run, those that a later one revises as `moving_body` or `implausible_motion`, whichever it is
+    itself, with the covariance of what is unknown.
 
     Their poses stay as they are: how the camera moved meanwhile, nobody saw. Lost pairs stay as they are as well.
 
@@ -18,24 +19,26 @@ def revised(steps: Iterable[Step]) -> list[Step]:
         steps: As the driver made them, one after the other; revising them again changes nothing.
     """
     whole = list(steps)
-    for place in taken_back(whole):
-        result = with_finding(whole[place].alignment, AlignmentStatus.MOVING_BODY)
+    for place, status in taken_back(whole).items():
+        result = with_finding(whole[place].alignment, status)
         whole[place] = replace(whole[place], alignment=result._replace(covariance=UNKNOWN))
     return whole
 
 
-def taken_back(steps: Sequence[Step]) -> list[int]:
-    """Places, in a list of steps, of those that a later one revises.
+def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
+    """Places, in a list of steps, of those that a later one revises, and what it finds.
 
     A step revises so many frames that became the reference. Frames between them that did not, as their images were
     doubted, do not count, and are revised as well where they are not lost.
     """
-    places: set[int] = set()
+    places: dict[int, AlignmentStatus] = {}
     for last, step in enumerate(steps):
         place, left = last, step.revises
+        kinds = AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION
+        finding = next((kind for kind in kinds if kind in step.alignment.statuses), kinds[0])
         while left > 0 and place > 0:
             left -= steps[place].reference_timestamp == steps[place - 1].timestamp
             place -= 1
             if not steps[place].lost:
-                places.add(place)
-    return sorted(places)
+                places[place] = finding
+    return places

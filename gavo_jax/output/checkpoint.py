@@ -17,6 +17,7 @@ from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
+from gavo_jax.odometry.misplaced import Arrival
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 
@@ -61,6 +62,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "doubted": progress.doubted,
         "unknown": progress.unknown,
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
+        "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
@@ -95,12 +97,13 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
             raise ValueError("altered")
         numbers = json.loads(str(arrays[NUMBERS]))
         history: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in numbers["history"].items()}
-        leap = numbers.pop("leap")
+        leap, came = numbers.pop("leap"), numbers.pop("arrival", None)
         files = {name: Mark(*mark) for name, mark in numbers.pop("files").items()}
         images = numbers.pop("images")
         poses = {name: arrays[name] for name in POSES}
         leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
         numbers |= {"history": History(**history), "leap": leap and Leap(np.array(leap[0]), *leap[1:])}
+        numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
         progress = Progress(**numbers, **poses)
     except GavoError:
         raise

@@ -27,7 +27,7 @@ that a `low_texture` pair leaves undetermined, what was recorded for a lost pair
 of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
 0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the reference is
 then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body). The last one is how many
-of the pairs before followed a body, as is seen then: their status says so once the run has come to its end."""
+of the pairs before are wrong, as is seen then: their status says so once the run has come to its end."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:

@@ -134,10 +134,15 @@ def test_leap_after_leap() -> None:
     assert places(steps) == [1, 2, 2, 13, 13, 31, 31, 46]
 
 
-def real(data_dir: Path, clip: str, numbers: list[int]) -> tuple[list[Step], Callable[[Step], tuple[float, float]]]:
-    """`ga:fast` over frames of a clip under the stamps of its first ones; how far each step is from the truth."""
+def real(
+    data_dir: Path, clip: str, numbers: list[int], moments: list[int] | None = None
+) -> tuple[list[Step], Callable[[Step], tuple[float, float]]]:
+    """`ga:fast` over frames of a clip under the stamps of its first ones; how far each step is from the truth, at the
+    moments of these frames or of others.
+    """
     sequence = TumSequence(data_dir / clip)
-    truth, stamps, moments = sequence.ground_truth, sequence.timestamps, sequence.timestamps[numbers]
+    truth, stamps = sequence.ground_truth, sequence.timestamps
+    of_truth = stamps[numbers if moments is None else moments]
     assert truth is not None
     odometry, steps = Odometry(sequence.camera, preset("ga", "fast")), []
     for number, stamp in zip(numbers, stamps, strict=False):
@@ -149,7 +154,7 @@ def real(data_dir: Path, clip: str, numbers: list[int]) -> tuple[list[Step], Cal
 
     def off(step: Step) -> tuple[float, float]:
         before = int(np.argmin(np.abs(stamps - step.reference_timestamp)))
-        poses = truth.interpolate(moments[[before, step.index]])[0]
+        poses = truth.interpolate(of_truth[[before, step.index]])[0]
         error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
         return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle(error[None, :3, :3])[0]))
 
