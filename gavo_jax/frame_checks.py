@@ -99,6 +99,8 @@ MIN_FAR = 0.8
 """Metres: the highest of the quantiles, for units to be known; read as fifths, millimetres are that from 4 m on."""
 MAX_INTERVAL_RATIO = 2.5
 """An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
+MAX_USUAL_INTERVAL = 1.5
+"""Of usual ones: a longer interval may be that of two frames."""
 MIN_INTERVALS = 3
 """Intervals that have to be known before one can be unusual."""
 ROW_STEP = 4
@@ -148,6 +150,19 @@ def check_frame(
         return _doubt(depth, history)
     history = history._replace(clipped=_remember(history.clipped, clipped), doubts=0)
     return (late if depth.status is AlignmentStatus.OK else depth), history
+
+
+def doubts_last_stamp(timestamp: float, history: History) -> bool:
+    """Whether a stamp that comes too early says that the last one came too late: that is later than usual, and two
+    frames that changed their stamps would look so.
+
+    Args:
+        timestamp: Of the new frame, seconds.
+        history: Of the frames before.
+    """
+    *before, last = (0.0, 0.0) if len(history.intervals) <= MIN_INTERVALS else history.intervals
+    early = history.timestamp is not None and history.timestamp - last < timestamp < history.timestamp
+    return early and last > MAX_USUAL_INTERVAL * median(before)
 
 
 def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:

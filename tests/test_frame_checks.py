@@ -8,7 +8,7 @@ import pytest
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame
+from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.status import AlignmentStatus as Status
 
 CAMERA = DEFAULT_CAMERA.level(1)
@@ -155,3 +155,19 @@ def test_no_false_alarms_on_real_clips(data_dir, clip):
     for frame in sequence:
         finding, history = check_frame(frame, frame.timestamp, sequence.camera, history)
         assert finding == Finding(Status.OK, Use.ALL)
+
+
+@pytest.mark.parametrize(
+    ("last", "new", "doubted"),
+    [
+        (2.0, -1.0, True),  # two frames that changed their stamps
+        (1.0, -0.3, False),  # the last one came when it should
+        (2.0, 1.0, False),  # in order
+        (2.0, -2.5, False),  # older than both
+        (2.0, float("nan"), False),
+    ],
+)
+def test_a_stamp_out_of_order_tells_of_the_one_before_that_came_late(last: float, new: float, doubted: bool) -> None:
+    history = History(timestamp=100.0, intervals=(1.0, 1.1, 0.9, 1.0, last))
+    assert doubts_last_stamp(100.0 + new, history) == doubted
+    assert not doubts_last_stamp(100.0 + new, history._replace(intervals=(1.0, last))), "nothing is usual yet"

@@ -20,7 +20,7 @@ from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
 from gavo_jax.errors import GavoError
-from gavo_jax.frame_checks import Finding, History, Use, check_frame
+from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
@@ -59,8 +59,8 @@ class Step:
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
     revises: int = 0
-    """So many of the pairs before are wrong, as is seen now: they followed a body, or led to a frame that does not
-    belong to its stamp; see `odometry.hindsight`."""
+    """So many of the pairs before are wrong, as is seen now: they followed a body, or led to an image that is
+    not of its stamp's moment; see `odometry.hindsight`."""
 
 
 class Found(NamedTuple):
@@ -195,6 +195,7 @@ class Odometry:
             result, lost = no_alignment(AlignmentStatus.NO_REFERENCE if fit else finding.status), True
         elif usable is None:
             after, result, lost = self._lose(before, None, timestamp), no_alignment(finding.status), True
+            revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         else:
             clock = clock_of(before, usable)
             attempt, leap = align_leaping(self.aligner, before.tracker, usable, clock, before.leap)

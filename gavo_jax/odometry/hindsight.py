@@ -10,8 +10,8 @@ from gavo_jax.status import AlignmentStatus
 
 
 def revised(steps: Iterable[Step]) -> list[Step]:
-    """The steps of a run, those that a later one revises as `moving_body` or `implausible_motion`, whichever it is
-    itself, with the covariance of what is unknown.
+    """The steps of a run, those that a later one revises as `moving_body` or `implausible_motion`, as its own
+    statuses say, with the covariance of what is unknown.
 
     Their poses stay as they are: how the camera moved meanwhile, nobody saw. Lost pairs stay as they are as well.
 
@@ -34,11 +34,18 @@ def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
     places: dict[int, AlignmentStatus] = {}
     for last, step in enumerate(steps):
         place, left = last, step.revises
-        kinds = AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION
-        finding = next((kind for kind in kinds if kind in step.alignment.statuses), kinds[0])
+        finding = _said_of_others(step)
         while left > 0 and place > 0:
             left -= steps[place].reference_timestamp == steps[place - 1].timestamp
             place -= 1
             if not steps[place].lost:
                 places[place] = finding
     return places
+
+
+def _said_of_others(step: Step) -> AlignmentStatus:
+    """What a step finds of those that it revises: that an image is not of its stamp's moment, or else a body."""
+    found = step.alignment.statuses
+    by_time = AlignmentStatus.IMPLAUSIBLE_MOTION in found or AlignmentStatus.BAD_TIMESTAMP in found
+    is_body = AlignmentStatus.MOVING_BODY in found or not by_time
+    return AlignmentStatus.MOVING_BODY if is_body else AlignmentStatus.IMPLAUSIBLE_MOTION

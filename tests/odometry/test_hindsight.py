@@ -39,3 +39,10 @@ def test_no_more_pairs_are_revised_than_there_are() -> None:
     steps = ran(AlignmentStatus.OK, AlignmentStatus.OK)
     steps[1] = replace(steps[1], revises=9)
     assert [step.alignment.status for step in revised(steps)] == [AlignmentStatus.MOVING_BODY, AlignmentStatus.OK]
+
+
+def test_a_stamp_out_of_order_speaks_of_the_one_before() -> None:
+    ok, early, implausible = AlignmentStatus.OK, AlignmentStatus.BAD_TIMESTAMP, AlignmentStatus.IMPLAUSIBLE_MOTION
+    steps = ran(ok, ok, early, ok)
+    steps[2] = replace(steps[2], revises=1, lost=True)
+    assert [step.alignment.status for step in revised(steps)] == [ok, implausible, early, ok]
