@@ -142,12 +142,26 @@ def stale(age: int) -> Fault:
     return damage
 
 
-def swapped(clip: FrameSequence, places: list[int]) -> Damaged:
-    """A frame's images and those of the next one are exchanged."""
+def swapped(apart: int) -> Fault:
+    """A frame's images and those of the next one, or of a later one, are exchanged."""
+
+    def damage(clip: FrameSequence, places: list[int]) -> Damaged:
+        sequence = Damaged(clip, list(range(len(clip))))
+        sequence.damaged = {i + j for i in places for j in (0, apart)}
+        for i in places:
+            sequence.sources[i], sequence.sources[i + apart] = i + apart, i
+        return sequence
+
+    return damage
+
+
+def exchanged_stamps(clip: FrameSequence, places: list[int]) -> Damaged:
+    """A frame's stamp and that of the next one are exchanged."""
     sequence = Damaged(clip, list(range(len(clip))))
     sequence.damaged = {i + j for i in places for j in (0, 1)}
     for i in places:
-        sequence.sources[i], sequence.sources[i + 1] = i + 1, i
+        sequence.timestamps[[i, i + 1]] = sequence.timestamps[[i + 1, i]]
+    sequence.moments = sequence.timestamps.copy()
     return sequence
 
 
@@ -221,6 +235,13 @@ def torn(clip: FrameSequence, index: int, frame: Frame) -> Frame:
         return replace(open_pair([(color, depth)], Calibration(clip.camera))[0], timestamp=frame.timestamp)
 
 
+def zoom(image: np.ndarray) -> np.ndarray:
+    """The middle of an image, a fifth larger, in its place."""
+    height, width = image.shape
+    part = image[height // 12 : height - height // 12, width // 12 : width - width // 12]
+    return cv2.resize(part, (width, height), interpolation=cv2.INTER_NEAREST)
+
+
 def noise(grey: np.ndarray) -> np.ndarray:
     """Independent grey levels, evenly spread."""
     return np.random.default_rng(0).integers(0, 256, grey.shape).astype(grey.dtype)
@@ -242,7 +263,10 @@ FAULTS: dict[str, Fault] = {
     "equal stamps": shifted_stamp(0.0),
     "stale by 10": stale(10),
     "stale by 6": stale(6),
-    "swapped": swapped,
+    "swapped": swapped(1),
+    "swapped, one between": swapped(2),
+    "stamps exchanged": exchanged_stamps,
+    "zoomed": altered(lambda clip, index, frame: replace(frame, grey=zoom(frame.grey), depth=zoom(frame.depth))),
     "jump of 10": dropped(10, restamped=True),
     "4 dropped and restamped": dropped(4, restamped=True),
     "60 Hz of duplicates": duplicated,

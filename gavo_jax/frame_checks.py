@@ -92,6 +92,11 @@ RANGE_AGE = 0.1
 """in seconds, beyond this."""
 MAX_DUPLICATE_DIFFERENCE = 2
 """Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
+MIN_FROZEN_PART = 0.25
+"""Share of the pixels beside an edge that are to the digit what they were, while as many are not, from which on a part
+of the image stands still: without a camera's noise nothing else does. Clean clips have 0.09 at most."""
+MIN_SEEN = 40
+"""Such pixels, of some 1200, that are needed to tell."""
 DEPTH_RANGE = (0.4, 15.0)
 """Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
 without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
@@ -142,6 +147,7 @@ def check_frame(
         return _refused(AlignmentStatus.FROZEN), history
     if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
         return _doubt(_refused(AlignmentStatus.BLANK), history)
+    part_frozen = before.size == thumbnail.size and _is_part_frozen(grey, thumbnail, before.reshape(thumbnail.shape))
     frozen, history = _is_depth_frozen(frame, history)
     if frozen:
         return Finding(AlignmentStatus.FROZEN, Use.GREY), history
@@ -149,7 +155,10 @@ def check_frame(
     if depth.use is Use.NOTHING:
         return _doubt(depth, history)
     history = history._replace(clipped=_remember(history.clipped, clipped), doubts=0)
-    return (late if depth.status is AlignmentStatus.OK else depth), history
+    finding = late if depth.status is AlignmentStatus.OK else depth
+    if part_frozen and finding.status is AlignmentStatus.OK:
+        finding = Finding(AlignmentStatus.MOVING_BODY, Use.ALL)
+    return finding, history
 
 
 def doubts_last_stamp(timestamp: float, history: History) -> bool:
@@ -226,6 +235,16 @@ def _check_image(grey: np.ndarray) -> tuple[AlignmentStatus, float]:
     if neighbours < MIN_CORRELATION * variance:
         return AlignmentStatus.NOISE, clipped
     return AlignmentStatus.OK, clipped
+
+
+def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray) -> bool:
+    """Whether much of an image is to the digit what it was, where there is something to see, and much of it is not."""
+    beside = grey[::ROW_STEP, ROW_STEP // 2 :: ROW_STEP**2]
+    columns = beside.shape[1]
+    now, was = thumbnail[:, :columns], before[:, :columns]
+    change = np.abs(now - was)[np.abs(beside - now) > 2 * MAX_DUPLICATE_DIFFERENCE]
+    still, moved = np.count_nonzero(change == 0), np.count_nonzero(change > MAX_DUPLICATE_DIFFERENCE)
+    return bool(change.size >= MIN_SEEN and min(still, moved) > MIN_FROZEN_PART * change.size)
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:

@@ -1,6 +1,7 @@
 """What is told of a frame before it is aligned, and what it may still be used for."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,3 +172,24 @@ def test_a_stamp_out_of_order_tells_of_the_one_before_that_came_late(last: float
     history = History(timestamp=100.0, intervals=(1.0, 1.1, 0.9, 1.0, last))
     assert doubts_last_stamp(100.0 + new, history) == doubted
     assert not doubts_last_stamp(100.0 + new, history._replace(intervals=(1.0, last))), "nothing is usual yet"
+
+
+def test_an_image_of_which_half_stands_still_is_told(frames: list[Frame]) -> None:
+    def half_of_the_first(frame: Frame) -> Frame:
+        grey = frame.grey.copy()
+        grey[:, : grey.shape[1] // 2] = frames[0].grey[:, : grey.shape[1] // 2]
+        return replace(frame, grey=grey)
+
+    findings, _ = look(History(), frames[0], *map(half_of_the_first, frames[1:4]), *frames[4:6])
+    assert [finding.status for finding in findings] == [Status.OK, *[Status.MOVING_BODY] * 3, Status.OK, Status.OK]
+    assert all(finding.use is Use.ALL for finding in findings)
+
+
+@pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
+def test_no_part_of_a_real_image_stands_still(data_dir: Path, clip: str) -> None:
+    sequence = TumSequence(data_dir / clip)
+    findings, history = [], History()
+    for frame in sequence[:40]:
+        finding, history = check_frame(frame, frame.timestamp, sequence.camera, history)
+        findings.append(finding.status)
+    assert Status.MOVING_BODY not in findings

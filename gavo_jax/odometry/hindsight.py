@@ -2,11 +2,17 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import with_finding
+from gavo_jax.mapping.motions import between, log
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.plausibility import image_shift
 from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
 
 
 def revised(steps: Iterable[Step]) -> list[Step]:
@@ -26,12 +32,12 @@ def revised(steps: Iterable[Step]) -> list[Step]:
 
 
 def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
-    """Places, in a list of steps, of those that a later one revises, and what it finds.
+    """Places, in a list of steps, of those that are wrong as is known later, and what they are.
 
     A step revises so many frames that became the reference. Frames between them that did not, as their images were
     doubted, do not count, and are revised as well where they are not lost.
     """
-    places: dict[int, AlignmentStatus] = {}
+    places = dict.fromkeys(sorted(of_other_moments(steps)), AlignmentStatus.IMPLAUSIBLE_MOTION)
     for last, step in enumerate(steps):
         place, left = last, step.revises
         finding = _said_of_others(step)
@@ -40,6 +46,12 @@ def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
             place -= 1
             if not steps[place].lost:
                 places[place] = finding
+        if step.revises and AlignmentStatus.BAD_TIMESTAMP in step.alignment.statuses:
+            later = last + 1  # it is not known when these began
+            while later < len(steps) and steps[later].reference_timestamp == step.reference_timestamp:
+                if not steps[later].lost:
+                    places[later] = finding
+                later += 1
     return places
 
 
@@ -49,3 +61,39 @@ def _said_of_others(step: Step) -> AlignmentStatus:
     by_time = AlignmentStatus.IMPLAUSIBLE_MOTION in found or AlignmentStatus.BAD_TIMESTAMP in found
     is_body = AlignmentStatus.MOVING_BODY in found or not by_time
     return AlignmentStatus.MOVING_BODY if is_body else AlignmentStatus.IMPLAUSIBLE_MOTION
+
+
+MUCH_SMOOTHER, MIN_JERKS = 5.0, 0.1
+"""An image is of another moment if the path is so many times smoother without it, or with it in the next one's place,
+and its changes of motion moved the image by more than so many radians in sum. Even a camera that turns round at every
+frame has a path that is smoother by a factor of three at most."""
+
+
+def of_other_moments(steps: Sequence[Step]) -> set[int]:
+    """Places of the motions to and from images that break a path which is smooth without them."""
+    places: set[int] = set()
+    twists = [None if step.lost else log(np.asarray(step.alignment.target_T_reference, np.float64)) for step in steps]
+    for first in range(len(steps) - 4):
+        window = steps[first : first + 5]
+        there, back = twists[first + 2 : first + 4]
+        if there is None or back is None or there @ back >= 0 or any(step.lost for step in window):
+            continue
+        if any(later.reference_timestamp != earlier.timestamp for earlier, later in pairwise(window)):
+            continue
+        a, b, c, d, e = (step.world_T_camera for step in window)
+        stamps = np.array([step.timestamp for step in window])
+        meant = between(b, d, float((stamps[2] - stamps[1]) / (stamps[3] - stamps[1])))
+        jerks, alone, swapped = (
+            _jerks(path, stamps) for path in ([a, b, c, d, e], [a, b, meant, d, e], [a, b, d, c, e])
+        )
+        if jerks > MIN_JERKS and jerks > MUCH_SMOOTHER * min(alone, swapped):
+            places |= {first + 2, first + 3} | ({first + 4} if swapped < alone else set())
+    return places
+
+
+def _jerks(poses: Sequence[np.ndarray], stamps: np.ndarray) -> float:
+    """By how much the changes of motion along a path move the image, in sum, radians."""
+    seconds = np.diff(stamps)
+    speeds = np.array([log(inverse(a) @ b) for a, b in pairwise(poses)]) / seconds[:, None]
+    changes = np.diff(speeds, axis=0) * np.median(seconds)
+    return float(np.sum(image_shift(np.linalg.norm(changes[:, :3], axis=1), np.linalg.norm(changes[:, 3:], axis=1))))

@@ -16,7 +16,7 @@ import numpy as np
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Progress, Step
-from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.hindsight import revised, taken_back
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (
@@ -277,7 +277,7 @@ class RunFolder:
     def _revise(self) -> None:
         """Replace frames.csv where pairs were taken back; then it does not grow any more."""
         steps = self._said()
-        if any(step.revises for step in steps):
+        if taken_back(steps):
             marks, images, progress = self._whole
             self._whole = ({name: mark for name, mark in marks.items() if name != FRAMES}, images, progress)
             if FRAMES in self._files:

@@ -1,14 +1,19 @@
 """Pairs that turn out to have followed a body."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
 
 
 def ran(*statuses: AlignmentStatus) -> list[Step]:
@@ -43,6 +48,34 @@ def test_no_more_pairs_are_revised_than_there_are() -> None:
 
 def test_a_stamp_out_of_order_speaks_of_the_one_before() -> None:
     ok, early, implausible = AlignmentStatus.OK, AlignmentStatus.BAD_TIMESTAMP, AlignmentStatus.IMPLAUSIBLE_MOTION
-    steps = ran(ok, ok, early, ok)
+    steps = ran(ok, ok, early, ok, ok)
     steps[2] = replace(steps[2], revises=1, lost=True)
-    assert [step.alignment.status for step in revised(steps)] == [ok, implausible, early, ok]
+    steps[3] = replace(steps[3], reference_timestamp=steps[2].reference_timestamp)
+    assert [step.alignment.status for step in revised(steps)] == [ok, implausible, early, implausible, ok]
+
+
+def turning(moments: Sequence[float]) -> list[Step]:
+    """A run of pairs that are ok, over images of a turn by 2 degrees per moment."""
+    poses = [exp(np.array([0.0, 0.0, 0.0, 0.0, moment * 0.035, 0.0])) for moment in moments]
+    ok = no_alignment(AlignmentStatus.OK)
+    return [
+        Step(i, (i - 1) / 15, i / 15, ok._replace(target_T_reference=inverse(new) @ old), new, 1.0, False)
+        for i, (old, new) in enumerate(pairwise(poses), start=1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("moments", "wrong"),
+    [
+        ([0, 1, 2, 3, 5, 4, 6, 7], {4, 5, 6}),  # neighbours that changed places
+        ([0, 1, 2, 3, 2, 5, 6, 7], {4, 5}),  # an older image
+        ([0, 1, 2, 3, 7, 5, 6, 7], {4, 5}),  # a younger one
+        ([0, 1, 2, 3, 2, 1, 0, -1], set()),  # a camera that turns round,
+        ([0, 1, 0, 1, 0, 1, 0, 1], set()),  # or shakes,
+        ([0, 1, 3, 6, 6, 5, 3, 0], set()),  # or swings
+    ],
+)
+def test_images_that_break_a_smooth_path(moments: list[float], wrong: set[int]) -> None:
+    steps = turning(moments)
+    flagged = {step.index for step in revised(steps) if step.alignment.status is AlignmentStatus.IMPLAUSIBLE_MOTION}
+    assert flagged == wrong
