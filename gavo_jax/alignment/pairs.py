@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
+from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
@@ -149,6 +150,50 @@ def with_image_findings(result: Alignment, sides: Any, camera: Camera) -> Alignm
     return result._replace(status=status, findings=findings)
 
 
+def with_repetitions(
+    result: Alignment, references: Images, camera: Camera, expected: Float[Array | np.ndarray, "b 4 4"] | None
+) -> Alignment:
+    """A batch's results on the host, those ambiguous whose image repeats itself, so that another motion explains it as
+    well; where motions were expected, those of them that are no nearer to that than another repetition.
+    """
+    status, findings = np.array(result.status), np.array(result.findings)
+    for k in np.flatnonzero((status == AlignmentStatus.OK) | (status == AlignmentStatus.LOW_TEXTURE)):
+        motion = np.asarray(result.target_T_reference[k])
+        grey, depth = (np.asarray(images[k]) for images in references)
+        if expected is None:
+            is_open = may_be_any_period(motion, np.inf, grey, depth, camera)
+        else:
+            is_open = may_be_another_period(motion, np.asarray(expected[k], np.float64), grey, depth, camera)
+        if is_open:
+            status[k] = status[k] or AlignmentStatus.AMBIGUOUS
+            findings[k] |= bit(AlignmentStatus.AMBIGUOUS)
+    return result._replace(status=status, findings=findings)
+
+
+def concluded(
+    result: Alignment,
+    frames: tuple[Any, Any],
+    sides: Any,
+    camera: Camera,
+    settings: Settings,
+    expected: Float[Array | np.ndarray, "b 4 4"] | None,
+) -> Alignment:
+    """A batch's results on the host, with all that is looked at there.
+
+    Args:
+        result: Of `align_rows`.
+        frames: References and targets as they were given, whose stamps tell the delays of depth.
+        sides: The same, of `stacked_images`.
+        camera: Theirs.
+        settings: What searched.
+        expected: Motions to start from, where any were given.
+    """
+    count = len(sides[0].grey)
+    delays = list(zip(*(depth_delays(side, count) for side in frames), strict=True))
+    result = with_image_findings(moving_rows(on_host(result), sides, camera, settings, delays), sides, camera)
+    return with_repetitions(result, sides[0], camera, expected)
+
+
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
     """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
     first `count` rows alone, where that is given.
@@ -207,10 +252,10 @@ def align(
     settings = as_settings(settings, solver, alignment=options)
     sides = [stacked_images([frame], camera) for frame in (reference, target)]
     keys = (jax.random.key(0) if key is None else key)[None]
-    guesses = (jnp.eye(4) if guess is None else jnp.asarray(guess, jnp.float32))[None]
-    result = on_host(align_rows(sides, camera, settings, keys, with_features(guesses, sides, camera, settings)))
-    delays = list(zip(depth_delays([reference], 1), depth_delays([target], 1), strict=True))
-    result = with_image_findings(moving_rows(result, sides, camera, settings, delays), sides, camera)
+    expected = None if guess is None else jnp.asarray(guess, jnp.float32)[None]
+    starts = with_features(jnp.eye(4)[None] if expected is None else expected, sides, camera, settings)
+    found = align_rows(sides, camera, settings, keys, starts)
+    result = concluded(found, ([reference], [target]), sides, camera, settings, expected)
     row = jax.tree.map(lambda leaf: leaf[0], result)
     return row._replace(status=AlignmentStatus(int(row.status)))
 
@@ -251,11 +296,10 @@ def align_batch(
     if len(sides[1].grey) != count:
         raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
-    guesses = with_features(guesses, sides, camera, settings)
-    result = on_host(align_rows(sides, camera, settings, keys, guesses))
-    delays = list(zip(depth_delays(references, count), depth_delays(targets, count), strict=True))
-    return with_image_findings(moving_rows(result, sides, camera, settings, delays), sides, camera)
+    starts = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
+    starts = with_features(starts, sides, camera, settings)
+    found = align_rows(sides, camera, settings, keys, starts)
+    return concluded(found, (references, targets), sides, camera, settings, guesses)
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:

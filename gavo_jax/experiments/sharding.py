@@ -9,8 +9,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment.pairs import Images, align_rows, stacked_images, with_features
-from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.pairs import Images, align_rows, concluded, stacked_images, with_features
+from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
 from gavo_jax.settings import Settings, as_settings
@@ -54,8 +54,8 @@ def align_batch_sharded(
     if len(sides[1].grey) != count:
         raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
     keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    guesses = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
-    guesses = with_features(np.asarray(guesses), sides, camera, settings)
+    starts = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
+    starts = with_features(np.asarray(starts), sides, camera, settings)
     mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:
@@ -63,9 +63,10 @@ def align_batch_sharded(
         return align_rows(own, camera, settings, jax.random.wrap_key_data(keys), guesses)
 
     align_all = jax.jit(jax.shard_map(align_own, mesh=mesh, in_specs=PAIRS, out_specs=PAIRS, check_vma=False))
-    rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), guesses)
+    rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), starts)
     found = align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows))
-    return on_host(jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found))
+    found = jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found)
+    return concluded(found, (references, targets), sides, camera, settings, guesses)
 
 
 def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:

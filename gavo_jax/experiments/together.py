@@ -28,7 +28,6 @@ from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, decoded
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.settings import Settings
-from gavo_jax.status import AlignmentStatus
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
 
@@ -158,7 +157,7 @@ class _Stacked:
         """The attempt that was made."""
         if self.made is None or self.state is None:
             return self.search.align(state, frame, clock)
-        return Attempt(self.state(), self.made, self.made.status == AlignmentStatus.OK)
+        return self.search.judged(state, self.state(), self.made, frame, clock)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """As of a single run."""

@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
 from gavo_jax.alignment.judgement import UNDETERMINED
+from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
@@ -131,9 +133,37 @@ class Search:
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
         """Align with the previous frame and the keyframe; the motion is usable if it is `OK`."""
-        state, result, populations = track_frame(*self._inputs(state, frame, clock), record=self.record)
-        result = on_host(result)
-        return Attempt(state, result, result.status == AlignmentStatus.OK, candidates=_by_level(populations))
+        after, result, populations = track_frame(*self._inputs(state, frame, clock), record=self.record)
+        attempt = self.judged(state, after, on_host(result), frame, clock)
+        return attempt._replace(candidates=_by_level(populations))
+
+    def judged(
+        self, state: TrackerState, after: TrackerState, result: Alignment, frame: Frame, clock: Clock
+    ) -> Attempt:
+        """The attempt that a result makes, which may be off by a period where the image repeats itself.
+
+        Where the motion before is known, such a motion is of no use. Where it is not, the one that was found is taken,
+        and the next frame has no motion to expect: it would only repeat the error.
+
+        Args:
+            state: Before the frame,
+            after: and with it.
+            result: On the host.
+            frame: The new one.
+            clock: When it was taken.
+        """
+        attempt = Attempt(after, result, result.status == AlignmentStatus.OK)
+        if not attempt.usable:
+            return attempt
+        motion, seconds = np.asarray(result.target_T_reference), float(clock.elapsed)
+        images = frame.grey, frame.depth, self.camera
+        ambiguous = with_finding(result, AlignmentStatus.AMBIGUOUS)
+        if np.any(np.asarray(state.motion)):
+            is_open = may_be_another_period(motion, self.predict(state, seconds), *images)
+            return attempt._replace(result=ambiguous, usable=False) if is_open else attempt
+        is_open = may_be_any_period(motion, seconds, *images)
+        unknown = after._replace(motion=jnp.zeros(6))
+        return attempt._replace(result=ambiguous, state=unknown) if is_open else attempt
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""

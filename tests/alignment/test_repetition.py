@@ -1,0 +1,90 @@
+"""Images that repeat themselves, and what is said of motions that may be off by a period."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import ALONE, CAMERA
+
+import gavo_jax as gavo
+from gavo_jax import se3
+from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period, periods
+from gavo_jax.datasets.synthetic import SyntheticSequence
+
+SETTINGS = replace(gavo.preset("gauss-newton", "fast"), odometry=ALONE)
+DISTANCE = 1.5
+DEPTH = np.full((CAMERA.height, CAMERA.width), DISTANCE * CAMERA.depth_scale, np.uint16)
+
+
+def wall(period: float, shift: float = 0.0, noise: float = 1.0) -> np.ndarray:
+    """A tiled wall straight ahead; period and shift of the camera to the right in pixels."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    a, b = 2 * np.pi * (u + shift) / period, 2 * np.pi * v / period
+    grey = 128 + 25 * np.sin(a) + 25 * np.sin(b) + 15 * np.sin(2 * a + b) + 15 * np.sin(a - 3 * b)
+    return np.round(grey + noise * np.random.default_rng(int(abs(shift))).normal(size=grey.shape)).astype(np.uint8)
+
+
+def moved_by(pixels: float) -> np.ndarray:
+    """target_T_reference of a camera that moves the image by so many pixels to the right."""
+    step = np.array([pixels * DISTANCE / CAMERA.fx, 0, 0, 0, 0, 0], np.float32)
+    return np.asarray(se3.exp(jnp.asarray(step)), np.float64)
+
+
+def test_a_tiled_wall_repeats_itself_after_a_tile() -> None:
+    shifts = {tuple(shift) for shift in periods(wall(20.0, noise=3.0)).tolist()}
+    assert {(20, 0), (0, 20), (-20, 0), (20, -20)} <= shifts
+
+
+def test_a_room_repeats_nothing() -> None:
+    sequence = SyntheticSequence(frames=2, camera=CAMERA)
+    assert len(periods(sequence[0].grey)) == 0
+
+
+@pytest.mark.parametrize("kind", ["plain", "ramp", "noise", "edge"])
+def test_what_has_no_pattern_repeats_nothing(kind: str) -> None:
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    images = {
+        "plain": np.full(u.shape, 128),
+        "ramp": u,
+        "noise": np.random.default_rng(0).integers(0, 255, u.shape),
+        "edge": np.where(u > 70, 200, 50),
+    }
+    assert len(periods(images[kind].astype(np.uint8))) == 0
+
+
+def test_a_motion_is_doubted_from_a_third_of_a_period_on() -> None:
+    grey = wall(24.0)
+    still = np.eye(4)
+    assert not may_be_another_period(moved_by(6.0), still, grey, DEPTH, CAMERA)
+    assert may_be_another_period(moved_by(9.0), still, grey, DEPTH, CAMERA)
+    assert not may_be_another_period(moved_by(9.0), moved_by(10.0), grey, DEPTH, CAMERA), "as was expected"
+    assert may_be_another_period(moved_by(-14.0), moved_by(10.0), grey, DEPTH, CAMERA), "a period off"
+
+
+def test_where_nothing_was_known_any_period_counts_that_a_hand_reaches() -> None:
+    grey = wall(24.0)
+    assert may_be_any_period(moved_by(3.0), np.inf, grey, DEPTH, CAMERA)
+    assert may_be_any_period(moved_by(3.0), 0.1, grey, DEPTH, CAMERA)
+    assert not may_be_any_period(moved_by(3.0), 0.005, grey, DEPTH, CAMERA)
+
+
+def test_align_says_that_a_tiled_wall_leaves_the_motion_open() -> None:
+    """The motion of 14 pixels, off by a tile of 20, was `ok`."""
+    frames = (wall(20.0), DEPTH), (wall(20.0, -14.0), DEPTH)
+    result = gavo.align(*frames, CAMERA, SETTINGS)
+    assert gavo.AlignmentStatus.AMBIGUOUS in result.statuses
+    known = gavo.align(*frames, CAMERA, SETTINGS, guess=moved_by(13.0))
+    assert known.status == gavo.AlignmentStatus.OK
+    np.testing.assert_allclose(known.target_T_reference, moved_by(14.0), atol=0.005)
+    batch = gavo.align_batch([frames[0]], [frames[1]], CAMERA, SETTINGS)
+    assert int(batch.status[0]) == gavo.AlignmentStatus.AMBIGUOUS
+
+
+def test_a_run_before_a_tiled_wall_is_doubted_until_its_motion_is_known() -> None:
+    odometry = gavo.Odometry(CAMERA, SETTINGS)
+    for i in range(4):
+        depth = DEPTH + np.random.default_rng(i).integers(0, 9, DEPTH.shape).astype(np.uint16)  # else it is frozen
+        step = odometry.register(gavo.Frame(wall(20.0, 3.0 * i), depth, i / 10), i / 10)
+        if step is not None:
+            assert gavo.AlignmentStatus.AMBIGUOUS in step.alignment.statuses and not step.lost
