@@ -161,9 +161,10 @@ def with_repetitions(
         motion = np.asarray(result.target_T_reference[k])
         grey, depth = (np.asarray(images[k]) for images in references)
         if expected is None:
-            is_open = may_be_any_period(motion, np.inf, grey, depth, camera)
+            is_open = may_be_any_period(motion, result.error[k], np.inf, grey, depth, camera)
         else:
-            is_open = may_be_another_period(motion, np.asarray(expected[k], np.float64), grey, depth, camera)
+            known = np.asarray(expected[k], np.float64)
+            is_open = may_be_another_period(motion, result.error[k], known, grey, depth, camera)
         if is_open:
             status[k] = status[k] or AlignmentStatus.AMBIGUOUS
             findings[k] |= bit(AlignmentStatus.AMBIGUOUS)

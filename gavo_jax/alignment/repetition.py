@@ -14,7 +14,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.trajectory import inverse
 
 REPEATS = 0.6
-"""Correlation of an image with itself, shifted, from which on it repeats itself. Rooms reach 0.4."""
+"""Correlation of an image with itself, shifted, from which on it may repeat itself. Rooms reach 0.4."""
 APART = 0.3
 """By how much less it has to be on the way there: a smooth image is like itself everywhere."""
 FARTHEST = 3
@@ -32,11 +32,12 @@ NEARLY = 2.0
 that one."""
 
 
-def periods(grey: Any) -> Integer[np.ndarray, "n 2"]:
-    """Shifts (columns, rows), pixels, after which an image [H, W] looks as before; none where it repeats nothing."""
+def periods(grey: Any) -> Float64[np.ndarray, "n 2"]:
+    """Shifts (columns, rows), pixels, after which an image [H, W] looks much as before."""
     if not len(_peaks(_self_likeness(_smaller(grey, QUICK), exact=False), HINT)):
-        return np.zeros((0, 2), int)
-    return EXACT * _peaks(_self_likeness(_smaller(grey, EXACT), exact=True), REPEATS)
+        return np.zeros((0, 2))
+    likeness = _self_likeness(_smaller(grey, EXACT), exact=True)
+    return EXACT * _between_pixels(likeness, _peaks(likeness, REPEATS))
 
 
 def _smaller(grey: Any, factor: int) -> Float[np.ndarray, "h w"]:
@@ -88,6 +89,32 @@ def _peaks(likeness: Float[np.ndarray, "n m"], least: float) -> Integer[np.ndarr
     return shifts[lowest < there - APART][:, ::-1]
 
 
+def _between_pixels(
+    likeness: Float[np.ndarray, "n m"], shifts: Integer[np.ndarray, "k 2"]
+) -> Float64[np.ndarray, "k 2"]:
+    """Where parabolas through the likeness at peaks and beside them are highest."""
+    padded = np.pad(likeness, 1, mode="edge")
+    column, row = shifts.T + np.array(likeness.shape[::-1])[:, None] // 2 + 1
+    here = padded[row, column]
+    moved = []
+    for ahead, behind in (
+        (padded[row, column + 1], padded[row, column - 1]),
+        (padded[row + 1, column], padded[row - 1, column]),
+    ):
+        bend = np.minimum(ahead + behind - 2 * here, -1e-6)
+        moved.append(np.clip(0.5 * (behind - ahead) / bend, -0.5, 0.5))
+    return shifts + np.stack(moved, axis=-1)
+
+
+def _difference(grey: Any, shift: Float64[np.ndarray, " 2"]) -> float:
+    """Mean square, squared grey levels, of what an image differs by from itself, shifted, where the two overlap."""
+    image = np.asarray(grey, np.float32)
+    size = image.shape[::-1]
+    move = np.column_stack([np.eye(2), shift]).astype(np.float32)
+    there = cv2.warpAffine(np.ones_like(image), move, size) > 0.999
+    return float(np.mean(np.square(cv2.warpAffine(image, move, size, flags=cv2.INTER_CUBIC) - image)[there]))
+
+
 def image_shift_of(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camera) -> Float64[np.ndarray, " 2"]:
     """By how many pixels (columns, rows) a motion moves the middle of an image, about.
 
@@ -109,10 +136,16 @@ def _distance(depth: Any, camera: Camera) -> float:
 
 LEAST_SHIFT = 4.0
 """Pixels from which on what was found is asked about: a third of the smallest period that a first look sees."""
+AS_GOOD, NOISE = 4.0, 4.0
+"""What a repetition differs by, over E, up to which it explains the images as well; and squared grey levels that E has
+at least, as an image between pixels is a guess."""
+MOST = 8
+"""Repetitions that are compared, the nearest."""
 
 
 def may_be_another_period(
     found: Float64[np.ndarray, "4 4"],
+    error: Any,
     expected: Float64[np.ndarray, "4 4"],
     grey: Any,
     depth: Any,
@@ -122,28 +155,37 @@ def may_be_another_period(
 
     Args:
         found: target_T_reference.
-        expected: The same, by what was known before.
+        error: Its E, squared grey levels.
+        expected: The same motion, by what was known before.
         grey: Of either frame, [H, W].
         depth: Of the same, in units of the camera's.
         camera: Of both.
     """
     shift = image_shift_of(found @ inverse(expected), depth, camera)
     length = float(np.hypot(*shift))
-    if length < LEAST_SHIFT:
-        return False
-    return bool(np.any(np.linalg.norm(periods(grey) - shift, axis=1) < NEARLY * length))
+    return length >= LEAST_SHIFT and _repeats(grey, float(error), shift, NEARLY * length)
 
 
-def may_be_any_period(found: Float64[np.ndarray, "4 4"], seconds: float, grey: Any, depth: Any, camera: Camera) -> bool:
+def may_be_any_period(
+    found: Float64[np.ndarray, "4 4"], error: Any, seconds: float, grey: Any, depth: Any, camera: Camera
+) -> bool:
     """The same, where nothing was known before: whether another repetition is a motion that a hand makes in that time.
 
     Args:
         found: target_T_reference.
+        error: As above.
         seconds: That it took; infinite where that is not known.
         grey: As above.
         depth: As above.
         camera: As above.
     """
-    shift = image_shift_of(found, depth, camera)
     reach = seconds * float(camera.fx) * (FAST[0] / _distance(depth, camera) + FAST[1])
-    return bool(np.any(np.linalg.norm(periods(grey) - shift, axis=1) < reach))
+    return _repeats(grey, float(error), image_shift_of(found, depth, camera), reach)
+
+
+def _repeats(grey: Any, error: float, shift: Float64[np.ndarray, " 2"], reach: float) -> bool:
+    """Whether an image looks as before after another shift that is no further from a given one."""
+    others = periods(grey)
+    away = np.linalg.norm(others - shift, axis=1)
+    near = others[np.argsort(away)][: np.count_nonzero(away < reach)][:MOST]
+    return any(_difference(grey, other) < AS_GOOD * max(error, NOISE) for other in near)

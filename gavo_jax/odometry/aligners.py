@@ -159,9 +159,9 @@ class Search:
         images = frame.grey, frame.depth, self.camera
         ambiguous = with_finding(result, AlignmentStatus.AMBIGUOUS)
         if np.any(np.asarray(state.motion)):
-            is_open = may_be_another_period(motion, self.predict(state, seconds), *images)
+            is_open = may_be_another_period(motion, result.error, self.predict(state, seconds), *images)
             return attempt._replace(result=ambiguous, usable=False) if is_open else attempt
-        is_open = may_be_any_period(motion, seconds, *images)
+        is_open = may_be_any_period(motion, result.error, seconds, *images)
         unknown = after._replace(motion=jnp.zeros(6))
         return attempt._replace(result=ambiguous, state=unknown) if is_open else attempt
 

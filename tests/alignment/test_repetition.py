@@ -32,7 +32,7 @@ def moved_by(pixels: float) -> np.ndarray:
 
 
 def test_a_tiled_wall_repeats_itself_after_a_tile() -> None:
-    shifts = {tuple(shift) for shift in periods(wall(20.0, noise=3.0)).tolist()}
+    shifts = {tuple(shift) for shift in np.round(periods(wall(20.0, noise=3.0))).astype(int).tolist()}
     assert {(20, 0), (0, 20), (-20, 0), (20, -20)} <= shifts
 
 
@@ -56,17 +56,17 @@ def test_what_has_no_pattern_repeats_nothing(kind: str) -> None:
 def test_a_motion_is_doubted_from_a_third_of_a_period_on() -> None:
     grey = wall(24.0)
     still = np.eye(4)
-    assert not may_be_another_period(moved_by(6.0), still, grey, DEPTH, CAMERA)
-    assert may_be_another_period(moved_by(9.0), still, grey, DEPTH, CAMERA)
-    assert not may_be_another_period(moved_by(9.0), moved_by(10.0), grey, DEPTH, CAMERA), "as was expected"
-    assert may_be_another_period(moved_by(-14.0), moved_by(10.0), grey, DEPTH, CAMERA), "a period off"
+    assert not may_be_another_period(moved_by(6.0), 4.0, still, grey, DEPTH, CAMERA)
+    assert may_be_another_period(moved_by(9.0), 4.0, still, grey, DEPTH, CAMERA)
+    assert not may_be_another_period(moved_by(9.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "as was expected"
+    assert may_be_another_period(moved_by(-14.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "a period off"
 
 
 def test_where_nothing_was_known_any_period_counts_that_a_hand_reaches() -> None:
     grey = wall(24.0)
-    assert may_be_any_period(moved_by(3.0), np.inf, grey, DEPTH, CAMERA)
-    assert may_be_any_period(moved_by(3.0), 0.1, grey, DEPTH, CAMERA)
-    assert not may_be_any_period(moved_by(3.0), 0.005, grey, DEPTH, CAMERA)
+    assert may_be_any_period(moved_by(3.0), 4.0, np.inf, grey, DEPTH, CAMERA)
+    assert may_be_any_period(moved_by(3.0), 4.0, 0.1, grey, DEPTH, CAMERA)
+    assert not may_be_any_period(moved_by(3.0), 4.0, 0.005, grey, DEPTH, CAMERA)
 
 
 def test_align_says_that_a_tiled_wall_leaves_the_motion_open() -> None:
