@@ -264,7 +264,7 @@ FAULTS: dict[str, Fault] = {
     "stale by 10": stale(10),
     "stale by 6": stale(6),
     "swapped": swapped(1),
-    "swapped, one between": swapped(2),
+    "swapped around one": swapped(2),
     "stamps exchanged": exchanged_stamps,
     "zoomed": altered(lambda clip, index, frame: replace(frame, grey=zoom(frame.grey), depth=zoom(frame.depth))),
     "jump of 10": dropped(10, restamped=True),
