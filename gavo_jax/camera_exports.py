@@ -88,8 +88,8 @@ def read_realsense(path: Path, values: Table) -> Table:
 LIKE = 0.01
 """By how much of the focal length the cameras of single frames may differ; a phone's autofocus moves it by less."""
 
-FOCUS_KEYS = ("fx", "fy", "cx", "cy", "fl_x", "fl_y")
-"""Of a camera, what its focus moves."""
+FOCUS_KEYS = ("fx", "fl_x", "fy", "fl_y", "cx", "cy")
+"""Of a camera, what its focus moves; a focal length first."""
 
 
 def common_camera(place: str, cameras: list[Table]) -> Table:
@@ -112,8 +112,10 @@ def common_camera(place: str, cameras: list[Table]) -> Table:
         raise GavoError(fault)
     try:
         table = np.array([[camera[key] for key in moved] for camera in cameras], float)
-    except (TypeError, ValueError):
-        return cameras[0]
+    except (TypeError, ValueError, OverflowError):
+        if any(camera != cameras[0] for camera in cameras):
+            raise GavoError(fault) from None
+        return cameras[0]  # whose entries are no numbers, as is said later
     middle = np.median(table, axis=0)
     off = np.abs(table - middle).max(initial=0.0)
     if middle.size and not off <= LIKE * middle[0]:

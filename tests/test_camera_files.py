@@ -159,7 +159,7 @@ FILES = {
     "transforms opencv.json": (json.dumps({**NERF, "camera_model": "OPENCV", **LENS}), BROWN),
     "transforms fisheye.json": (json.dumps({**NERF, "camera_model": "OPENCV_FISHEYE", **FISH_LENS}), FISH),
     "transforms of autofocus.json": (
-        json.dumps({"frames": [NERF, {**NERF, "fl_x": 503.0}, {**NERF, "fl_x": 498.0}]}),
+        json.dumps({"frames": [NERF, {**NERF, "fl_x": 504.5}, {**NERF, "fl_x": 498.0}]}),
         NONE,
     ),
     "transforms of frames.json": (json.dumps({"frames": [NERF, {**NERF, "sharpness": 3}]}), NONE),
@@ -282,6 +282,7 @@ FAULTS = {
         "each frame has a camera of its",
     ),
     "transforms of many.json": (json.dumps({"frames": [NERF, {**NERF, "fl_x": 3}]}), "each frame has a camera of its"),
+    "transforms of huge numbers.json": (json.dumps({"frames": [{**NERF, "fl_x": 10**400}] * 2}), "fx: must be a number"),
     "transforms of text.json": (json.dumps({"frames": [{**NERF, "fl_x": "long"}]}), "fx: must be a number"),
     "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
     "transforms of poses.json": (json.dumps({"frames": [{"file_path": "a"}] * 2}), "Its entry 'fl_x' is missing"),

@@ -113,11 +113,12 @@ class NumberedFolder(FileSequence):
 def _trajectory(
     poses: Mapping[int, np.ndarray], times: Mapping[int, float], posed_T_color: np.ndarray
 ) -> Trajectory | None:
-    """Poses of the frames that have one, at their times; None where none has."""
-    known = [number for number in times if number in poses]
-    if not known:
+    """Poses of the frames that have one, in the order of their times, of equal times the first; None where none has."""
+    numbers = [number for number in times if number in poses]
+    if not numbers:
         return None
-    return Trajectory(np.array([times[n] for n in known]), np.stack([poses[n] @ posed_T_color for n in known]))
+    stamps, kept = np.unique([times[number] for number in numbers], return_index=True)
+    return Trajectory(stamps, np.stack([poses[numbers[at]] @ posed_T_color for at in kept]))
 
 
 class SevenScenes(NumberedFolder):

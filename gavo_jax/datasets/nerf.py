@@ -29,7 +29,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
         stamps: seconds of each image, by its name without the ending.
 
     Returns:
-        The poses; or None, and a line that says why: they are of none of these images, or their unit is open
+        The poses; or None, and a line that says why: none is finite and of one of these images, or their unit is open
         (`WITHOUT_SCALE`). None and no line where the file has no poses.
 
     Raises:
@@ -45,7 +45,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
         if stamp is not None and pose is not None:
             poses[stamp] = pose @ FLIP
     if not poses:
-        return None, [f"{path.name}: its poses are of none of these images"] if frames else []
+        return None, [f"{path.name}: has no pose of any of these images"] if frames else []
     times = sorted(poses)
     return Trajectory(np.array(times), np.stack([poses[time] for time in times])), []
 

@@ -19,7 +19,7 @@ from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.errors import GavoError, data_rows, number
-from gavo_jax.trajectory import Trajectory, inverse, rotation_from_quaternion
+from gavo_jax.trajectory import SHORTEST_QUATERNION, Trajectory, inverse, rotation_from_quaternion
 
 LARGEST = 1e10
 """Of a file of poses, seconds since 1970 included."""
@@ -29,7 +29,7 @@ class StrayScan(NumberedFolder):
     """A scan of the app Stray Scanner, once the frames of its film are images: `rgb/`, `depth/`, `odometry.csv`.
 
     Depth is registered to colour, in millimetres. `odometry.csv` has a stamp and a pose for each frame, by its number:
-    of a camera whose y points down, as ours. Older versions wrote poses alone.
+    of a camera whose y points down, as ours. Older versions wrote poses alone, newer ones add the camera of each frame.
     """
 
     kind: ClassVar[str] = "scan of Stray Scanner"
@@ -152,14 +152,14 @@ def _numbered(place: str, fields: list[str], count: int) -> list[float] | None:
 
 
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
-    """Stamps and poses by the numbers of frames; the first line may name the columns."""
+    """Stamps and poses by the numbers of frames; the first line may name the columns, of which the first nine count."""
     rows, found = data_rows(path), {}
     if rows and "qx" in rows[0][1]:
         rows = rows[1:]
     for at, (place, fields) in enumerate(rows):
         is_bare = len(fields) == 7
-        values = _numbered(place, fields, 7 if is_bare else 9)
-        if values is None or np.linalg.norm(values[-4:]) < 1e-6:
+        values = _numbered(place, fields[:9], 7 if is_bare else 9)
+        if values is None or np.linalg.norm(values[-4:]) < SHORTEST_QUATERNION:
             continue
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(np.array(values[-4:])), values[-7:-4]

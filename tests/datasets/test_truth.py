@@ -269,6 +269,29 @@ def test_a_phones_first_poses_had_no_stamps(tmp_path):
     np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
 
 
+def test_newer_rows_of_a_phone_have_a_camera_as_well(tmp_path):
+    """And columns that are empty."""
+    LAYOUTS["stray"][1](tmp_path)
+    names, *rows = (tmp_path / "odometry.csv").read_text().splitlines()
+    more = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y"
+    rows = [f"{row}, 1572.0, 1572.0, 959.5, 719.5, , " for row in rows]
+    (tmp_path / "odometry.csv").write_text("\n".join([names + more, *rows]))
+    truth = truth_of(tmp_path)
+    np.testing.assert_allclose(truth.timestamps, STRAY_STAMPS)
+    np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
+
+
+def test_the_truth_of_a_phone_is_in_order_where_its_stamps_are_not(tmp_path):
+    LAYOUTS["stray"][1](tmp_path)
+    text = (tmp_path / "odometry.csv").read_text()
+    (tmp_path / "odometry.csv").write_text(text.replace(str(STRAY_STAMPS[1]), str(STRAY_STAMPS[3] + 1)))
+    truth = truth_of(tmp_path)
+    np.testing.assert_array_equal(truth.timestamps, [*np.array(STRAY_STAMPS)[[0, 2, 3]], STRAY_STAMPS[3] + 1])
+    np.testing.assert_allclose(truth.world_T_camera, POSES[[0, 2, 3, 1]], atol=1e-6)
+    (tmp_path / "odometry.csv").write_text(text.replace(str(STRAY_STAMPS[1]), str(STRAY_STAMPS[0])))
+    np.testing.assert_array_equal(truth_of(tmp_path).timestamps, np.array(STRAY_STAMPS)[[0, 2, 3]])
+
+
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
@@ -301,12 +324,14 @@ def test_poses_of_structure_from_motion_are_no_truth(tmp_path):
     assert left_out(sequence) == ["transforms.json: its poses are of structure from motion, whose unit is open"]
 
 
-def test_poses_of_other_images_are_told(tmp_path):
+@pytest.mark.parametrize("entries", [{"file_path": "train/r_0"}, {"transform_matrix": [[float("nan")] * 4] * 4}])
+def test_poses_of_other_images_are_told(tmp_path, entries):
+    """And those that are not finite."""
     LAYOUTS["nerf"][1](tmp_path)
-    change_transforms(tmp_path, file_path="train/r_0")
+    change_transforms(tmp_path, **entries)
     sequence = open_source(tmp_path)
     assert sequence.ground_truth is None
-    assert left_out(sequence) == ["transforms.json: its poses are of none of these images"]
+    assert left_out(sequence) == ["transforms.json: has no pose of any of these images"]
 
 
 def test_no_pose_of_nerf_is_refused_with_its_place(tmp_path):
