@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.status import AlignmentStatus as Status
@@ -183,6 +183,16 @@ def test_an_image_of_which_half_stands_still_is_told(frames: list[Frame]) -> Non
     findings, _ = look(History(), frames[0], *map(half_of_the_first, frames[1:4]), *frames[4:6])
     assert [finding.status for finding in findings] == [Status.OK, *[Status.MOVING_BODY] * 3, Status.OK, Status.OK]
     assert all(finding.use is Use.ALL for finding in findings)
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.3, 3.0])
+@pytest.mark.parametrize("level", [0, 2])
+def test_nothing_stands_still_in_images_without_noise(speed: float, level: int) -> None:
+    """Where they change slowly many a pixel stays as it was, here and there."""
+    camera, history = DEFAULT_CAMERA.level(level), History()
+    for frame in SyntheticSequence(frames=12, camera=camera, noise=NONE, speed=speed):
+        finding, history = check_frame(frame, frame.timestamp, camera, history)
+        assert finding.status is Status.OK
 
 
 @pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
