@@ -49,7 +49,7 @@ class Attempt(NamedTuple):
     unknown: int = 0
     """So many of the last motions, this one included, are guesses."""
     revises: int = 0
-    """So many of the motions before this one were a body's, as is seen now."""
+    """So many of the motions before this one are wrong, as is seen now: see `Step.revises`."""
 
     @property
     def is_found(self) -> bool:

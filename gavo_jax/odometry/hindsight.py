@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -56,11 +56,18 @@ def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
 
 
 def _said_of_others(step: Step) -> AlignmentStatus:
-    """What a step finds of those that it revises: that an image is not of its stamp's moment, or else a body."""
-    found = step.alignment.statuses
-    by_time = AlignmentStatus.IMPLAUSIBLE_MOTION in found or AlignmentStatus.BAD_TIMESTAMP in found
-    is_body = AlignmentStatus.MOVING_BODY in found or not by_time
-    return AlignmentStatus.MOVING_BODY if is_body else AlignmentStatus.IMPLAUSIBLE_MOTION
+    """What a step finds of those that it revises: that an image is not of its stamp's moment, or else a body.
+
+    What was found of the step first counts: more may have been found since, of its image or by a later step.
+    """
+    first, found = step.alignment.status, step.alignment.statuses
+    if first not in (AlignmentStatus.MOVING_BODY, *BY_TIME):
+        first = next((status for status in (AlignmentStatus.MOVING_BODY, *BY_TIME) if status in found), None)
+    return AlignmentStatus.IMPLAUSIBLE_MOTION if first in BY_TIME else AlignmentStatus.MOVING_BODY
+
+
+BY_TIME = (AlignmentStatus.IMPLAUSIBLE_MOTION, AlignmentStatus.BAD_TIMESTAMP)
+"""What a step says where it revises others for the sake of their stamps."""
 
 
 MUCH_SMOOTHER, MIN_JERKS = 5.0, 0.1
@@ -70,9 +77,12 @@ frame has a path that is smoother by a factor of three at most."""
 
 
 def of_other_moments(steps: Sequence[Step]) -> set[int]:
-    """Places of the motions to and from images that break a path which is smooth without them."""
+    """Places of the motions to and from images that break a path which is smooth without them: the path of the
+    motions as they were found, whatever loops have corrected since.
+    """
     places: set[int] = set()
-    twists = [None if step.lost else log(np.asarray(step.alignment.target_T_reference, np.float64)) for step in steps]
+    motions = [np.asarray(step.alignment.target_T_reference, np.float64) for step in steps]
+    twists = [None if step.lost else log(motion) for step, motion in zip(steps, motions, strict=True)]
     for first in range(len(steps) - 4):
         window = steps[first : first + 5]
         there, back = twists[first + 2 : first + 4]
@@ -80,7 +90,8 @@ def of_other_moments(steps: Sequence[Step]) -> set[int]:
             continue
         if any(later.reference_timestamp != earlier.timestamp for earlier, later in pairwise(window)):
             continue
-        a, b, c, d, e = (step.world_T_camera for step in window)
+        onward = (inverse(motion) for motion in motions[first + 1 : first + 5])
+        a, b, c, d, e = accumulate(onward, np.matmul, initial=np.eye(4))
         stamps = np.array([step.timestamp for step in window])
         meant = between(b, d, float((stamps[2] - stamps[1]) / (stamps[3] - stamps[1])))
         jerks, alone, swapped = (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gavo_jax.alignment.judgement import UNKNOWN
-from gavo_jax.alignment.result import no_alignment
+from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
@@ -52,6 +52,32 @@ def test_a_stamp_out_of_order_speaks_of_the_one_before() -> None:
     steps[2] = replace(steps[2], revises=1, lost=True)
     steps[3] = replace(steps[3], reference_timestamp=steps[2].reference_timestamp)
     assert [step.alignment.status for step in revised(steps)] == [ok, implausible, early, implausible, ok]
+
+
+def test_what_a_step_says_of_others_stays_when_it_is_revised_itself() -> None:
+    """A run folder is read and revised again whenever somebody looks at it."""
+    ok, body, implausible = AlignmentStatus.OK, AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION
+    steps = ran(ok, ok, implausible, body)
+    steps[2], steps[3] = replace(steps[2], revises=1), replace(steps[3], revises=1)
+    after = revised(steps)
+    assert [step.alignment.statuses for step in after] == [(ok,), (implausible,), (implausible, body), (body,)]
+    for once, twice in zip(after, revised(after), strict=True):
+        assert once.alignment.statuses == twice.alignment.statuses
+
+
+def test_a_doubted_reference_is_no_body_where_a_part_of_the_next_image_stood_still() -> None:
+    ok, body, implausible = AlignmentStatus.OK, AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION
+    steps = ran(ok, ok, implausible)
+    steps[2] = replace(steps[2], revises=1, alignment=with_finding(steps[2].alignment, body))
+    assert revised(steps)[1].alignment.status is implausible
+
+
+def test_a_correction_of_the_path_says_nothing_of_images() -> None:
+    """Loops move the poses after a run; what its motions were stays as it is."""
+    steps = turning([0, 1, 2, 3, 5, 4, 6, 7])
+    wrong = {step.index for step in revised(steps) if step.alignment.status is not AlignmentStatus.OK}
+    moved = [replace(step, world_T_camera=np.eye(4)) for step in steps]
+    assert {step.index for step in revised(moved) if step.alignment.status is not AlignmentStatus.OK} == wrong
 
 
 def turning(moments: Sequence[float]) -> list[Step]:
