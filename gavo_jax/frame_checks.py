@@ -233,7 +233,7 @@ def _check_image(grey: np.ndarray) -> tuple[AlignmentStatus, float]:
     variance = float(np.vdot(values, values)) / values.size
     if variance < MIN_CONTRAST**2 or clipped > MAX_CLIPPED:
         return AlignmentStatus.BLANK, clipped
-    neighbours = float(np.einsum("ij,ij->", values[:, 1:], values[:, :-1])) / values[:, 1:].size
+    neighbours = float(np.einsum("ij,ij->", values[:, 1:], values[:, :-1])) / max(values[:, 1:].size, 1)
     if neighbours < MIN_CORRELATION * variance:
         return AlignmentStatus.NOISE, clipped
     return AlignmentStatus.OK, clipped

@@ -282,7 +282,10 @@ FAULTS = {
         "each frame has a camera of its",
     ),
     "transforms of many.json": (json.dumps({"frames": [NERF, {**NERF, "fl_x": 3}]}), "each frame has a camera of its"),
-    "transforms of huge numbers.json": (json.dumps({"frames": [{**NERF, "fl_x": 10**400}] * 2}), "fx: must be a number"),
+    "transforms of huge numbers.json": (
+        json.dumps({"frames": [{**NERF, "fl_x": 10**400}] * 2}),
+        "fx: must be a number",
+    ),
     "transforms of text.json": (json.dumps({"frames": [{**NERF, "fl_x": "long"}]}), "fx: must be a number"),
     "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
     "transforms of poses.json": (json.dumps({"frames": [{"file_path": "a"}] * 2}), "Its entry 'fl_x' is missing"),

@@ -174,6 +174,14 @@ def test_a_stamp_out_of_order_tells_of_the_one_before_that_came_late(last: float
     assert not doubts_last_stamp(100.0 + new, history._replace(intervals=(1.0, last))), "nothing is usual yet"
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 16), (16, 1), (2, 2), (50, 3)])
+def test_images_of_a_few_pixels_are_no_fault(size: tuple[int, int]) -> None:
+    camera, history = replace(CAMERA, height=size[0], width=size[1]), History()
+    for i in range(3):
+        grey = (np.add.outer(np.arange(size[0]), np.arange(size[1])) * 9 % 200 + 20 + 7 * i).astype(np.uint8)
+        _, history = check_frame(Frame(grey, np.full(size, 5000 + i, np.uint16), i / 30), i / 30, camera, history)
+
+
 def test_an_image_of_which_half_stands_still_is_told(frames: list[Frame]) -> None:
     def half_of_the_first(frame: Frame) -> Frame:
         grey = frame.grey.copy()

@@ -34,7 +34,7 @@ that one."""
 
 def periods(grey: Any) -> Float64[np.ndarray, "n 2"]:
     """Shifts (columns, rows), pixels, after which an image [H, W] looks much as before."""
-    if not len(_peaks(_self_likeness(_smaller(grey, QUICK), exact=False), HINT)):
+    if min(np.shape(grey)) < QUICK or not len(_peaks(_self_likeness(_smaller(grey, QUICK), exact=False), HINT)):
         return np.zeros((0, 2))
     likeness = _self_likeness(_smaller(grey, EXACT), exact=True)
     return EXACT * _between_pixels(likeness, _peaks(likeness, REPEATS))

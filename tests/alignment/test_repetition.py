@@ -53,6 +53,11 @@ def test_what_has_no_pattern_repeats_nothing(kind: str) -> None:
     assert len(periods(images[kind].astype(np.uint8))) == 0
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 640), (640, 1), (5, 7)])
+def test_what_is_too_small_for_a_pattern_repeats_nothing(size: tuple[int, int]) -> None:
+    assert len(periods(np.random.default_rng(0).integers(0, 255, size).astype(np.uint8))) == 0
+
+
 def test_a_motion_is_doubted_from_a_third_of_a_period_on() -> None:
     grey = wall(24.0)
     still = np.eye(4)
