@@ -157,14 +157,14 @@ def with_repetitions(
     well; where motions were expected, those of them that are no nearer to that than another repetition.
     """
     status, findings = np.array(result.status), np.array(result.findings)
+    greys, depths = map(np.asarray, references)
+    guesses = None if expected is None else np.asarray(expected, np.float64)
     for k in np.flatnonzero((status == AlignmentStatus.OK) | (status == AlignmentStatus.LOW_TEXTURE)):
-        motion = np.asarray(result.target_T_reference[k])
-        grey, depth = (np.asarray(images[k]) for images in references)
-        if expected is None:
-            is_open = may_be_any_period(motion, result.error[k], np.inf, grey, depth, camera)
+        motion, images = np.asarray(result.target_T_reference[k]), (greys[k], depths[k], camera)
+        if guesses is None:
+            is_open = may_be_any_period(motion, result.error[k], np.inf, *images)
         else:
-            known = np.asarray(expected[k], np.float64)
-            is_open = may_be_another_period(motion, result.error[k], known, grey, depth, camera)
+            is_open = may_be_another_period(motion, result.error[k], guesses[k], *images)
         if is_open:
             status[k] = status[k] or AlignmentStatus.AMBIGUOUS
             findings[k] |= bit(AlignmentStatus.AMBIGUOUS)
@@ -289,7 +289,7 @@ def align_batch(
         An `Alignment` of NumPy arrays with a leading axis B; `status` is an integer array.
 
     Raises:
-        GavoError: The images are not of the camera's size, or the two sides differ in number.
+        GavoError: The images are not of the camera's size, the two sides differ in number, or there are none.
     """
     settings = as_settings(settings, solver, alignment=options)
     sides = [stacked_images(side, camera) for side in (references, targets)]
@@ -318,8 +318,15 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
 
 
 def stacked_images(side: Any, camera: Camera) -> Images:
-    """B frames as `align_batch` takes them, stacked and free of lens distortion."""
-    if isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3:
+    """B frames as `align_batch` takes them, stacked and free of lens distortion.
+
+    Raises:
+        GavoError: They are none, or not of the camera's size.
+    """
+    is_stacked = isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3
+    if not len(side[0] if is_stacked else side):
+        raise GavoError("a batch of no frames: at least one pair is needed")
+    if is_stacked:
         if camera.is_distorted:
             return stacked_images(list(zip(*side, strict=True)), camera)
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):

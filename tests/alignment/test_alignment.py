@@ -425,6 +425,9 @@ def test_wrong_sizes_are_refused(sequence: SyntheticSequence, frames: dict[int, 
     stack = np.zeros((2, 480, 640), np.uint8)
     with pytest.raises(GavoError):
         align_batch((stack, stack[:, :-1]), (stack, stack), camera)
+    for nothing in ([], (stack[:0], stack[:0])):
+        with pytest.raises(GavoError, match="a batch of no frames"):
+            align_batch(nothing, nothing, camera)
 
 
 def test_an_undetermined_direction_is_named(sequence: SyntheticSequence) -> None:

@@ -58,6 +58,14 @@ def test_what_is_too_small_for_a_pattern_repeats_nothing(size: tuple[int, int]) 
     assert len(periods(np.random.default_rng(0).integers(0, 255, size).astype(np.uint8))) == 0
 
 
+def test_a_motion_whose_error_is_far_below_what_a_period_changes_is_not_off_by_it() -> None:
+    """On a wall that grows brighter to the right."""
+    grey = np.round(wall(24.0) * 0.8 + 0.3 * np.arange(CAMERA.width)).astype(np.uint8)
+    assert [24, 0] in np.round(periods(grey)).tolist()
+    assert may_be_another_period(moved_by(9.0), 200.0, np.eye(4), grey, DEPTH, CAMERA)
+    assert not may_be_another_period(moved_by(9.0), 5.0, np.eye(4), grey, DEPTH, CAMERA)
+
+
 def test_a_motion_is_doubted_from_a_third_of_a_period_on() -> None:
     grey = wall(24.0)
     still = np.eye(4)
