@@ -25,8 +25,8 @@ HINT = 0.3
 """Correlation from which on a first look finds something: it takes no account of what lies outside."""
 FAST = (1.0, 2.0)
 """m/s and rad/s of a hand that moves fast."""
-NEAREST = 0.1
-"""Metres: nothing is nearer."""
+NEAREST, USUAL_DISTANCE = 0.1, 1.5
+"""Metres: nothing is nearer; and what an image without depth is taken to show."""
 NEARLY = 2.0
 """Distance from what was expected to another repetition, over the distance to what was found, up to which it may be
 that one."""
@@ -131,7 +131,8 @@ def image_shift_of(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camer
 def _distance(depth: Any, camera: Camera) -> float:
     """Metres, of the median of what is read."""
     read = np.asarray(depth)[::8, ::8]
-    return max(float(np.median(read[read > 0])) / float(camera.depth_scale), NEAREST) if np.any(read > 0) else np.inf
+    read = read[read > 0]
+    return max(float(np.median(read)) / float(camera.depth_scale), NEAREST) if read.size else USUAL_DISTANCE
 
 
 LEAST_SHIFT = 4.0
