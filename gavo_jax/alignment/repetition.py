@@ -137,7 +137,7 @@ def _distance(depth: Any, camera: Camera) -> float:
 
 LEAST_SHIFT = 4.0
 """Pixels from which on what was found is asked about: a third of the smallest period that a first look sees."""
-AS_GOOD, NOISE = 4.0, 4.0
+AS_GOOD, NOISE = 6.0, 4.0
 """What a repetition differs by, over E, up to which it explains the images as well; and squared grey levels that E has
 at least, as an image between pixels is a guess."""
 MOST = 8
