@@ -157,13 +157,15 @@ class Search:
             return attempt
         motion, seconds = np.asarray(result.target_T_reference), float(clock.elapsed)
         images = frame.grey, frame.depth, self.camera
-        ambiguous = with_finding(result, AlignmentStatus.AMBIGUOUS)
-        if np.any(np.asarray(state.motion)):
+        is_known = bool(np.any(np.asarray(state.motion)))
+        if is_known:
             is_open = may_be_another_period(motion, result.error, self.predict(state, seconds), *images)
-            return attempt._replace(result=ambiguous, usable=False) if is_open else attempt
-        is_open = may_be_any_period(motion, result.error, seconds, *images)
-        unknown = after._replace(motion=jnp.zeros(6))
-        return attempt._replace(result=ambiguous, state=unknown) if is_open else attempt
+        else:
+            is_open = may_be_any_period(motion, result.error, seconds, *images)
+        if not is_open:
+            return attempt
+        attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
+        return attempt if is_known else attempt._replace(state=after._replace(motion=jnp.zeros(6)))
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
