@@ -35,12 +35,13 @@ TOGETHER = (0.008, np.radians(0.5))
 """Metres and radians within which the two are the same motion,"""
 APART = (0.025, np.radians(1.0))
 """and from which on it matters which one is taken."""
-AGREED_AFTER, DROPPED_AFTER = 5, 12
-"""Frames after which a rival is dropped if it is the same motion; if nothing is decided."""
-DROPPED_EARLY, LEAST_DOUBT = 5, 20.0
-"""Frames after which it is dropped if the first one's motion is within its covariance as often as not."""
-DECIDED, FORGOTTEN = -1, 30
-"""No frames: it is clear whose motion the first one's is. And so many after which it counts as clear."""
+AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
+"""Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
+away, however many frames are taken meanwhile."""
+DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
+"""Seconds after which it is dropped if the first one's motion is within its covariance as often as not."""
+FORGOTTEN = 1.0
+"""Seconds after which it counts as clear whose motion the first one's is."""
 LARGEST = 100.0
 """Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ;"""
 CONTRADICTED = 30.0
@@ -55,6 +56,26 @@ LANDSLIDE = 0.6
 EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
 """Metres: deviation of the rival's translation up to which votes can have it taken, up to which the contradiction can,
 and from which on it tells nothing."""
+
+
+class Span(NamedTuple):
+    """How long something has been so."""
+
+    frames: Any
+    """-1 where it is not."""
+    seconds: Any
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is so."""
+        return int(self.frames) >= 0
+
+    def later(self, elapsed: float) -> "Span":
+        """The same a frame later."""
+        return Span(np.int32(int(self.frames) + 1), np.float32(float(self.seconds) + elapsed))
+
+
+BEGUN, OVER = (Span(np.int32(frames), np.float32(0.0)) for frames in (0, -1))
 
 
 class Rival(NamedTuple):
@@ -73,15 +94,15 @@ class Rival(NamedTuple):
     """and by the rival's."""
     vaguest: Float[np.ndarray, "6 6"]
     """Covariance of the rival's motion where it was known least well since the anchor."""
-    age: Any
-    """Frames since the anchor; -1 where there is no rival."""
+    age: Span
+    """Since the anchor."""
     ahead: Any
     """Frames for which the margins have held."""
 
     @property
     def is_there(self) -> bool:
         """Whether there is one."""
-        return int(self.age) >= 0
+        return self.age.lasts
 
 
 class RivalledState(NamedTuple):
@@ -89,8 +110,8 @@ class RivalledState(NamedTuple):
 
     first: AwareState
     rival: Rival
-    open_for: Any
-    """Frames for which it has been open whether the first one's motion is the camera's; -1 where it is not."""
+    open_for: Span
+    """As long as it has been open whether the first one's motion is the camera's."""
 
     @property
     def tracker(self) -> TrackerState:
@@ -119,7 +140,7 @@ class WithRival:
 
     def blank_state(self) -> RivalledState:
         """The state before the first frame, in the shapes and types of every state."""
-        return self._alone(self.first.blank_state(), DECIDED)
+        return self._alone(self.first.blank_state(), OVER)
 
     def start(self, frame: Frame) -> RivalledState:
         """A scene in which nothing is known to move, and a rival if something stands before the rest. It is open whose
@@ -127,7 +148,7 @@ class WithRival:
         """
         state = self.first.start(frame)
         rival = self._rival_of(state)
-        return RivalledState(state, rival, np.int32(0))
+        return RivalledState(state, rival, BEGUN)
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the first one."""
@@ -137,36 +158,36 @@ class WithRival:
         """The first one's attempt, or the rival's once that is clearly the camera's motion."""
         attempt = self.first.align(state.first, frame, clock)
         own: AwareState = attempt.state
-        rival, open_for = state.rival, int(state.open_for)
-        if not rival.is_there and attempt.usable and (own.is_doubted or open_for >= 0):
+        rival, open_for, elapsed = state.rival, state.open_for, float(clock.elapsed)
+        if not rival.is_there and attempt.usable and (own.is_doubted or open_for.lasts):
             rival = self._rival_of(state.first, standing_before=not own.is_doubted)
-            open_for = max(open_for, 0) if rival.is_there else open_for
-        open_for = open_for + 1 if 0 <= open_for < FORGOTTEN else DECIDED
+            open_for = BEGUN if rival.is_there and not open_for.lasts else open_for
+        open_for = open_for.later(elapsed) if open_for.lasts and float(open_for.seconds) < FORGOTTEN else OVER
         other = self.second.align(rival.state, frame, clock) if rival.is_there else None
         if other is not None and other.usable:
             if attempt.usable:
-                return self._decide(attempt, other, rival, open_for)
+                return self._decide(attempt, other, rival._replace(age=rival.age.later(elapsed)), open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
-                return self._taken(other, rival, open_for, open_for)
+                return self._taken(other, rival, int(rival.age.frames), open_for, open_for)
         if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
             rival = self._nobody
         elif other is not None:
-            rival = self._rival_of(own) if open_for < DROPPED_AFTER else self._nobody
-        return _open(attempt, open_for)._replace(state=RivalledState(own, rival, np.int32(open_for)))
+            rival = self._rival_of(own) if float(open_for.seconds) < DROPPED_AFTER else self._nobody
+        return _open(attempt, open_for)._replace(state=RivalledState(own, rival, open_for))
 
-    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: int) -> Attempt:
-        """Which of two attempts at a frame stands for it, and whether the rival is kept."""
+    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span) -> Attempt:
+        """Which of two attempts at a frame stands for it, and whether the rival, of the age it has then, is kept."""
         before = np.asarray(rival.first_T_anchor, np.float64)
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
-        age = int(rival.age) + 1
+        age, earlier = float(rival.age.seconds), int(rival.age.frames) - 1
         vaguest = max(rival.vaguest, other.result.covariance, key=np.trace)
         contradiction = _distance(first, second, np.asarray(attempt.result.covariance) + vaguest)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
-        open_after = DECIDED if rival.stands_before else open_for
+        open_after = OVER if rival.stands_before else open_for
         confirmed = attempt._replace(state=self._alone(attempt.state, open_after))
         if age >= AGREED_AFTER and not _exceeds(apart, TOGETHER):
             return confirmed
@@ -177,13 +198,13 @@ class WithRival:
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
             if uncertainty < EXACT and far > 0.0 and (ahead >= FRAMES or whole > LANDSLIDE):
-                return self._taken(other, rival, open_for, open_after)
+                return self._taken(other, rival, earlier, open_for, open_after)
         contradicts = contradiction > CONTRADICTED and (far > 0.0 if is_asked else bool(rival.stands_before))
         contradicts &= _exceeds(apart, TOGETHER)
         certainty = min(contradiction / LARGEST, 1.0) + far
         if contradicts and uncertainty < EXACTER and certainty > CLEAR:
-            return self._taken(other, rival, open_for, open_after)
-        if age >= FRAMES and contradicts and certainty > DOUBTFUL:
+            return self._taken(other, rival, earlier, open_for, open_after)
+        if int(rival.age.frames) >= FRAMES and contradicts and certainty > DOUBTFUL:
             attempt = mistrusted(attempt)
         if age >= DROPPED_EARLY and contradiction < LEAST_DOUBT:
             return confirmed
@@ -194,19 +215,28 @@ class WithRival:
             first_T_anchor=first.astype(np.float32),
             rival_T_anchor=second.astype(np.float32),
             vaguest=np.asarray(vaguest, np.float32),
-            age=np.int32(age),
             ahead=np.int32(ahead),
         )
-        return attempt._replace(state=RivalledState(attempt.state, after, np.int32(open_for)))
+        return attempt._replace(state=RivalledState(attempt.state, after, open_for))
 
-    def _taken(self, other: Attempt, rival: Rival, open_for: int, open_after: int) -> Attempt:
-        """The rival's attempt in place of the first one's, by the way from where its camera was believed to be."""
+    def _taken(self, other: Attempt, rival: Rival, earlier: int, open_for: Span, open_after: Span) -> Attempt:
+        """The rival's attempt in place of the first one's, by the way from where its camera was believed to be.
+
+        Args:
+            other: The rival's.
+            rival: Before it.
+            earlier: Frames from its anchor to the last one.
+            open_for: How long it was open whose motion the first one's is,
+            open_after: and how long it is from now on.
+        """
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
-        unknown = max(open_for - int(rival.age) - 1, 0)
-        taken = other._replace(state=self._alone(other.state, open_after), result=result, unknown=unknown)
-        parted = int(rival.age) == 0 or _exceeds(_between(rival.first_T_anchor, rival.rival_T_anchor), TOGETHER)
-        return mistrusted(taken._replace(revises=(unknown + int(rival.age)) * parted))
+        taken = other._replace(state=self._alone(other.state, open_after), result=result)
+        parted = earlier == 0 or _exceeds(_between(rival.first_T_anchor, rival.rival_T_anchor), TOGETHER)
+        if parted:  # else the motions before were the same by both
+            unknown = max(int(open_for.frames) - earlier - 1, 0)
+            taken = taken._replace(unknown=unknown, revises=unknown + earlier)
+        return mistrusted(taken)
 
     @cached_property
     def _nobody(self) -> Rival:
@@ -214,11 +244,11 @@ class WithRival:
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
         nothing = np.zeros(self.first.retina.size, bool)
         exact = np.zeros((6, 6), np.float32)
-        return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, exact, np.int32(-1), np.int32(0))
+        return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, exact, OVER, np.int32(0))
 
-    def _alone(self, state: AwareState, open_for: int) -> RivalledState:
+    def _alone(self, state: AwareState, open_for: Span) -> RivalledState:
         """A state without a rival."""
-        return RivalledState(state, self._nobody, np.int32(open_for))
+        return RivalledState(state, self._nobody, open_for)
 
     def _rival_of(self, state: AwareState, standing_before: bool = False) -> Rival:
         """The motion of what the last frame shows behind all that stands before other surfaces, from here on; nobody if
@@ -240,13 +270,13 @@ class WithRival:
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
         seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
         return self._nobody._replace(
-            state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=np.int32(0)
+            state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=BEGUN
         )
 
 
-def _open(attempt: Attempt, open_for: int) -> Attempt:
+def _open(attempt: Attempt, open_for: Span) -> Attempt:
     """The attempt; its motion is unknown where it may be a body's, as the ones before may have been."""
-    doubted = open_for >= 0 and AlignmentStatus.MOVING_BODY in attempt.result.statuses
+    doubted = open_for.lasts and AlignmentStatus.MOVING_BODY in attempt.result.statuses
     return attempt._replace(unknown=1) if doubted else attempt
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.rival import RivalledState, WithRival
+from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.bodies.surfaces import nearer_part, standing_before
 from gavo_jax.bodies.votes import vote
@@ -221,7 +221,7 @@ def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> No
         state = attempt.state
         assert attempt.unknown == 0 and not state.rival.is_there
     taken = aligner.align(state._replace(rival=seen.rival), frame, CLOCK)
-    assert taken.unknown == taken.revises == 6 and int(taken.state.open_for) < 0
+    assert taken.unknown == taken.revises == 6 and not taken.state.open_for.lasts
 
 
 def test_motions_that_part_slowly_are_told_apart_by_how_far_they_are_apart_since_the_anchor() -> None:
@@ -242,16 +242,16 @@ def test_as_long_as_it_is_open_whose_motion_is_found_a_rival_is_asked_for_once_s
     state = aligner.start(frame)
     alone = state._replace(rival=aligner._nobody)
     assert aligner.align(alone, frame, CLOCK).state.rival.is_there
-    assert not aligner.align(alone._replace(open_for=np.int32(-1)), frame, CLOCK).state.rival.is_there
+    assert not aligner.align(alone._replace(open_for=OVER), frame, CLOCK).state.rival.is_there
 
 
-@pytest.mark.parametrize(("open_for", "unknown"), [(3, 1), (-1, 0)])
-def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_is_unknown(open_for: int, unknown: int) -> None:
+@pytest.mark.parametrize(("open_for", "unknown"), [(Span(3, 0.1), 1), (OVER, 0)])
+def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_is_unknown(open_for: Span, unknown: int) -> None:
     """A card that fills the image leaves it: the search hands itself over to the room, over some frames."""
     aligner, frame = rivalled([(True, 0.0, 1e-3)], [])
     covered = replace(frame, depth=np.full_like(frame.depth, 5000))
     object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.MOVING_BODY))
-    state = aligner.start(covered)._replace(open_for=np.int32(open_for))
+    state = aligner.start(covered)._replace(open_for=open_for)
     assert aligner.align(state, covered, CLOCK).unknown == unknown
 
 
@@ -261,13 +261,13 @@ def test_what_was_followed_before_the_anchor_is_unknown_once_the_rival_is_taken(
     second = [(False, 0.0, 1.0)] * missed + [(True, 0.0, 1e-3)]
     aligner, frame = rivalled([(True, 0.05, 1e-3)] * (missed + 1), second)
     state = aligner.start(frame)
-    assert state.rival.is_there and int(state.open_for) == 0
+    assert state.rival.is_there and int(state.open_for.frames) == 0
     for _ in range(missed):
         attempt = aligner.align(state, frame, CLOCK)
         state = attempt.state
         assert state.rival.is_there and attempt.unknown == 0
     taken = aligner.align(state, frame, CLOCK)
-    assert not taken.state.rival.is_there and int(taken.state.open_for) < 0
+    assert not taken.state.rival.is_there and not taken.state.open_for.lasts
     assert taken.unknown == taken.revises == unknown and AlignmentStatus.MOVING_BODY in taken.result.statuses
     assert taken.result.target_T_reference[0, 3] == pytest.approx(0.0, abs=1e-6)
 
@@ -281,10 +281,22 @@ def test_where_the_first_motion_ends_the_rival_goes_on_if_it_is_known(deviation:
     ended = aligner.align(both.state, frame, CLOCK)
     assert ended.revises == usable, "both had parted"
     assert ended.usable == usable and not ended.state.rival.is_there, "it would have missed a frame"
-    assert int(ended.state.open_for) == 2, "nobody has said whose motion either is"
+    assert int(ended.state.open_for.frames) == 2, "nobody has said whose motion either is"
     if usable:  # as far as the rival has come since the anchor, from where the first one was believed to be
         assert ended.result.target_T_reference[0, 3] == pytest.approx(0.03, abs=1e-6)
         assert AlignmentStatus.MOVING_BODY in ended.result.statuses
+
+
+@pytest.mark.parametrize(("apart", "unknown"), [(0.002, 0), (0.01, 4)])
+def test_where_both_moved_alike_a_rival_that_goes_on_makes_no_guesses_of_the_motions_before(
+    apart: float, unknown: int
+) -> None:
+    """A run of a still scene at few frames a second broke in two."""
+    first, second = [(True, 0.0, 1e-3), (False, 0.0, 1.0)], [(True, apart, 1e-3), (True, 0.02, 1e-3)]
+    aligner, frame = rivalled(first, second)
+    both = aligner.align(aligner.start(frame)._replace(open_for=Span(4, 0.1)), frame, CLOCK)
+    ended = aligner.align(both.state, frame, CLOCK)
+    assert ended.usable and ended.unknown == unknown and (ended.revises > 0) == (unknown > 0)
 
 
 def test_where_depth_is_in_doubt_the_rival_does_not_take_over() -> None:
