@@ -153,7 +153,7 @@ def test_bodies_are_tinted_left_out_of_the_map_and_have_paths(run, tmp_path):
     with shown:
         shown.open("bodies", sequence.camera, sequence.timestamps, None)
         for i, step in enumerate(steps[:2]):
-            shown.watch(sequence[i], replace(step, bodies=(bodies[i],)))
+            shown.watch(sequence[i], replace(step, lost=False, bodies=(bodies[i],)))
     found = read_recording(tmp_path / "bodies.rrd")
     [path] = found["/world/bodies"]
     assert np.allclose(component(path, "strips")[0], [[0, 0, 1], [0.1, 0, 1]], atol=1e-6)
