@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, UInt8, UInt16
 
 from gavo_jax.errors import GavoError
 
-MAX_SIDE = 8192
-"""Largest image width or height accepted, in pixels."""
+MIN_SIDE, MAX_SIDE = 16, 8192
+"""Smallest and largest image width or height accepted, in pixels: the coarsest of five levels is 16 times smaller."""
 
 RIM = 4
 """Depth that comes from within this many pixels of the raw image's border is dropped by undistortion."""
@@ -183,6 +183,17 @@ PRESETS = {
 }
 """Cameras of the TUM RGB-D benchmark (Sturm et al. 2012), as its page of file formats gives them; of the Bonn RGB-D
 Dynamic dataset (Palazzolo et al. 2019), like them; of the rendered ICL-NUIM (Handa et al. 2014)."""
+
+
+def require_size(camera: Camera) -> None:
+    """Refuse images that are too small for a pyramid.
+
+    Raises:
+        GavoError: A side has fewer than `MIN_SIDE` pixels.
+    """
+    if min(camera.width, camera.height) < MIN_SIDE:
+        size = f"{camera.width}x{camera.height}"
+        raise GavoError(f"images of {size} are too small: the search needs {MIN_SIDE} pixels a side at least")
 
 
 def _stack(*arrays: Any) -> Any:

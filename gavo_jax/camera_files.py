@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import MAX_SIDE, PRESETS, Camera
+from gavo_jax.camera import MAX_SIDE, MIN_SIDE, PRESETS, Camera
 from gavo_jax.camera_makes import MODELS, PARSERS, PROJECTION, Table
 from gavo_jax.errors import GavoError, read_text, shown
 
@@ -168,8 +168,9 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
     def whole(key: str) -> int:
         value = values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 16 <= value <= MAX_SIDE:
-            raise GavoError(f"{path}: {part}{key}: must be a whole number from 16 to {MAX_SIDE}, not {shown(value)}")
+        if isinstance(value, bool) or not isinstance(value, int) or not MIN_SIDE <= value <= MAX_SIDE:
+            fault = f"must be a whole number from {MIN_SIDE} to {MAX_SIDE}, not {shown(value)}"
+            raise GavoError(f"{path}: {part}{key}: {fault}")
         return value
 
     width, height = whole("width"), whole("height")

@@ -1,4 +1,8 @@
-"""Whether two keyframes show the same place, and where they stand to each other: aligned there and back."""
+"""Whether two keyframes show the same place, and where they stand to each other: aligned there and back.
+
+Before a wall that repeats itself both ways may agree on a motion that is off by a period; such a pair
+is no edge.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.pairs import Images, align_rows
+from gavo_jax.alignment.repetition import may_be_any_period
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
@@ -84,6 +89,7 @@ class Verifier:
         sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
         there = self._one_way(sides[0], sides[1], guesses)
         standing = [k for k in range(len(candidates)) if _stands(there[k])]
+        standing = [k for k in standing if not self._is_off_by_a_period(candidates[k], there[k])]
         earlier, later = ([side[k] for k in standing] for side in sides)
         back = self._one_way(later, earlier, [inverse(guesses[k]) for k in standing])
         edges: list[Edge | None] = [None] * len(candidates)
@@ -91,6 +97,13 @@ class Verifier:
             if _stands(result):
                 edges[k] = _edge(candidates[k], there[k], result)
         return edges
+
+    def _is_off_by_a_period(self, candidate: Candidate, there: Alignment) -> bool:
+        """Whether a motion may be: the map's guess is no help, as it drifts, and who knows by how much."""
+        images = candidate.earlier.images
+        assert images is not None
+        motion = np.asarray(there.target_T_reference)
+        return may_be_any_period(motion, there.error, np.inf, images.grey, images.depth, self.camera)
 
     def _one_way(
         self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]

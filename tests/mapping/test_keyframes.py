@@ -8,10 +8,11 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.image.settling import still
-from gavo_jax.mapping.candidates import APART, MIN_SECONDS, find_candidates
+from gavo_jax.mapping.candidates import APART, MIN_SECONDS, Candidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
@@ -238,3 +239,25 @@ def test_what_is_heavy_is_held_for_a_stated_number_of_keyframes():
     assert weight(vars(mapper), seen) < 4000  # the place that was found last
     pixels = CAMERA.width * CAMERA.height
     assert heavy < len(kept) * 16 * pixels
+
+
+PATTERN_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+
+
+def tiled(shift: float) -> Frame:
+    """A wall of tiles of 60 pixels, 1.5 m ahead, from a camera that went so many pixels to the right."""
+    v, u = np.mgrid[:480, :640] * (2 * np.pi / 60)
+    u = u + 2 * np.pi / 60 * shift
+    grey = 128 + 25 * np.sin(u) + 25 * np.sin(v) + 15 * np.sin(2 * u + v) + 15 * np.sin(u - 3 * v)
+    return Frame(np.round(grey).astype(np.uint8), np.full((480, 640), 7500, np.uint16), timestamp=shift)
+
+
+def test_before_tiles_that_repeat_nothing_ties_two_keyframes():
+    """A frame was found in the map, and keyframes were tied, off by a tile."""
+    pytest.importorskip("gtsam")
+    mapper = Mapper(PATTERN_CAMERA)
+    earlier, later = (mapper.keyframes.make(tiled(s), 0, 0, np.eye(4), np.zeros(6)) for s in (0.0, 96.0))
+    mapper.keyframes.add(earlier)
+    near_the_last_tile = exp(np.array([-24.0 * 1.5 / 525, 0, 0, 0, 0, 0]))
+    assert mapper.verifier.verify([Candidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
+    assert mapper.find(tiled(96.0)) is None
