@@ -186,11 +186,13 @@ Dynamic dataset (Palazzolo et al. 2019), like them; of the rendered ICL-NUIM (Ha
 
 
 def require_size(camera: Camera) -> None:
-    """Refuse images that are too small for a pyramid.
+    """Refuse what is no camera, and one whose images are too small for a pyramid.
 
     Raises:
-        GavoError: A side has fewer than `MIN_SIDE` pixels.
+        GavoError: A side has fewer than `MIN_SIDE` pixels, say.
     """
+    if not isinstance(camera, Camera):
+        raise GavoError(f"a Camera is needed, not {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise GavoError(f"images of {size} are too small: the search needs {MIN_SIDE} pixels a side at least")

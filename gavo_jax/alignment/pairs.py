@@ -14,7 +14,7 @@ from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera, require_size
-from gavo_jax.datasets.base import Frame, what_helps
+from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
@@ -91,10 +91,20 @@ FEATURE_KINDS: dict[str, tuple[FeatureKind, ...]] = {
 }
 
 
-def with_features(
-    guesses: Float[Array | np.ndarray, "b 4 4"], sides: Any, camera: Camera, settings: Settings
+def starts_of(
+    guesses: Float[Array | np.ndarray, "b 4 4"] | None, sides: Any, camera: Camera, settings: Settings
 ) -> Float[Array, "b g 4 4"]:
-    """Each pair's guess, and the motions that its features ask for, one per kind; not-a-number where there is none."""
+    """Each pair's guess, the identity if left out, and the motions that its features ask for, one per kind;
+    not-a-number where there is none.
+
+    Raises:
+        GavoError: The guesses are no matrices, or not as many as there are pairs.
+    """
+    shape = (len(sides[0].grey), 4, 4)
+    if guesses is None:
+        guesses = np.broadcast_to(np.eye(4, dtype=np.float32), shape)
+    if np.shape(guesses) != shape:
+        raise GavoError(f"guesses are of shape {np.shape(guesses)}: target_T_reference is needed, {shape}")
     kinds = FEATURE_KINDS[settings.alignment.features] if settings.alignment.refine else ()
     found = np.full((len(sides[0].grey), len(kinds), 4, 4), np.nan, np.float32)
     for row, pair in enumerate(zip(*sides[0], *sides[1], strict=True) if kinds else ()):
@@ -252,10 +262,11 @@ def align(
     """
     settings = as_settings(settings, solver, alignment=options)
     sides = [stacked_images([frame], camera) for frame in (reference, target)]
-    keys = (jax.random.key(0) if key is None else key)[None]
-    expected = None if guess is None else jnp.asarray(guess, jnp.float32)[None]
-    starts = with_features(jnp.eye(4)[None] if expected is None else expected, sides, camera, settings)
-    found = align_rows(sides, camera, settings, keys, starts)
+    key = jax.random.key(0) if key is None else key
+    if not isinstance(key, jax.Array):
+        raise GavoError(f"a key is needed, jax.random.key(seed), not {type(key).__name__}")
+    expected = None if guess is None else np.asarray(guess, np.float32)[None]
+    found = align_rows(sides, camera, settings, key[None], starts_of(expected, sides, camera, settings))
     result = concluded(found, ([reference], [target]), sides, camera, settings, expected)
     row = jax.tree.map(lambda leaf: leaf[0], result)
     return row._replace(status=AlignmentStatus(int(row.status)))
@@ -292,15 +303,27 @@ def align_batch(
         GavoError: The images are not of the camera's size, the two sides differ in number, or there are none.
     """
     settings = as_settings(settings, solver, alignment=options)
-    sides = [stacked_images(side, camera) for side in (references, targets)]
-    count = len(sides[0].grey)
-    if len(sides[1].grey) != count:
-        raise GavoError(f"align_batch: {count} references but {len(sides[1].grey)} targets")
-    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    starts = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else jnp.asarray(guesses, jnp.float32)
-    starts = with_features(starts, sides, camera, settings)
-    found = align_rows(sides, camera, settings, keys, starts)
+    sides, keys = stacked_pairs(references, targets, camera, keys)
+    found = align_rows(sides, camera, settings, keys, starts_of(guesses, sides, camera, settings))
     return concluded(found, (references, targets), sides, camera, settings, guesses)
+
+
+def stacked_pairs(
+    references: Any, targets: Any, camera: Camera, keys: PRNGKeyArray | None
+) -> tuple[list[Images], PRNGKeyArray]:
+    """Both sides of B pairs as of `stacked_images`, and their keys.
+
+    Raises:
+        GavoError: As of `stacked_images`, or there are not as many of one as of the other.
+    """
+    sides = [stacked_images(side, camera) for side in (references, targets)]
+    count, others = (len(side.grey) for side in sides)
+    if others != count:
+        raise GavoError(f"{count} references but {others} targets")
+    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
+    if np.shape(keys)[:1] != (count,):
+        raise GavoError(f"keys are of shape {np.shape(keys)}: one per pair is needed, jax.random.split(key, {count})")
+    return sides, keys
 
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
@@ -312,6 +335,7 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
         if np.shape(image) != expected:
             fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
             raise GavoError(fault + what_helps(name, image))
+    require_grey_levels(grey)
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
@@ -332,6 +356,7 @@ def stacked_images(side: Any, camera: Camera) -> Images:
             return stacked_images(list(zip(*side, strict=True)), camera)
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
             raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
+        require_grey_levels(side[0])
         return Images(jnp.asarray(side[0]), jnp.asarray(side[1]))
     images = [_rectified_images(frame, camera) for frame in side]
-    return Images(jnp.stack([i.grey for i in images]), jnp.stack([i.depth for i in images]))
+    return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
-from gavo_jax.camera import Camera, require_size
+from gavo_jax.camera import Camera
 from gavo_jax.image.levels import ImagePlane, Levels
 from gavo_jax.image.pyramid import Pyramid, make_atlas
 from gavo_jax.image.sampling import Target, pack_target
@@ -30,12 +30,7 @@ class Exchanged(NamedTuple):
 
 
 def levels_of(camera: Camera, solver: Solver, options: AlignmentOptions) -> Levels:
-    """The levels that a solver searches, with as many points as the options say.
-
-    Raises:
-        GavoError: The images are too small.
-    """
-    require_size(camera)
+    """The levels that a solver searches, with as many points as the options say."""
     return Levels.of(camera, solver.levels, options.points)
 
 

@@ -21,6 +21,17 @@ def what_helps(name: str, image: Any) -> str:
     return "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
 
 
+def require_grey_levels(grey: Any) -> None:
+    """Refuse grey images whose levels reach to 1 and not to 255.
+
+    Raises:
+        FrameError: They are floats, none above 1, and not all black.
+    """
+    values = np.asarray(grey)
+    if values.dtype.kind == "f" and values.size and 0.0 < np.max(values) <= 1.0:
+        raise FrameError("grey levels reach from 0 to 255, not from 0 to 1: multiply by 255")
+
+
 class TimestampError(FrameError):
     """A frame whose time is in doubt."""
 

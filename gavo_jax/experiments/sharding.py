@@ -3,16 +3,14 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment.pairs import Images, align_rows, concluded, stacked_images, with_features
+from gavo_jax.alignment.pairs import Images, align_rows, concluded, stacked_pairs, starts_of
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
-from gavo_jax.errors import GavoError
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 
@@ -49,13 +47,8 @@ def align_batch_sharded(
         GavoError: as `align_batch`.
     """
     settings = as_settings(settings)
-    sides = [stacked_images(side, camera) for side in (references, targets)]
-    count = len(sides[0].grey)
-    if len(sides[1].grey) != count:
-        raise GavoError(f"align_batch_sharded: {count} references but {len(sides[1].grey)} targets")
-    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    starts = jnp.tile(jnp.eye(4), (count, 1, 1)) if guesses is None else guesses
-    starts = with_features(np.asarray(starts), sides, camera, settings)
+    sides, keys = stacked_pairs(references, targets, camera, keys)
+    count, starts = len(keys), starts_of(guesses, sides, camera, settings)
     mesh = Mesh(np.array(jax.devices()), (PAIRS[0],))
 
     def align_own(references: Any, targets: Any, keys: Any, guesses: Any) -> Alignment:

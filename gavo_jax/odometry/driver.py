@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, in_world
-from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
+from gavo_jax.camera import Camera, require_size
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
@@ -135,6 +135,9 @@ class Odometry:
         camera: Without distortion: that of the frames as they are aligned.
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
         candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
+
+    Raises:
+        GavoError: The camera's images are too small.
     """
 
     def __init__(
@@ -148,6 +151,7 @@ class Odometry:
         aligner: Aligner | None = None,
         relocaliser: Relocaliser | None = None,
     ):
+        require_size(camera)
         self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
@@ -370,6 +374,7 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         if np.shape(image) != size or kind.kind not in "uif":
             fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
+    require_grey_levels(frame.grey)
     if not camera.is_distorted:
         return frame
     grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))

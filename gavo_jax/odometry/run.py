@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -88,8 +89,11 @@ def run_odometry(
         options: Deprecated: a part of the settings.
 
     Raises:
-        GavoError: Fewer than two frames, or the sequence's own check refuses it.
+        GavoError: It is no sequence, has fewer than two frames, or its own check refuses it.
     """
+    if isinstance(sequence, list | tuple | str | Path):
+        fault = f"a Sequence is needed, not {type(sequence).__name__}"
+        raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
     if len(sequence) < 2:
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()

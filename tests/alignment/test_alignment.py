@@ -28,6 +28,7 @@ from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.error import Scales
 from gavo_jax.objective.estimates import ExplainedShare
+from gavo_jax.odometry.driver import Odometry
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, Settings
@@ -409,6 +410,38 @@ def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> 
         align((np.repeat(frame.grey[..., None], 3, axis=2), frame.depth), frame, CAMERA, NEWTON)
     with pytest.raises(TypeError, match="LOSSES"):
         align(frame, frame, CAMERA, Settings(NEWTON.solver, AlignmentOptions(loss="huber")))  # pyright: ignore
+
+
+def test_what_does_not_belong_to_the_frames_is_refused_by_name(small_frames: dict[int, Frame]) -> None:
+    """These ended in the middle of the search, with words of arrays that nobody had given."""
+    frame = small_frames[0]
+    bright = frame.grey / np.float32(255.0)
+    two, key = [frame, frame], jax.random.key(0)
+    calls: list[tuple[str, Callable[[], Any]]] = [
+        ("Camera is needed, not str", lambda: align(frame, frame, "fr1", NEWTON)),  # pyright: ignore
+        ("multiply by 255", lambda: align((bright, frame.depth), frame, CAMERA, NEWTON)),
+        ("multiply by 255", lambda: align_batch((bright[None], frame.depth[None]), [frame], CAMERA, NEWTON)),
+        ("key is needed", lambda: align(frame, frame, CAMERA, NEWTON, key=5)),  # pyright: ignore
+        ("guesses are of shape", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.zeros(6))),
+        ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.eye(4))),
+        ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.tile(np.eye(4), (3, 1, 1)))),
+        ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=key)),
+        ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=jax.random.split(key, 3))),
+    ]
+    for words, call in calls:
+        with pytest.raises(GavoError, match=words):
+            call()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 640), (640, 1), (15, 20)])
+def test_images_too_small_for_a_pyramid_are_refused(width: int, height: int) -> None:
+    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height)
+    frame = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint16)
+    for name in ("default", "wide"):
+        with pytest.raises(GavoError, match="16 pixels"):
+            align(frame, frame, camera, presets.preset("ga", name))
+    with pytest.raises(GavoError, match="16 pixels"):
+        Odometry(camera)
 
 
 def test_wrong_sizes_are_refused(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:

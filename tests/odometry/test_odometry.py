@@ -107,6 +107,18 @@ def errors(result: OdometryRun, sequence: Any) -> np.ndarray:
     return np.linalg.norm(result.trajectory.world_T_camera[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
+def test_what_is_no_sequence_is_refused_by_name():
+    frames = list(SyntheticSequence(frames=2, camera=DEFAULT_CAMERA.level(2)))
+    for wrong in (frames, "fr1_xyz"):
+        with pytest.raises(GavoError, match="a Sequence is needed, not (list|str)"):
+            run_odometry(wrong)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="Camera is needed"):
+        Odometry("fr1")  # pyright: ignore[reportArgumentType]
+    odometry = Odometry(DEFAULT_CAMERA.level(2))
+    with pytest.raises(GavoError, match="multiply by 255"):
+        odometry.register(replace(frames[0], grey=frames[0].grey / np.float32(255.0)), 0.0)
+
+
 def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
     trajectory = plain_run.trajectory
     np.testing.assert_array_equal(trajectory.timestamps, sequence.timestamps)
