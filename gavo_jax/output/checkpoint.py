@@ -72,7 +72,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays |= {name: np.asarray(getattr(progress, name)) for name in POSES}
     arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
     data = io.BytesIO()
-    np.savez(data, allow_pickle=False, **arrays, **{SEAL: np.array(_seal(arrays))})
+    np.savez(data, **arrays, **{SEAL: np.array(_seal(arrays))})
     write_bytes(path, data.getvalue())
 
 
