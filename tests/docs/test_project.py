@@ -33,7 +33,7 @@ def test_the_changelog_keeps_its_form() -> None:
 
 def test_workflows_test_what_is_allowed() -> None:
     matrix = read_yaml(".github/workflows/tests.yml")["jobs"]["tests"]["strategy"]["matrix"]["include"]
-    assert {row["jax"] for row in matrix} == {"oldest", "newest"}
+    assert {row["versions"] for row in matrix} == {"oldest", "newest"}
     assert PROJECT["project"]["requires-python"].removeprefix(">=") in {row["python"] for row in matrix}
 
 
