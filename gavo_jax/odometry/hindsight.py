@@ -1,10 +1,11 @@
 """What is known of earlier pairs only later: that they followed a body, or led to an image of another moment."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate, pairwise
 
 import numpy as np
+from jaxtyping import Float64
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import with_finding
@@ -71,35 +72,60 @@ BY_TIME = (AlignmentStatus.IMPLAUSIBLE_MOTION, AlignmentStatus.BAD_TIMESTAMP)
 
 
 MUCH_SMOOTHER, MIN_JERKS = 5.0, 0.1
-"""An image is of another moment if the path is so many times smoother without it, or with it in the next one's place,
-and its changes of motion moved the image by more than so many radians in sum. Even a camera that turns round at every
-frame has a path that is smoother by a factor of three at most."""
+"""An image is of another moment if the path is so many times smoother without it, or where it has changed places with
+one of the next two, and its changes of motion moved the image by more than so many radians in sum. Even a camera that
+turns round at every frame has a path that is smoother by a factor of three at most."""
+BEFORE, AFTER = 2, 3
+"""Poses of a path before and after such an image that tell."""
 
 
 def of_other_moments(steps: Sequence[Step]) -> set[int]:
     """Places of the motions to and from images that break a path which is smooth without them: the path of the
-    motions as they were found, whatever loops have corrected since.
+    motions as they were found, whatever loops have corrected since. Frames that were lost are not on it.
     """
     places: set[int] = set()
-    motions = [np.asarray(step.alignment.target_T_reference, np.float64) for step in steps]
-    twists = [None if step.lost else log(motion) for step, motion in zip(steps, motions, strict=True)]
-    for first in range(len(steps) - 4):
-        window = steps[first : first + 5]
-        there, back = twists[first + 2 : first + 4]
-        if there is None or back is None or there @ back >= 0 or any(step.lost for step in window):
-            continue
-        if any(later.reference_timestamp != earlier.timestamp for earlier, later in pairwise(window)):
-            continue
-        onward = (inverse(motion) for motion in motions[first + 1 : first + 5])
-        a, b, c, d, e = accumulate(onward, np.matmul, initial=np.eye(4))
-        stamps = np.array([step.timestamp for step in window])
-        meant = between(b, d, float((stamps[2] - stamps[1]) / (stamps[3] - stamps[1])))
-        jerks, alone, swapped = (
-            _jerks(path, stamps) for path in ([a, b, c, d, e], [a, b, meant, d, e], [a, b, d, c, e])
-        )
-        if jerks > MIN_JERKS and jerks > MUCH_SMOOTHER * min(alone, swapped):
-            places |= {first + 2, first + 3} | ({first + 4} if swapped < alone else set())
+    for chain in _chains(steps):
+        motions = [np.asarray(steps[place].alignment.target_T_reference, np.float64) for place in chain]
+        poses = list(accumulate(map(inverse, motions), np.matmul, initial=np.eye(4)))
+        stamps = np.array([steps[chain[0]].reference_timestamp, *(steps[place].timestamp for place in chain)])
+        turns = [there @ back < 0 for there, back in pairwise(map(log, motions))]
+        for middle in range(BEFORE, len(poses) - 2):
+            if turns[middle - 1]:
+                window = slice(middle - BEFORE, middle + AFTER + 1)
+                wrong = _misplaced(poses[window], stamps[window])
+                places |= {chain[middle - BEFORE + k + step - 1] for k in wrong for step in (0, 1)}
     return places
+
+
+def _chains(steps: Sequence[Step]) -> Iterator[list[int]]:
+    """Places of steps that are not lost, of which each begins where the one before has ended."""
+    chain: list[int] = []
+    for place, step in enumerate(steps):
+        if step.lost:
+            continue
+        if chain and step.reference_timestamp != steps[chain[-1]].timestamp:
+            yield chain
+            chain = []
+        chain.append(place)
+    if chain:
+        yield chain
+
+
+def _misplaced(poses: Sequence[np.ndarray], stamps: Float64[np.ndarray, " n"]) -> tuple[int, ...]:
+    """Which of some poses, the third among them, are of other moments than their stamps say, if any."""
+    here, later = BEFORE, BEFORE + 1
+    share = float((stamps[here] - stamps[here - 1]) / (stamps[later] - stamps[here - 1]))
+    changed = [{here: between(poses[here - 1], poses[later], share)}]
+    changed += [{here: poses[k], k: poses[here]} for k in range(later, len(poses) - 1)]
+    found, most = {}, MUCH_SMOOTHER
+    for other in changed:
+        whole = slice(max(max(other), later) + 2)
+        jerks = _jerks(poses[whole], stamps[whole])
+        smooth = _jerks([other.get(k, pose) for k, pose in enumerate(poses[whole])], stamps[whole])
+        smoother = jerks / max(smooth, 1e-9)
+        if jerks > MIN_JERKS and smoother > most:
+            found, most = other, smoother
+    return tuple(found)
 
 
 def _jerks(poses: Sequence[np.ndarray], stamps: np.ndarray) -> float:

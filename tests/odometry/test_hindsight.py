@@ -90,10 +90,25 @@ def turning(moments: Sequence[float]) -> list[Step]:
     ]
 
 
+def test_lost_frames_are_no_part_of_a_path() -> None:
+    """Of two frames that changed places around a third, that one was lost and the others were `ok`."""
+    steps = turning([0, 1, 2, 3, 6, 4, 7, 8, 9])
+    stamps = [0, 1, 2, 3, 4, 6, 7, 8, 9]
+    steps = [
+        replace(step, reference_timestamp=a / 15, timestamp=b / 15)
+        for step, (a, b) in zip(steps, pairwise(stamps), strict=True)
+    ]
+    lost = replace(steps[4], timestamp=5 / 15, lost=True)
+    after = revised([*steps[:4], lost, *steps[4:]])
+    flagged = [place for place, step in enumerate(after) if step.alignment.status is not AlignmentStatus.OK]
+    assert flagged == [3, 5, 6]
+
+
 @pytest.mark.parametrize(
     ("moments", "wrong"),
     [
         ([0, 1, 2, 3, 5, 4, 6, 7], {4, 5, 6}),  # neighbours that changed places
+        ([0, 1, 2, 5, 4, 3, 6, 7], {3, 4, 5, 6}),  # those on either side of one
         ([0, 1, 2, 3, 2, 5, 6, 7], {4, 5}),  # an older image
         ([0, 1, 2, 3, 7, 5, 6, 7], {4, 5}),  # a younger one
         ([0, 1, 2, 3, 2, 1, 0, -1], set()),  # a camera that turns round,
