@@ -72,7 +72,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays |= {name: np.asarray(getattr(progress, name)) for name in POSES}
     arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
     data = io.BytesIO()
-    np.savez(data, **arrays, **{SEAL: np.array(_seal(arrays))})
+    arrays[SEAL] = np.array(_seal(arrays))
+    np.savez(data, **arrays)  # pyright: ignore[reportArgumentType] (NumPy 2.0 takes allow_pickle=False for an array)
     write_bytes(path, data.getvalue())
 
 
