@@ -88,8 +88,7 @@ class Verifier:
         guesses = [candidate.later_T_earlier for candidate in candidates]
         sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
         there = self._one_way(sides[0], sides[1], guesses)
-        standing = [k for k in range(len(candidates)) if _stands(there[k])]
-        standing = [k for k in standing if not self._is_off_by_a_period(candidates[k], there[k])]
+        standing = [k for k in range(len(candidates)) if _stands(there[k]) and self._is_unique(candidates[k], there[k])]
         earlier, later = ([side[k] for k in standing] for side in sides)
         back = self._one_way(later, earlier, [inverse(guesses[k]) for k in standing])
         edges: list[Edge | None] = [None] * len(candidates)
@@ -98,12 +97,14 @@ class Verifier:
                 edges[k] = _edge(candidates[k], there[k], result)
         return edges
 
-    def _is_off_by_a_period(self, candidate: Candidate, there: Alignment) -> bool:
-        """Whether a motion may be: the map's guess is no help, as it drifts, and who knows by how much."""
+    def _is_unique(self, candidate: Candidate, there: Alignment) -> bool:
+        """Whether no other motion explains the images as well, as one does before a pattern that repeats itself. Which
+        one it was, the map's guess does not tell: it drifts, and who knows by how much.
+        """
         images = candidate.earlier.images
         assert images is not None
         motion = np.asarray(there.target_T_reference)
-        return may_be_any_period(motion, there.error, np.inf, images.grey, images.depth, self.camera)
+        return not may_be_any_period(motion, there.error, np.inf, images.grey, images.depth, self.camera)
 
     def _one_way(
         self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]

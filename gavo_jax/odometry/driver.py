@@ -180,6 +180,8 @@ class Odometry:
         """
         if isinstance(frame, Frame):
             frame = rectified(frame, self.recorded)
+            if self.progress.last_index < 0:  # later a dark image may be a covered lens
+                require_grey_levels(frame.grey)
         elif not (frame is None or isinstance(frame, FrameError)):
             raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
         if self.progress.last_index < 0 and not isinstance(frame, Frame):
@@ -374,7 +376,6 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         if np.shape(image) != size or kind.kind not in "uif":
             fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
-    require_grey_levels(frame.grey)
     if not camera.is_distorted:
         return frame
     grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))

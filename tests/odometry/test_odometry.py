@@ -115,8 +115,12 @@ def test_what_is_no_sequence_is_refused_by_name():
     with pytest.raises(GavoError, match="Camera is needed"):
         Odometry("fr1")  # pyright: ignore[reportArgumentType]
     odometry = Odometry(DEFAULT_CAMERA.level(2))
+    dark = frames[0].grey / np.float32(255.0)
     with pytest.raises(GavoError, match="multiply by 255"):
-        odometry.register(replace(frames[0], grey=frames[0].grey / np.float32(255.0)), 0.0)
+        odometry.register(replace(frames[0], grey=dark), 0.0)
+    odometry.register(frames[0], 0.0)
+    step = odometry.register(replace(frames[1], grey=dark), 1 / 30)  # a covered lens is no reason to end a run
+    assert step is not None and step.alignment.status is not AlignmentStatus.OK
 
 
 def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
