@@ -165,11 +165,12 @@ class WithRival:
         open_for = open_for.later(elapsed) if open_for.lasts and float(open_for.seconds) < FORGOTTEN else OVER
         other = self.second.align(rival.state, frame, clock) if rival.is_there else None
         if other is not None and other.usable:
+            aged = rival._replace(age=rival.age.later(elapsed))
             if attempt.usable:
-                return self._decide(attempt, other, rival._replace(age=rival.age.later(elapsed)), open_for)
+                return self._decide(attempt, other, aged, open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
-                return self._taken(other, rival, int(rival.age.frames), open_for, open_for)
+                return self._taken(other, aged, open_for, open_for)
         if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
             rival = self._nobody
         elif other is not None:
@@ -181,7 +182,7 @@ class WithRival:
         before = np.asarray(rival.first_T_anchor, np.float64)
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
-        age, earlier = float(rival.age.seconds), int(rival.age.frames) - 1
+        age = float(rival.age.seconds)
         vaguest = max(rival.vaguest, other.result.covariance, key=np.trace)
         contradiction = _distance(first, second, np.asarray(attempt.result.covariance) + vaguest)
         apart, uncertainty = _between(first, second), deviation(other)
@@ -198,12 +199,12 @@ class WithRival:
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
             if uncertainty < EXACT and far > 0.0 and (ahead >= FRAMES or whole > LANDSLIDE):
-                return self._taken(other, rival, earlier, open_for, open_after)
+                return self._taken(other, rival, open_for, open_after)
         contradicts = contradiction > CONTRADICTED and (far > 0.0 if is_asked else bool(rival.stands_before))
         contradicts &= _exceeds(apart, TOGETHER)
         certainty = min(contradiction / LARGEST, 1.0) + far
         if contradicts and uncertainty < EXACTER and certainty > CLEAR:
-            return self._taken(other, rival, earlier, open_for, open_after)
+            return self._taken(other, rival, open_for, open_after)
         if int(rival.age.frames) >= FRAMES and contradicts and certainty > DOUBTFUL:
             attempt = mistrusted(attempt)
         if age >= DROPPED_EARLY and contradiction < LEAST_DOUBT:
@@ -219,19 +220,19 @@ class WithRival:
         )
         return attempt._replace(state=RivalledState(attempt.state, after, open_for))
 
-    def _taken(self, other: Attempt, rival: Rival, earlier: int, open_for: Span, open_after: Span) -> Attempt:
+    def _taken(self, other: Attempt, rival: Rival, open_for: Span, open_after: Span) -> Attempt:
         """The rival's attempt in place of the first one's, by the way from where its camera was believed to be.
 
         Args:
             other: The rival's.
-            rival: Before it.
-            earlier: Frames from its anchor to the last one.
+            rival: Before it, of the age it has then.
             open_for: How long it was open whose motion the first one's is,
             open_after: and how long it is from now on.
         """
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
         taken = other._replace(state=self._alone(other.state, open_after), result=result)
+        earlier = int(rival.age.frames) - 1
         parted = earlier == 0 or _exceeds(_between(rival.first_T_anchor, rival.rival_T_anchor), TOGETHER)
         if parted:  # else the motions before were the same by both
             unknown = max(int(open_for.frames) - earlier - 1, 0)
