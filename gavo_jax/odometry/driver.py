@@ -22,6 +22,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_lev
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
+from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
@@ -117,6 +118,8 @@ class Progress(NamedTuple):
     """What the last frame may have been; it is lost until the next one confirms that."""
     arrival: Arrival | None = None
     """How the reference was reached, where its image may be of another moment."""
+    beginning: Beginning | None = None
+    """Of the track, as long as it may have followed a body."""
 
 
 class Odometry:
@@ -209,7 +212,12 @@ class Odometry:
             attempt, kept = doubt_reference(before.arrival, clock, attempt)
             after, result, lost = self._advance(before, usable, finding, attempt)
             after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
-            candidates, revises = attempt.candidates, attempt.revises
+            candidates, shown = attempt.candidates, sum(seen.share for seen in attempt.bodies)
+            revises = max(attempt.revises, 0 if lost else revised_by(before.beginning, shown))
+            if not lost:
+                is_reference = after.tracker is not before.tracker
+                beginning = followed(before.beginning, timestamp, shown, is_reference=is_reference)
+                after = after._replace(beginning=beginning)
             size = (self.camera.height, self.camera.width)
             bodies = tuple(
                 in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
@@ -268,6 +276,7 @@ class Odometry:
             held=0,
             doubted=False,
             unknown=0,
+            beginning=begun(before.beginning, frame.timestamp),
         )
 
     def _advance(

@@ -15,6 +15,7 @@ import numpy as np
 
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
+from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
@@ -63,6 +64,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "unknown": progress.unknown,
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
+        "beginning": progress.beginning,
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
@@ -105,6 +107,8 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
         numbers |= {"history": History(**history), "leap": leap and Leap(np.array(leap[0]), *leap[1:])}
         numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
+        beginning = numbers.get("beginning")
+        numbers["beginning"] = beginning and Beginning(*beginning)
         progress = Progress(**numbers, **poses)
     except GavoError:
         raise

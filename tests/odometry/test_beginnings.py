@@ -1,0 +1,81 @@
+"""Pairs that a body carried which filled the image: they say so once it leaves."""
+
+from functools import reduce
+from typing import Any
+
+import numpy as np
+import pytest
+from small import Rendered
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.bodies.records import Seen
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE
+from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.beginnings import PROVEN_AFTER, Beginning, begun, followed, revised_by
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.status import AlignmentStatus
+
+RATE = 30.0
+CAMERA = DEFAULT_CAMERA.level(2)
+
+
+def track(before: Beginning | None, frames: int, stamp: float = 0.0) -> Beginning | None:
+    """So many frames of a video in which nothing is seen to move."""
+    stamps = [stamp + (k + 1) / RATE for k in range(frames)]
+    return reduce(lambda track, stamp: followed(track, stamp, 0.0, is_reference=True), stamps, before)
+
+
+def test_what_moves_behind_a_break_was_followed_before_it() -> None:
+    followed_before = track(begun(None, 0.0), 10)
+    assert revised_by(followed_before, 0.5) == 0  # a body that comes in is no news of the past
+    broken = begun(followed_before, 0.5)
+    assert revised_by(broken, 0.5) == 11  # the ten and the way across the break
+    assert revised_by(broken, 0.1) == 0
+    assert revised_by(track(broken, 1, 0.5), 0.5) == 0
+
+
+def test_a_long_track_of_a_still_world_is_the_scene() -> None:
+    proven = track(begun(None, 0.0), int(PROVEN_AFTER * RATE) + 2)
+    assert proven is None
+    assert revised_by(begun(proven, 2.0), 0.5) == 0
+
+
+def test_where_bodies_are_known_the_camera_is_told_from_them() -> None:
+    known = followed(track(begun(None, 0.0), 3), 0.2, 0.05, is_reference=True)
+    assert known is None and followed(None, 0.3, 0.0, is_reference=True) is None
+
+
+class Covered:
+    """An aligner that follows a body for some frames, loses it, and then sees it as one."""
+
+    def __init__(self, followed: int, share: float) -> None:
+        body = Seen(1, np.ones((6, 8), np.float32), share, np.zeros(3))
+        good, lost = no_alignment(AlignmentStatus.OK), no_alignment(AlignmentStatus.LOW_TEXTURE)
+        self.attempts = [(good, ())] * followed + [(lost, ())] * 3 + [(good, (body,))] * 2
+
+    def warm_up(self) -> float:
+        return 0.0
+
+    def start(self, frame: Frame) -> Any:
+        return frame.timestamp
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        result, bodies = self.attempts.pop(0)
+        return Attempt(frame.timestamp, result, result.status is AlignmentStatus.OK, bodies=bodies)
+
+    def predict(self, state: Any, elapsed: float) -> np.ndarray:
+        return np.eye(4)
+
+
+@pytest.mark.parametrize(("followed", "share", "told"), [(5, 0.5, range(5)), (5, 0.1, range(0)), (40, 0.5, range(0))])
+def test_a_run_says_so_at_its_end(followed: int, share: float, told: range) -> None:
+    odometry = Odometry(CAMERA, aligner=Covered(followed, share))
+    sequence = Rendered(frames=followed + 6, camera=CAMERA, noise=NONE)
+    steps = [odometry.register(frame, frame.timestamp) for frame in sequence]
+    whole: list[Step] = revised(step for step in steps if step is not None)
+    marked = [place for place, step in enumerate(whole) if step.alignment.status is AlignmentStatus.MOVING_BODY]
+    assert marked == list(told)
+    assert whole[-1].segment == 1 and whole[-1].alignment.status is AlignmentStatus.OK
