@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float64, Integer
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
-from gavo_jax.bodies.identity import LEAST, SHOWS, SUSPECTED_SHOWS, Roll, parts
+from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.datasets.base import Frame
@@ -141,8 +141,8 @@ class BodyAware:
         known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
-        shows = SUSPECTED_SHOWS if AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses else SHOWS
-        attempt, found, carried = seen, _bodies(look.belief, before, shows), 0.0
+        explains = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
+        attempt, found, carried = seen, _bodies(look.belief, before, explains), 0.0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (known or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
@@ -158,7 +158,7 @@ class BodyAware:
             attempt = self._completed(state, clock, attempt)
         if attempt is not seen:
             look = self._look(state, attempt)
-            found = _bodies(look.belief, before, shows)
+            found = _bodies(look.belief, before, explains)
         return self._remember(state, frame, clock, attempt, look, found, carried)
 
     def _remember(
@@ -335,9 +335,9 @@ def deviation(attempt: Attempt) -> float:
     return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
-def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], shows: float) -> Integer[np.ndarray, "h w"]:
+def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], explains: bool) -> Integer[np.ndarray, "h w"]:
     moving, known = jax.device_get((belief.moving, belief.known))
-    return parts(moving, known, before, shows)
+    return parts(moving, known, before, explains)
 
 
 def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

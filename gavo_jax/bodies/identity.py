@@ -10,8 +10,8 @@ LEAST = 0.008
 """Share of the image that a body covers at least."""
 SHOWS = 0.03
 """Evidence, as a share of the image that is known to move, that shows a body,"""
-SUSPECTED_SHOWS = 0.015
-"""one where depth disagrees with the motion found,"""
+EXPLAINS = 0.015
+"""the largest part where depth disagrees with the motion found, which it explains,"""
 KEEPS = 0.006
 """and that one needs that was known in the frame before."""
 THICK = 6 / 160
@@ -54,7 +54,7 @@ def parts(
     moving: Float[np.ndarray, "h w"],
     known: Float[np.ndarray, "h w"],
     before: Bool[np.ndarray, "h w"],
-    shows: float = SHOWS,
+    explains: bool = False,
 ) -> Integer[np.ndarray, "h w"]:
     """Parts of a mask that hang together and are bodies: 1, 2, … from the largest one; else 0.
 
@@ -65,7 +65,7 @@ def parts(
         moving: Positive where something moves; see `Belief`.
         known: See `Belief`.
         before: Where bodies were in the frame before.
-        shows: Evidence that one needs which was not known.
+        explains: Whether depth disagrees with the motion found.
     """
     mask = moving > 0
     labels = np.zeros(mask.shape, np.int32)
@@ -81,6 +81,7 @@ def parts(
         part = split == k
         was_known = np.mean(before[part]) > 0.3
         evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
+        shows = EXPLAINS if explains and found == 0 else SHOWS
         if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else shows):
             found += 1
             labels[part] = found

@@ -369,6 +369,14 @@ def test_a_body_that_was_known_needs_less() -> None:
     assert np.any(parts(field(BOX), little, there))
 
 
+def test_the_largest_part_needs_less_where_depth_disagrees() -> None:
+    nowhere, both = np.zeros((60, 80), bool), field(BOX, OTHER)
+    little = 0.25 * both
+    assert not np.any(parts(both, little, nowhere))
+    assert set(np.unique(parts(both, little, nowhere, explains=True))) == {0, 1}
+    assert not np.any(parts(both, 0.05 * both, nowhere, explains=True))
+
+
 def test_bodies_keep_their_numbers() -> None:
     nowhere = np.zeros((60, 80), bool)
     both = parts(field(BOX, OTHER), field(BOX, OTHER), nowhere)

@@ -136,6 +136,22 @@ def test_a_card_does_not_take_the_camera_along(
     assert len(jumps) == 1 and AlignmentStatus.MOVING_BODY in jumps[0].statuses  # the pose is mended, and that is told
 
 
+def test_a_plain_body_that_comes_in_is_not_taken_for_wrong_depth(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was, and as no such frame became the reference, the body was never found."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    clips = importlib.import_module("moving_clips")
+    sequence = clips.CardClip(TumSequence(data_dir / "fr1_rpy")[:60], 0.1, 2, clips.LOOKS[2])
+    odometry = Odometry(sequence.camera, FAST)
+    steps = [odometry.register(sequence[index], float(sequence.timestamps[index])) for index in range(36, 60)]
+    assert {step.alignment.status for step in steps if step is not None} == {AlignmentStatus.OK}
+    last = steps[-1]
+    assert last is not None and len(last.bodies) == 1
+    covered = sequence.part_labels(59) > 0
+    assert np.sum(last.bodies[0].mask & covered) > 0.8 * np.sum(last.bodies[0].mask | covered)
+
+
 @pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_rpy"])
 def test_where_nothing_moves_a_rival_changes_nothing(data_dir: Path, clip: str) -> None:
     sequence = TumSequence(data_dir / clip)[:8]
