@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float64, Integer
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
+from gavo_jax.bodies.evidence import inverse_depth_of
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
+from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp as exp_on_host
 from gavo_jax.mapping.motions import log as log_on_host
@@ -179,7 +181,9 @@ class BodyAware:
         limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
         roll = Roll(*map(np.asarray, scene.roll))
-        seen = ()
+        seen, seemed_still = (), found == 0
+        if np.any(found):
+            found = whole_surfaces(found, inverse_depth_of(retina.view(attempt.state)))
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state
@@ -190,6 +194,9 @@ class BodyAware:
         )
         if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
             after = after._replace(known=look.belief.carried)
+        elif np.any(found):
+            known = np.asarray(after.known)
+            after = after._replace(known=np.where((found > 0) & seemed_still, np.maximum(known, 0.0), known))
         aside = suspected > SUSPECTED  # without what was just found, where the motion is in doubt
         if np.any(aside):
             tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else found > 0)

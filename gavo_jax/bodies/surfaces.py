@@ -26,6 +26,8 @@ MOST_TOGETHER = 0.5
 """Share of the image up to which smaller surfaces than the largest one count, too."""
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 """Share of the image that may move together; less or more is not worth to ask about."""
+PART = 0.3
+"""Share of such a surface that moves, from which on all of it does."""
 BINS = 64
 
 
@@ -52,6 +54,30 @@ def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
 
 def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """The pixels of surfaces that stand before their neighbours along most of their border."""
+    return _standing_surfaces(inverse_depth) > 0
+
+
+def whole_surfaces(
+    bodies: Integer[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
+) -> Integer[np.ndarray, "h w"]:
+    """Bodies with all of each surface that stands before others and of which a part is theirs: a body that turns is
+    nearly at rest about its axis.
+
+    Args:
+        bodies: Number of the body that each pixel shows, 0 for none.
+        inverse_depth: 1/m; 0 where there is no reading.
+    """
+    whole, surfaces = bodies.copy(), _standing_surfaces(inverse_depth)
+    for surface in np.unique(surfaces[(bodies > 0) & (surfaces > 0)]):
+        on_it = surfaces == surface
+        shown = np.bincount(bodies[on_it])
+        if 1.0 - shown[0] / shown.sum() > PART:
+            whole[on_it & (bodies == 0)] = 1 + np.argmax(shown[1:])
+    return whole
+
+
+def _standing_surfaces(inverse_depth: Float[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:
+    """A number for each pixel of a surface that stands before its neighbours along most of its border; else 0."""
     labels, count = _surfaces(inverse_depth)
     before, behind = np.zeros(count), np.zeros(count)
     for q, surface in ((inverse_depth, labels), (inverse_depth.T, labels.T)):
@@ -70,7 +96,7 @@ def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray,
     largest_first = np.argsort(-np.where(chosen, area, 0.0))
     together = np.cumsum(np.where(chosen, area, 0.0)[largest_first])
     chosen[largest_first[1:][together[1:] > MOST_TOGETHER]] = False
-    return chosen[labels] & (inverse_depth > 0)
+    return np.where(chosen[labels] & (inverse_depth > 0), labels, 0)
 
 
 def _surfaces(q: Float[np.ndarray, "h w"]) -> tuple[Integer[np.ndarray, "h w"], int]:

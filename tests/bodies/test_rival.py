@@ -13,7 +13,6 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival
 from gavo_jax.bodies.scene import Retina
-from gavo_jax.bodies.surfaces import nearer_part, standing_before
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
@@ -34,52 +33,6 @@ CAMERA = DEFAULT_CAMERA.level(1)
 SETTINGS = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(recover=False, bodies="mask"))
 """Of a program that other tests use, too."""
 FAST = preset("gauss-newton", "fast")
-
-
-def wall(depth: float = 2.0) -> np.ndarray:
-    return np.full((60, 80), 1.0 / depth)
-
-
-def test_a_card_before_a_wall_stands_before_it() -> None:
-    q, card = wall(), np.zeros((60, 80), bool)
-    card[20:40, 30:60] = True
-    q[card] = 1.0 / 0.8
-    assert (standing_before(q) == card).all() and (nearer_part(q).mask == card).all() and nearer_part(q).stands_before
-
-
-def test_of_two_surfaces_that_fill_the_image_the_larger_one_is_asked() -> None:
-    """What is left is to show a motion; all that stands before something is too much."""
-    q, card, table = wall(), np.zeros((60, 80), bool), np.zeros((60, 80), bool)
-    card[:, 25:75], table[35:, :22] = True, True
-    q[table], q[card] = 1.0 / 1.2, 1.0 / 0.8
-    assert (standing_before(q) == card).all()
-    q[:, 55:75], card[:, 55:75] = 1.0 / 2.0, False
-    assert (standing_before(q) == card | table).all()
-
-
-def test_a_shadow_without_depth_lies_between_a_card_and_a_wall() -> None:
-    q, card = wall(), np.zeros((60, 80), bool)
-    card[20:40, 30:60] = True
-    q[17:43, 27:63] = 0.0
-    q[card] = 1.0 / 0.8
-    assert (standing_before(q) == card).all()
-
-
-def test_a_window_is_behind_and_no_body() -> None:
-    q = wall(1.0)
-    q[20:40, 30:60] = 1.0 / 3.0
-    assert not standing_before(q)[20:40, 30:60].any()
-
-
-@pytest.mark.parametrize("q", [wall(), np.zeros((60, 80)), np.where(np.arange(80) == 3, 1.0, wall())])
-def test_nothing_stands_before_a_plain_wall(q: np.ndarray) -> None:
-    assert not nearer_part(q).mask.any()
-
-
-def test_a_floor_has_a_nearer_part() -> None:
-    q = np.repeat(np.linspace(0.3, 1.2, 60)[:, None], 80, axis=1)
-    near, stands_before = nearer_part(q)
-    assert not stands_before and near[-1].all() and not near[0].any() and 0.3 < near.mean() < 0.7
 
 
 def test_blocks_vote_for_the_true_motion() -> None:
