@@ -183,7 +183,7 @@ class BodyAware:
         roll = Roll(*map(np.asarray, scene.roll))
         seen, seemed_still = (), found == 0
         if np.any(found):
-            found = whole_surfaces(found, inverse_depth_of(retina.view(attempt.state)))
+            found = whole_surfaces(found, np.asarray(look.belief.known), inverse_depth_of(retina.view(attempt.state)))
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state

@@ -26,8 +26,11 @@ MOST_TOGETHER = 0.5
 """Share of the image up to which smaller surfaces than the largest one count, too."""
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 """Share of the image that may move together; less or more is not worth to ask about."""
-PART = 0.3
-"""Share of such a surface that moves, from which on all of it does."""
+PART, LARGEST_COMPLETED = 0.3, 0.6
+"""Share of such a surface that moves, from which on all of it does, if it fills no more of the image than this,"""
+STILL = -0.3
+"""and unless the middle one of its other pixels is believed to be at rest by more than this: a plain pixel is after half a
+second, a textured one after two frames."""
 BINS = 64
 
 
@@ -58,21 +61,23 @@ def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray,
 
 
 def whole_surfaces(
-    bodies: Integer[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
+    bodies: Integer[np.ndarray, "h w"], known: Float[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
 ) -> Integer[np.ndarray, "h w"]:
     """Bodies with all of each surface that stands before others and of which a part is theirs: a body that turns is
-    nearly at rest about its axis.
+    nearly at rest about its axis. Where the rest has been still for long they only seem to be one surface.
 
     Args:
         bodies: Number of the body that each pixel shows, 0 for none.
+        known: See `Belief`.
         inverse_depth: 1/m; 0 where there is no reading.
     """
     whole, surfaces = bodies.copy(), _standing_surfaces(inverse_depth)
     for surface in np.unique(surfaces[(bodies > 0) & (surfaces > 0)]):
         on_it = surfaces == surface
-        shown = np.bincount(bodies[on_it])
-        if 1.0 - shown[0] / shown.sum() > PART:
-            whole[on_it & (bodies == 0)] = 1 + np.argmax(shown[1:])
+        shown, rest = np.bincount(bodies[on_it]), on_it & (bodies == 0)
+        is_part = PART * shown.sum() < shown[1:].sum() < shown.sum() < LARGEST_COMPLETED * bodies.size
+        if is_part and np.median(known[rest]) > STILL:
+            whole[rest] = 1 + np.argmax(shown[1:])
     return whole
 
 

@@ -212,10 +212,10 @@ class Odometry:
             attempt, kept = doubt_reference(before.arrival, clock, attempt)
             after, result, lost = self._advance(before, usable, finding, attempt)
             after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
-            candidates, shown = attempt.candidates, sum(seen.share for seen in attempt.bodies)
-            revises = max(attempt.revises, 0 if lost else revised_by(before.beginning, shown))
+            candidates, revises = attempt.candidates, attempt.revises
             if not lost:
-                is_reference = after.tracker is not before.tracker
+                shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
+                revises = max(revises, revised_by(before.beginning, shown))
                 beginning = followed(before.beginning, timestamp, shown, is_reference=is_reference)
                 after = after._replace(beginning=beginning)
             size = (self.camera.height, self.camera.width)
@@ -231,6 +231,7 @@ class Odometry:
                 segment=found.segment,
                 adrift=0,
                 unknown=0,
+                beginning=None,
             )
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
             bodies = ()  # those that were seen moved against the last frame, which is not the reference any more
