@@ -29,8 +29,8 @@ LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 PART, LARGEST_COMPLETED = 0.3, 0.6
 """Share of such a surface that moves, from which on all of it does, if it fills no more of the image than this,"""
 STILL = -0.3
-"""and unless the middle one of its other pixels is believed to be at rest by more than this: a plain pixel is after half
-a second, a textured one after two frames."""
+"""and unless the middle one of its other pixels is believed to be at rest by more than this: a plain pixel is after
+half a second, a textured one after two frames."""
 BINS = 64
 
 
