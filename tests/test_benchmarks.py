@@ -390,10 +390,12 @@ def test_found_bodies_are_compared_with_the_true_ones(load) -> None:
 def test_pairs_that_are_wrong_and_told_so_are_counted(load) -> None:
     moving: ModuleType = load("moving")
     score = moving.Score("clip", "card", "x", 0, 0.3, 0.1)
-    for wrong, flagged in ((True, True), (True, False), (False, True), (False, False), (False, False)):
-        moving.count(score, wrong, flagged)
+    far, off, near = (0.03, 0.0), (0.01, 0.1), (0.0, 0.5)
+    for error, flagged in ((far, True), (far, False), (off, True), (near, False), (near, False)):
+        moving.count(score, error, flagged)
     summary = moving.summarise("clip", "card", [score])
     assert (summary.precision, summary.recall, summary.false_alarms) == (0.5, 0.5, pytest.approx(1 / 3))
+    assert (score.exact, summary.exact_flagged) == (2, 0.0)
     assert summary.ratio_worst == pytest.approx(3.0) and summary.overlap is None
 
 
