@@ -183,7 +183,8 @@ class BodyAware:
         roll = Roll(*map(np.asarray, scene.roll))
         seen, seemed_still = (), found == 0
         if np.any(found):
-            found = whole_surfaces(found, np.asarray(look.belief.known), inverse_depth_of(retina.view(attempt.state)))
+            lately = np.asarray(look.belief.suspected) > SUSPECTED
+            found = whole_surfaces(found, lately, inverse_depth_of(retina.view(attempt.state)))
         if np.any(found) or np.any(roll.numbers):
             roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
         tracker: TrackerState = attempt.state

@@ -27,10 +27,7 @@ MOST_TOGETHER = 0.5
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95
 """Share of the image that may move together; less or more is not worth to ask about."""
 PART, LARGEST_COMPLETED = 0.3, 0.6
-"""Share of such a surface that moves, from which on all of it does, if it fills no more of the image than this,"""
-STILL = -0.3
-"""and unless the middle one of its other pixels is believed to be at rest by more than this: a plain pixel is after
-half a second, a textured one after two frames."""
+"""Share of such a surface that moves, from which on all of it does, if it fills no more of the image than this."""
 BINS = 64
 
 
@@ -61,14 +58,14 @@ def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray,
 
 
 def whole_surfaces(
-    bodies: Integer[np.ndarray, "h w"], known: Float[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
+    bodies: Integer[np.ndarray, "h w"], lately: Bool[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
 ) -> Integer[np.ndarray, "h w"]:
     """Bodies with all of each surface that stands before others and of which a part is theirs: a body that turns is
-    nearly at rest about its axis. Where the rest has been still for long they only seem to be one surface.
+    nearly at rest about its axis. Where no body was seen on the rest they only seem to be one surface.
 
     Args:
         bodies: Number of the body that each pixel shows, 0 for none.
-        known: See `Belief`.
+        lately: Where a body was seen lately.
         inverse_depth: 1/m; 0 where there is no reading.
     """
     whole, surfaces = bodies.copy(), _standing_surfaces(inverse_depth)
@@ -76,7 +73,7 @@ def whole_surfaces(
         on_it = surfaces == surface
         shown, rest = np.bincount(bodies[on_it]), on_it & (bodies == 0)
         is_part = PART * shown.sum() < shown[1:].sum() < shown.sum() < LARGEST_COMPLETED * bodies.size
-        if is_part and np.median(known[rest]) > STILL:
+        if is_part and np.mean(lately[rest]) > 0.5:
             whole[rest] = 1 + np.argmax(shown[1:])
     return whole
 

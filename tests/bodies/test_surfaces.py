@@ -5,6 +5,8 @@ import pytest
 
 from gavo_jax.bodies.surfaces import nearer_part, standing_before, whole_surfaces
 
+EVERYWHERE = np.ones((60, 80), bool)
+
 
 def wall(depth: float = 2.0) -> np.ndarray:
     return np.full((60, 80), 1.0 / depth)
@@ -59,25 +61,24 @@ def test_a_body_that_turns_is_all_of_its_surface() -> None:
     q[card] = 1.0 / 0.8
     seen = np.zeros((60, 80), np.int32)
     seen[20:28, 30:60] = 3
-    unknown = np.zeros((60, 80))
-    assert (whole_surfaces(seen, unknown, q) == 3 * card).all()
-    assert (whole_surfaces(seen, np.where(seen > 0, 1.0, -0.5), q) == seen).all()  # a wall at the card's depth
+    assert (whole_surfaces(seen, card, q) == 3 * card).all()
+    assert (whole_surfaces(seen, seen > 0, q) == seen).all()  # what the card has come to stand beside, at its depth
     seen[24:28] = 0  # a fifth of it
-    assert (whole_surfaces(seen, unknown, q) == seen).all()
+    assert (whole_surfaces(seen, card, q) == seen).all()
 
 
 def test_what_stands_before_nothing_is_not_completed() -> None:
     """A hand on a table is no reason to take the table for a body."""
     seen = np.zeros((60, 80), np.int32)
     seen[:40] = 1
-    assert (whole_surfaces(seen, np.zeros((60, 80)), wall()) == seen).all()
+    assert (whole_surfaces(seen, EVERYWHERE, wall()) == seen).all()
 
 
 def test_two_bodies_keep_their_own_surfaces() -> None:
     q, seen = wall(), np.zeros((60, 80), np.int32)
     q[10:30, 10:30], q[10:30, 50:70] = 1.0 / 0.8, 1.0 / 0.9
     seen[10:20, 10:30], seen[10:25, 50:70] = 1, 2
-    whole = whole_surfaces(seen, np.zeros((60, 80)), q)
+    whole = whole_surfaces(seen, EVERYWHERE, q)
     assert (whole[10:30, 10:30] == 1).all() and (whole[10:30, 50:70] == 2).all() and np.sum(whole > 0) == 800
 
 
@@ -86,4 +87,4 @@ def test_a_surface_that_fills_the_image_is_not_completed() -> None:
     q, seen = wall(0.8), np.zeros((60, 80), np.int32)
     q[:, 70:] = 1.0 / 2.0
     seen[:30, :70] = 1
-    assert standing_before(q)[:, :70].all() and (whole_surfaces(seen, np.zeros((60, 80)), q) == seen).all()
+    assert standing_before(q)[:, :70].all() and (whole_surfaces(seen, EVERYWHERE, q) == seen).all()
