@@ -11,7 +11,7 @@ import numpy as np
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
-from gavo_jax.odometry.hindsight import revised, taken_back
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY, read_json
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse
@@ -96,15 +96,16 @@ def with_hindsight(lines: Sequence[str], steps: Sequence[Step]) -> list[str]:
 
     Args:
         lines: Of the file.
-        steps: Revised, one per row.
+        steps: As the driver made them, one per row.
     """
     lines = list(lines)
-    for place in taken_back(steps):
-        said = next(csv.reader([lines[place + 1]]))
-        known = dict(zip(FRAME_COLUMNS, frame_row(steps[place]), strict=True))
-        for name in ("status", "statuses", *DEVIATIONS):
-            said[FRAME_COLUMNS.index(name)] = str(known[name])
-        lines[place + 1] = as_line(said)
+    for place, (step, after) in enumerate(zip(steps, revised(steps), strict=True), start=1):
+        if after is not step:
+            said = next(csv.reader([lines[place]]))
+            known = dict(zip(FRAME_COLUMNS, frame_row(after), strict=True))
+            for name in ("status", "statuses", *DEVIATIONS):
+                said[FRAME_COLUMNS.index(name)] = str(known[name])
+            lines[place] = as_line(said)
     return lines
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Progress, Step
-from gavo_jax.odometry.hindsight import revised, taken_back
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (
@@ -277,13 +276,14 @@ class RunFolder:
     def _revise(self) -> None:
         """Replace frames.csv where pairs were taken back; then it does not grow any more."""
         steps = self._said()
-        if taken_back(steps):
+        rows = read_text(self.path / FRAMES).splitlines()
+        known = with_hindsight(rows, steps)
+        if known != rows:
             marks, images, progress = self._whole
             self._whole = ({name: mark for name, mark in marks.items() if name != FRAMES}, images, progress)
             if FRAMES in self._files:
                 self._files.pop(FRAMES).close()
-            rows = read_text(self.path / FRAMES)
-            write_lines(self.path / FRAMES, with_hindsight(rows.splitlines(), revised(steps)))
+            write_lines(self.path / FRAMES, known)
 
     def _open(self, files: Mapping[str, Mark | None]) -> None:
         for name, mark in files.items():
