@@ -29,7 +29,8 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.files import open_pair
 from gavo_jax.errors import GavoError
-from gavo_jax.evaluation import relative_pose_error, rotation_angle
+from gavo_jax.evaluation import relative_pose_error
+from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.driver import Step, track
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
@@ -325,8 +326,8 @@ def is_wrong(step: Step, sequence: Damaged, truth: Trajectory) -> bool:
     if not valid.all():
         return False
     error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
-    angle = np.degrees(rotation_angle(error[None, :3, :3])[0])
-    return bool(np.linalg.norm(error[:3, 3]) > WRONG[0] or angle > WRONG[1])
+    length, angle = size(error)
+    return bool(length > WRONG[0] or np.degrees(angle) > WRONG[1])
 
 
 def drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float:

@@ -39,6 +39,7 @@ from gavo_jax.datasets.moving import body_of_part
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
+from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
@@ -168,7 +169,8 @@ def pair_error(step: Step, poses: dict[float, np.ndarray], truth: Trajectory) ->
     if not valid.all() or step.reference_timestamp not in poses:
         return 0.0, 0.0
     error = inverse(inverse(true[0]) @ true[1]) @ inverse(poses[step.reference_timestamp]) @ step.world_T_camera
-    return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle(error[:3, :3])))
+    length, angle = size(error)
+    return float(length), float(np.degrees(angle))
 
 
 def exceeds(error: tuple[float, float], limits: tuple[float, float]) -> bool:

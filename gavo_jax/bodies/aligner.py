@@ -180,27 +180,25 @@ class BodyAware:
             attempt = mistrusted(attempt)
         limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
-        roll = Roll(*map(np.asarray, scene.roll))
-        seen, seemed_still = (), found == 0
-        if np.any(found):
-            lately = np.asarray(look.belief.suspected) > SUSPECTED
-            found = whole_surfaces(found, lately, inverse_depth_of(retina.view(attempt.state)))
+        roll, bodies, seen = Roll(*map(np.asarray, scene.roll)), found, ()
         if np.any(found) or np.any(roll.numbers):
-            roll, seen = find_motions(self, state, frame, clock, attempt, found, look.belief)
+            inverse_depth = inverse_depth_of(retina.view(attempt.state))
+            bodies = whole_surfaces(found, np.asarray(look.belief.suspected) > SUSPECTED, inverse_depth)
+            roll, seen = find_motions(self, state, frame, clock, bodies, look.belief, inverse_depth)
         tracker: TrackerState = attempt.state
         whole, elapsed = tracker.previous, float(clock.elapsed)
-        suspected = suspect(look.belief, found > 0, elapsed, trusted=not is_doubted)
+        suspected = suspect(look.belief, bodies > 0, elapsed, trusted=not is_doubted)
         after = retina.renewed(scene, look, elapsed)._replace(
             roll=roll, carried=np.asarray(carried, np.float32), suspected=suspected
         )
         if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
             after = after._replace(known=look.belief.carried)
-        elif np.any(found):
+        elif np.any(bodies != found):
             known = np.asarray(after.known)
-            after = after._replace(known=np.where((found > 0) & seemed_still, np.maximum(known, 0.0), known))
+            after = after._replace(known=np.where(bodies != found, np.maximum(known, 0.0), known))
         aside = suspected > SUSPECTED  # without what was just found, where the motion is in doubt
         if np.any(aside):
-            tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else found > 0)
+            tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else bodies > 0)
         return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:

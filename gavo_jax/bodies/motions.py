@@ -9,14 +9,12 @@ from jaxtyping import Float64, Integer
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import Unrest
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.evidence import inverse_depth_of
 from gavo_jax.bodies.identity import Roll, identify
 from gavo_jax.bodies.records import Seen
 from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.points import Reference, unsettle_reference
-from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
 
@@ -29,9 +27,9 @@ def find_motions(
     state: AwareState,
     frame: Frame,
     clock: Clock,
-    attempt: Attempt,
     found: Integer[np.ndarray, "h w"],
     belief: Belief,
+    inverse_depth: Float64[np.ndarray, "h w"],
 ) -> tuple[Roll, tuple[Seen, ...]]:
     """The bodies of a new frame by their numbers, with their motions where these are asked for.
 
@@ -40,14 +38,13 @@ def find_motions(
         state: Before the frame.
         frame: The new one.
         clock: When it was taken.
-        attempt: The camera's motion.
         found: Parts of the new frame that are bodies.
         belief: Of its pixels.
+        inverse_depth: Of them, 1/m; 0 where there is no reading.
     """
     before = Roll(*map(np.asarray, state.scene.roll))
     roll = identify(found, before)
     moving = np.asarray(belief.moving)
-    depth = inverse_depth_of(aware.retina.view(attempt.state))
     seen = []
     for place, (number, age) in enumerate(zip(roll.numbers, roll.ages, strict=True)):
         part = (roll.labels == number) & (found > 0)
@@ -59,7 +56,8 @@ def find_motions(
             if np.all(np.isfinite(alignment.xi)):
                 roll.motions[place], roll.seconds[place] = alignment.xi, clock.elapsed
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
-        seen.append(Seen(int(number), field, float(np.mean(part)), _centroid(part, depth, aware.retina), alignment))
+        centroid = _centroid(part, inverse_depth, aware.retina)
+        seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))
     return roll, tuple(seen)
 
 

@@ -68,6 +68,8 @@ def whole_surfaces(
         lately: Where a body was seen lately.
         inverse_depth: 1/m; 0 where there is no reading.
     """
+    if not np.any(bodies):
+        return bodies
     whole, surfaces = bodies.copy(), _standing_surfaces(inverse_depth)
     for surface in np.unique(surfaces[(bodies > 0) & (surfaces > 0)]):
         on_it = surfaces == surface

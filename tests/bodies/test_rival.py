@@ -3,6 +3,7 @@
 import importlib
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import jax
@@ -71,13 +72,16 @@ def error_mm(sequence: Any, steps: list[Step]) -> float:
     return 1e3 * float(np.linalg.norm(between[:3, 3]))
 
 
-@pytest.mark.parametrize(("share", "seed"), [(0.25, 2), (0.33, 5)])
-def test_a_card_does_not_take_the_camera_along(
-    data_dir: Path, share: float, seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A step to the side and a turn explained card and room to the eye; from then on the pose was 5 to 8 cm off."""
+@pytest.fixture
+def clips(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The benchmark's, with a card put in."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    clips = importlib.import_module("moving_clips")
+    return importlib.import_module("moving_clips")
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.25, 2), (0.33, 5)])
+def test_a_card_does_not_take_the_camera_along(data_dir: Path, share: float, seed: int, clips: ModuleType) -> None:
+    """A step to the side and a turn explained card and room to the eye; from then on the pose was 5 to 8 cm off."""
     sequence = clips.CardClip(TumSequence(data_dir / "fr1_xyz")[:60], share, seed, clips.LOOKS[0])
     odometry = Odometry(sequence.camera, FAST)
     steps = []
@@ -89,12 +93,8 @@ def test_a_card_does_not_take_the_camera_along(
     assert len(jumps) == 1 and AlignmentStatus.MOVING_BODY in jumps[0].statuses  # the pose is mended, and that is told
 
 
-def test_a_plain_body_that_comes_in_is_not_taken_for_wrong_depth(
-    data_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plain_body_that_comes_in_is_not_taken_for_wrong_depth(data_dir: Path, clips: ModuleType) -> None:
     """It was, and as no such frame became the reference, the body was never found."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    clips = importlib.import_module("moving_clips")
     sequence = clips.CardClip(TumSequence(data_dir / "fr1_rpy")[:60], 0.1, 2, clips.LOOKS[2])
     odometry = Odometry(sequence.camera, FAST)
     steps = [odometry.register(sequence[index], float(sequence.timestamps[index])) for index in range(36, 60)]
