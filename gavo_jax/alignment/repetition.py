@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float64, Integer
 
+from gavo_jax.alignment.planes import Plane, Small, StraightView, planes, seen_straight, smaller
 from gavo_jax.camera import Camera
 from gavo_jax.trajectory import inverse
 
@@ -18,40 +19,64 @@ REPEATS = 0.6
 APART = 0.3
 """By how much less it has to be on the way there: a smooth image is like itself everywhere."""
 FARTHEST = 3
-"""The largest shift that is looked at is the image's size over this."""
+"""The largest shift that is looked at is the view's size over this."""
+OVERLAP = 0.3
+"""Share of a plane that has to be seen before and after a shift."""
+AHEAD = 0.2
+"""Cosine between the optical axis and a plane's normal above which the plane lies ahead."""
 QUICK, EXACT = 4, 2
 """Factors by which the image is made smaller: for a first look, and where that finds something."""
 HINT = 0.3
 """Correlation from which on a first look finds something: it takes no account of what lies outside."""
 FAST = (1.0, 2.0)
 """m/s and rad/s of a hand that moves fast."""
-NEAREST, USUAL_DISTANCE = 0.1, 1.5
-"""Metres: nothing is nearer; and what an image without depth is taken to show."""
+NEAREST, FARTHEST_POINT, USUAL_DISTANCE = 0.1, 100.0, 1.5
+"""Metres: nothing is nearer, nor farther; and where an image without depth is taken to be."""
 NEARLY = 2.0
 """Distance from what was expected to another repetition, over the distance to what was found, up to which it may be
 that one."""
 
 
-def periods(grey: Any) -> Float64[np.ndarray, "n 2"]:
-    """Shifts (columns, rows), pixels, after which an image [H, W] looks much as before."""
-    if min(np.shape(grey)) < QUICK or not len(_peaks(_self_likeness(_smaller(grey, QUICK), exact=False), HINT)):
-        return np.zeros((0, 2))
-    likeness = _self_likeness(_smaller(grey, EXACT), exact=True)
-    return EXACT * _between_pixels(likeness, _peaks(likeness, REPEATS))
-
-
-def _smaller(grey: Any, factor: int) -> Float[np.ndarray, "h w"]:
-    small = cv2.resize(np.asarray(grey, np.float32), None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
-    return small - np.mean(small)
-
-
-def _self_likeness(image: Float[np.ndarray, "h w"], exact: bool) -> Float[np.ndarray, "n m"]:
-    """Correlation of an image with itself by the shift; none is in the middle.
+def repetitions(grey: Any, depth: Any, camera: Camera) -> list[tuple[Plane, Float64[np.ndarray, "n 3"]]]:
+    """Planes of a frame, and steps along each after which what is seen of it looks much as before, metres.
 
     Args:
-        image: Of mean 0.
-        exact: Whether it is that of the parts that overlap, else of the image as a torus.
+        grey: [H, W].
+        depth: In units of the camera's; 0 where nothing was read.
+        camera: Of both, by whose axes the steps are.
     """
+    if min(np.shape(grey)) < QUICK:
+        return []
+    coarse = smaller(grey, depth, camera, QUICK)
+    promising = [plane for plane in planes(coarse) or [_ahead(depth, camera)] if _may_repeat(coarse, plane)]
+    if not promising:
+        return []
+    fine = smaller(grey, depth, camera, EXACT)
+    return [(plane, _steps_along(plane, fine)) for plane in promising]
+
+
+def _may_repeat(frame: Small, plane: Plane) -> bool:
+    view = seen_straight(frame, plane)
+    return view is not None and len(_peaks(_self_likeness(view, exact=False), HINT)) > 0
+
+
+def _steps_along(plane: Plane, frame: Small) -> Float64[np.ndarray, "n 3"]:
+    view = seen_straight(frame, plane)
+    if view is None:
+        return np.zeros((0, 3))
+    likeness = _self_likeness(view, exact=True)
+    return _between_pixels(likeness, _peaks(likeness, REPEATS)) @ view.axes
+
+
+def _self_likeness(view: StraightView, exact: bool) -> Float[np.ndarray, "n m"]:
+    """Correlation of a view with itself by the shift; none is in the middle.
+
+    Args:
+        view: Straight before a plane.
+        exact: Whether it is that of the parts that overlap, else of the view as a torus.
+    """
+    there = view.inside.astype(np.float32)
+    image = there * (view.grey - view.grey[view.inside].mean()) if view.inside.any() else there
     height, width = image.shape
     beyond = (height // FARTHEST, width // FARTHEST)
     rows, columns = map(cv2.getOptimalDFTSize, np.add(image.shape, beyond)) if exact else image.shape
@@ -67,9 +92,10 @@ def _self_likeness(image: Float[np.ndarray, "h w"], exact: bool) -> Float[np.nda
     own = spectrum(image)
     likeness = correlation(own, own)
     if exact:
-        squares, inside = spectrum(image**2), spectrum(np.ones_like(image))
+        squares, inside = spectrum(image**2), spectrum(there)
         energies = correlation(squares, inside) * correlation(inside, squares)
-        likeness = likeness / np.sqrt(np.maximum(energies, 1.0))
+        overlap = correlation(inside, inside)
+        likeness = np.where(overlap > OVERLAP * there.sum(), likeness / np.sqrt(np.maximum(energies, 1.0)), 0.0)
     else:
         likeness = likeness / max(float(likeness[0, 0]), 1.0)
     middle = np.fft.fftshift(likeness)[rows // 2 - beyond[0] :, columns // 2 - beyond[1] :]
@@ -106,33 +132,29 @@ def _between_pixels(
     return shifts + np.stack(moved, axis=-1)
 
 
-def _difference(grey: Any, shift: Float64[np.ndarray, " 2"]) -> float:
-    """Mean square, squared grey levels, of what an image differs by from itself, shifted, where the two overlap."""
-    image = np.asarray(grey, np.float32)
-    size = image.shape[::-1]
-    move = np.column_stack([np.eye(2), shift]).astype(np.float32)
-    there = cv2.warpAffine(np.ones_like(image), move, size) > 0.999
-    return float(np.mean(np.square(cv2.warpAffine(image, move, size, flags=cv2.INTER_CUBIC) - image)[there]))
-
-
-def image_shift_of(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camera) -> Float64[np.ndarray, " 2"]:
-    """By how many pixels (columns, rows) a motion moves the middle of an image, about.
+def _difference(grey: Any, depth: Any, step: Float64[np.ndarray, " 3"], plane: Plane, camera: Camera) -> float:
+    """Mean square, squared grey levels, of what an image differs by from itself after a step of all it shows; infinite
+    where none of it is left in view.
 
     Args:
-        motion: target_T_reference.
-        depth: Of either frame, [H, W], in units of the camera's.
+        grey: [H, W].
+        depth: The same frame's, in units of the camera's.
+        step: Metres, by the camera's axes.
+        plane: What is taken to be seen where nothing was read.
         camera: Of both.
     """
-    away = _distance(depth, camera)
-    (x, y, _), (about_x, about_y, _) = motion[:3, 3], cv2.Rodrigues(motion[:3, :3])[0].ravel()
-    return np.array([camera.fx * (x / away + about_y), camera.fy * (y / away - about_x)])
-
-
-def _distance(depth: Any, camera: Camera) -> float:
-    """Metres, of the median of what is read."""
-    read = np.asarray(depth)[::8, ::8]
-    read = read[read > 0]
-    return max(float(np.median(read)) / float(camera.depth_scale), NEAREST) if read.size else USUAL_DISTANCE
+    image = np.asarray(grey, np.float32)
+    full = smaller(image, depth, camera, 1)
+    x, y = full.slopes
+    a, b, c = (plane.normal / plane.distance).astype(np.float32)
+    expected = np.maximum(a * x + (b * y + c)[:, None], 1 / FARTHEST_POINT)
+    z = 1 / np.where(full.inverse_depth > 0, full.inverse_depth, expected)
+    to_x, to_y, ahead = z * x + step[0], z * y[:, None] + step[1], np.maximum(z + step[2], NEAREST)
+    u = (float(camera.fx) * to_x / ahead + float(camera.cx)).astype(np.float32)
+    v = (float(camera.fy) * to_y / ahead + float(camera.cy)).astype(np.float32)
+    there = (u >= 0) & (u <= image.shape[1] - 1) & (v >= 0) & (v <= image.shape[0] - 1)
+    moved = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return float(np.mean(np.square(moved - image)[there])) if there.any() else np.inf
 
 
 LEAST_SHIFT = 4.0
@@ -141,7 +163,7 @@ AS_GOOD, NOISE = 6.0, 4.0
 """What a repetition differs by, over E, up to which it explains the images as well; and squared grey levels that E has
 at least, as an image between pixels is a guess."""
 MOST = 8
-"""Repetitions that are compared, the nearest."""
+"""Repetitions of each plane that are compared, the nearest."""
 
 
 def may_be_another_period(
@@ -162,9 +184,15 @@ def may_be_another_period(
         depth: Of the same, in units of the camera's.
         camera: Of both.
     """
-    shift = image_shift_of(found @ inverse(expected), depth, camera)
-    length = float(np.hypot(*shift))
-    return length >= LEAST_SHIFT and _repeats(grey, float(error), shift, NEARLY * length)
+    apart = found @ inverse(expected)
+    if _pixels(apart, depth, camera) < LEAST_SHIFT:
+        return False
+    for plane, others in repetitions(grey, depth, camera):
+        step = _step_of(apart, plane)
+        near = _nearest(others, step, NEARLY * float(np.linalg.norm(step)))
+        if _is_any_as_good(near, error, grey, depth, plane, camera):
+            return True
+    return False
 
 
 def may_be_any_period(
@@ -180,13 +208,51 @@ def may_be_any_period(
         depth: As above.
         camera: As above.
     """
-    reach = seconds * float(camera.fx) * (FAST[0] / _distance(depth, camera) + FAST[1])
-    return _repeats(grey, float(error), image_shift_of(found, depth, camera), reach)
+    reach = seconds * (FAST[0] + FAST[1] * _distance(depth, camera))
+    return any(
+        _is_any_as_good(_nearest(others, _step_of(found, plane), reach), error, grey, depth, plane, camera)
+        for plane, others in repetitions(grey, depth, camera)
+    )
 
 
-def _repeats(grey: Any, error: float, shift: Float64[np.ndarray, " 2"], reach: float) -> bool:
-    """Whether an image looks as before after another shift that is no further from a given one."""
-    others = periods(grey)
-    away = np.linalg.norm(others - shift, axis=1)
-    near = others[np.argsort(away)][: np.count_nonzero(away < reach)][:MOST]
-    return any(_difference(grey, other) < AS_GOOD * max(error, NOISE) for other in near)
+def _ahead(depth: Any, camera: Camera) -> Plane:
+    """A plane straight ahead, for what shows none."""
+    return Plane(np.array([0.0, 0.0, 1.0]), _distance(depth, camera))
+
+
+def _distance(depth: Any, camera: Camera) -> float:
+    """Metres, of the median of what is read."""
+    read = np.asarray(depth)[::8, ::8]
+    read = read[read > 0]
+    return max(float(np.median(read)) / float(camera.depth_scale), NEAREST) if read.size else USUAL_DISTANCE
+
+
+def _pixels(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camera) -> float:
+    """By how many a motion moves the middle of an image, about."""
+    ahead = _ahead(depth, camera)
+    return float(np.linalg.norm(_step_of(motion, ahead))) * float(camera.fx) / ahead.distance
+
+
+def _step_of(motion: Float64[np.ndarray, "4 4"], plane: Plane) -> Float64[np.ndarray, " 3"]:
+    """By how many metres, along it, a motion moves the point of a plane that is straight ahead, or where none is its
+    foot.
+    """
+    cosine = plane.normal[2]
+    point = np.array([0.0, 0.0, plane.distance / cosine]) if cosine > AHEAD else plane.foot
+    step = motion[:3, :3] @ point + motion[:3, 3] - point
+    return step - (step @ plane.normal) * plane.normal
+
+
+def _nearest(
+    others: Float64[np.ndarray, "n 3"], step: Float64[np.ndarray, " 3"], reach: float
+) -> Float64[np.ndarray, "k 3"]:
+    away = np.linalg.norm(others - step, axis=1)
+    return others[np.argsort(away)][: np.count_nonzero(away < reach)][:MOST]
+
+
+def _is_any_as_good(
+    steps: Float64[np.ndarray, "k 3"], error: Any, grey: Any, depth: Any, plane: Plane, camera: Camera
+) -> bool:
+    """Whether an image differs from itself after one of the steps by no more than E allows."""
+    bound = AS_GOOD * max(float(error), NOISE)
+    return any(_difference(grey, depth, step, plane, camera) < bound for step in steps)

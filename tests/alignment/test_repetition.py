@@ -9,7 +9,7 @@ from small import ALONE, CAMERA
 
 import gavo_jax as gavo
 from gavo_jax import se3
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period, periods
+from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period, repetitions
 from gavo_jax.datasets.synthetic import SyntheticSequence
 
 SETTINGS = replace(gavo.preset("gauss-newton", "fast"), odometry=ALONE)
@@ -31,18 +31,64 @@ def moved_by(pixels: float) -> np.ndarray:
     return np.asarray(se3.exp(jnp.asarray(step)), np.float64)
 
 
+def steps(grey: np.ndarray, depth: np.ndarray = DEPTH) -> np.ndarray:
+    """All after which a frame looks as before, metres."""
+    found = [others for _, others in repetitions(grey, depth, CAMERA)]
+    return np.concatenate([np.zeros((0, 3)), *found])
+
+
+def pixels(grey: np.ndarray) -> set[tuple[int, ...]]:
+    """The same before a wall straight ahead."""
+    return {tuple(step) for step in np.round(steps(grey)[:, :2] * CAMERA.fx / DISTANCE).astype(int).tolist()}
+
+
 def test_a_tiled_wall_repeats_itself_after_a_tile() -> None:
-    shifts = {tuple(shift) for shift in np.round(periods(wall(20.0, noise=3.0))).astype(int).tolist()}
-    assert {(20, 0), (0, 20), (-20, 0), (20, -20)} <= shifts
+    assert {(20, 0), (0, 20), (-20, 0), (20, -20)} <= pixels(wall(20.0, noise=3.0))
+
+
+def slanted(slope: float, period: float = 0.2, noise: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A tiled wall, turned by its slope along x, with tiles of so many metres; its depth as a Kinect reads it."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    z = DISTANCE / (1 - slope * x)
+    a, b = 2 * np.pi * x * z * np.hypot(1, slope) / period, 2 * np.pi * y * z / period
+    grey = 128 + 25 * np.sin(a) + 25 * np.sin(b) + 15 * np.sin(2 * a + b) + 15 * np.sin(a - 3 * b)
+    generator = np.random.default_rng(0)
+    read = 1 / (1 / z + 0.0015 * generator.normal(size=z.shape))
+    image = np.round(grey + noise * generator.normal(size=grey.shape)).astype(np.uint8)
+    return image, np.round(read * CAMERA.depth_scale).astype(np.uint16)
+
+
+@pytest.mark.parametrize("slope", [-0.6, 0.3, 0.9])
+def test_a_tiled_wall_repeats_itself_along_the_wall(slope: float) -> None:
+    """No shift of its image does, as tiles grow with nearness."""
+    tile = 0.2 * np.array([1.0, 0.0, slope]) / np.hypot(1.0, slope)
+    apart = np.linalg.norm(steps(*slanted(slope)) - tile, axis=1)
+    assert apart.min() < 0.01
+
+
+def test_a_floor_repeats_itself_before_a_bare_wall() -> None:
+    """Seen by a camera that looks down by 37 degrees."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
+    down, ahead = np.array([0.0, 0.8, 0.6]), np.array([0.0, -0.6, 0.8])
+    to_floor, to_wall = 1.2 / np.maximum(rays @ down, 1e-3), 2.2 / np.maximum(rays @ ahead, 1e-3)
+    z = np.minimum(to_floor, to_wall)
+    points = z[..., None] * rays
+    checks = np.sign(np.sin(np.pi * points[..., 0] / 0.2) * np.sin(np.pi * (points @ ahead) / 0.2))
+    grey = np.where(to_floor < to_wall, 128 + 50 * checks, 128).astype(np.uint8)
+    found = steps(grey, np.round(z * CAMERA.depth_scale).astype(np.uint16))
+    assert np.linalg.norm(found - (np.array([0.2, 0.0, 0.0]) + 0.2 * ahead), axis=1).min() < 0.02
 
 
 def test_a_room_repeats_nothing() -> None:
-    sequence = SyntheticSequence(frames=2, camera=CAMERA)
-    assert len(periods(sequence[0].grey)) == 0
+    frame = SyntheticSequence(frames=2, camera=CAMERA)[0]
+    assert not len(steps(frame.grey, frame.depth))
 
 
 @pytest.mark.parametrize("kind", ["plain", "ramp", "noise", "edge"])
-def test_what_has_no_pattern_repeats_nothing(kind: str) -> None:
+@pytest.mark.parametrize("depth", [DEPTH, np.zeros_like(DEPTH), slanted(0.6)[1]], ids=["ahead", "none", "slanted"])
+def test_what_has_no_pattern_repeats_nothing(kind: str, depth: np.ndarray) -> None:
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     images = {
         "plain": np.full(u.shape, 128),
@@ -50,18 +96,20 @@ def test_what_has_no_pattern_repeats_nothing(kind: str) -> None:
         "noise": np.random.default_rng(0).integers(0, 255, u.shape),
         "edge": np.where(u > 70, 200, 50),
     }
-    assert len(periods(images[kind].astype(np.uint8))) == 0
+    assert not len(steps(images[kind].astype(np.uint8), depth))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 640), (640, 1), (5, 7)])
 def test_what_is_too_small_for_a_pattern_repeats_nothing(size: tuple[int, int]) -> None:
-    assert len(periods(np.random.default_rng(0).integers(0, 255, size).astype(np.uint8))) == 0
+    grey = np.random.default_rng(0).integers(0, 255, size).astype(np.uint8)
+    for depth in (np.zeros(size, np.uint16), np.full(size, 7500, np.uint16)):
+        assert not len(steps(grey, depth))
 
 
 def test_a_motion_whose_error_is_far_below_what_a_period_changes_is_not_off_by_it() -> None:
     """On a wall that grows brighter to the right."""
     grey = np.round(wall(24.0) * 0.8 + 0.3 * np.arange(CAMERA.width)).astype(np.uint8)
-    assert [24, 0] in np.round(periods(grey)).tolist()
+    assert (24, 0) in pixels(grey)
     assert may_be_another_period(moved_by(9.0), 200.0, np.eye(4), grey, DEPTH, CAMERA)
     assert not may_be_another_period(moved_by(9.0), 5.0, np.eye(4), grey, DEPTH, CAMERA)
 
@@ -80,6 +128,13 @@ def test_where_nothing_was_known_any_period_counts_that_a_hand_reaches() -> None
     assert may_be_any_period(moved_by(3.0), 4.0, np.inf, grey, DEPTH, CAMERA)
     assert may_be_any_period(moved_by(3.0), 4.0, 0.1, grey, DEPTH, CAMERA)
     assert not may_be_any_period(moved_by(3.0), 4.0, 0.005, grey, DEPTH, CAMERA)
+
+
+def test_align_says_so_of_a_slanted_wall_too() -> None:
+    first, second = slanted(0.6), slanted(0.6, noise=2.0)
+    result = gavo.align(first, second, CAMERA, SETTINGS)
+    assert gavo.AlignmentStatus.AMBIGUOUS in result.statuses
+    assert gavo.align(first, second, CAMERA, SETTINGS, guess=np.eye(4)).status == gavo.AlignmentStatus.OK
 
 
 def test_align_says_that_a_tiled_wall_leaves_the_motion_open() -> None:
