@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import Rendered
+from small import Rendered, StandIn
 
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies.records import Seen
@@ -48,7 +48,7 @@ def test_where_bodies_are_known_the_camera_is_told_from_them() -> None:
     assert known is None and followed(None, 0.3, 0.0, is_reference=True) is None
 
 
-class Covered:
+class Covered(StandIn):
     """An aligner that follows a body for some frames, loses it, and then sees it as one."""
 
     def __init__(self, followed: int, share: float) -> None:
@@ -56,18 +56,9 @@ class Covered:
         good, lost = no_alignment(AlignmentStatus.OK), no_alignment(AlignmentStatus.LOW_TEXTURE)
         self.attempts = [(good, ())] * followed + [(lost, ())] * 3 + [(good, (body,))] * 2
 
-    def warm_up(self) -> float:
-        return 0.0
-
-    def start(self, frame: Frame) -> Any:
-        return frame.timestamp
-
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         result, bodies = self.attempts.pop(0)
         return Attempt(frame.timestamp, result, result.status is AlignmentStatus.OK, bodies=bodies)
-
-    def predict(self, state: Any, elapsed: float) -> np.ndarray:
-        return np.eye(4)
 
 
 @pytest.mark.parametrize(("followed", "share", "told"), [(5, 0.5, range(5)), (5, 0.1, range(0)), (40, 0.5, range(0))])

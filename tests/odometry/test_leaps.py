@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from small import StandIn
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import no_alignment, with_finding
@@ -26,7 +27,7 @@ SPEED, DT = 0.6, 1 / 30
 STEP = SPEED * DT
 
 
-class OnRails:
+class OnRails(StandIn):
     """Finds every motion, and cannot believe one that is far from the last one's speed."""
 
     def start(self, frame: Frame) -> tuple[float, float]:
@@ -34,9 +35,6 @@ class OnRails:
 
     def place(self, frame: Frame) -> float:
         return float(frame.grey[0, 0])
-
-    def warm_up(self) -> float:
-        return 0.0
 
     def predict(self, state: tuple[float, float], elapsed: float) -> NDArray[np.float64]:
         return moved(-state[1] * elapsed)

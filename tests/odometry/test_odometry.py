@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import Rendered
+from small import Rendered, StandIn
 
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
@@ -600,23 +600,14 @@ def test_the_wide_search_recovers_what_the_default_loses() -> None:
     assert run_odometry(jump, GaussNewton()).metrics["lost_pairs"] < max(lost, 1)
 
 
-class Told:
+class Told(StandIn):
     """An aligner that finds what it is told."""
 
     def __init__(self, result: Alignment) -> None:
         self.result = result
 
-    def warm_up(self) -> float:
-        return 0.0
-
-    def start(self, frame: Frame) -> Any:
-        return frame.timestamp
-
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         return Attempt(frame.timestamp, self.result, self.result.status is AlignmentStatus.OK)
-
-    def predict(self, state: Any, elapsed: float) -> np.ndarray:
-        return np.eye(4)
 
 
 def found(status: AlignmentStatus, x: float) -> Alignment:
