@@ -75,7 +75,7 @@ def smaller(grey: Any, depth: Any, camera: Camera, factor: int) -> Small:
     """
     image = np.asarray(grey, np.float32)
     small = cv2.resize(image, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
-    read = cv2.resize(np.asarray(depth), small.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float32)
+    read = cv2.resize(np.asarray(depth, np.float32), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
     across, down = np.divide(small.shape[::-1], image.shape[::-1])
     focal = np.diag([camera.fx * across, camera.fy * down, 1.0])
     middle = [(camera.cx + 0.5) * across - 0.5, (camera.cy + 0.5) * down - 0.5, 1.0]
