@@ -278,7 +278,7 @@ def test_folders_of_other_names_say_which_are_known(folder):
     ):
         open_source(folder)
     (folder / "left").rename(folder / "RGB")
-    with pytest.raises(GavoError, match=r"no folder of depth beside rgb/; depth is looked for in .*, depth, depths, "):
+    with pytest.raises(GavoError, match=r"no folder of depth beside RGB/; depth is looked for in .*, depth, depths, "):
         open_source(folder)
 
 
