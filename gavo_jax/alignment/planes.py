@@ -53,6 +53,12 @@ class Small(NamedTuple):
         rows, columns = (np.arange(size, dtype=np.float32) for size in self.grey.shape)
         return (columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)
 
+    def inverse_depth_of(self, plane: Plane) -> Float[np.ndarray, "h w"]:
+        """What its pixels would read, 1/m, if they showed a plane; below 0 where they look away from it."""
+        x, y = self.slopes
+        a, b, c = (plane.normal / plane.distance).astype(np.float32)
+        return a * x + (b * y + c)[:, None]
+
 
 class StraightView(NamedTuple):
     """An image as a camera sees it that looks along a plane's normal."""
@@ -125,16 +131,14 @@ def seen_straight(frame: Small, plane: Plane) -> StraightView | None:
     """A frame as it is seen from straight before a plane, or None where too little of it would be; what was not read is
     taken for the plane.
     """
-    x, y = frame.slopes
-    a, b, c = (plane.normal / plane.distance).astype(np.float32)
-    expected = a * x + (b * y + c)[:, None]
-    q = frame.inverse_depth
+    expected, q = frame.inverse_depth_of(plane), frame.inverse_depth
     inside = (expected > 0) & ((q == 0) | _is_near(expected, q))
     row, column = np.nonzero(inside)
     row, column = row[::EVERY], column[::EVERY]
     if len(row) < LEAST:
         return None
     right, down = _axes(plane.normal)
+    x, y = frame.slopes
     points = np.stack([x[column], y[row], np.ones_like(x[column])], axis=-1) / expected[row, column, None]
     low, high = np.percentile(points @ np.stack([right, down], axis=-1), MIDDLE, axis=0)
     pixel = max(float(np.sqrt(np.prod(high - low) / frame.grey.size)), 1e-9)

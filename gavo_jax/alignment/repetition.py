@@ -132,26 +132,22 @@ def _between_pixels(
     return shifts + np.stack(moved, axis=-1)
 
 
-def _difference(grey: Any, depth: Any, step: Float64[np.ndarray, " 3"], plane: Plane, camera: Camera) -> float:
-    """Mean square, squared grey levels, of what an image differs by from itself after a step of all it shows; infinite
+def _difference(frame: Small, step: Float64[np.ndarray, " 3"], plane: Plane) -> float:
+    """Mean square, squared grey levels, of what a frame differs by from itself after a step of all it shows; infinite
     where none of it is left in view.
 
     Args:
-        grey: [H, W].
-        depth: The same frame's, in units of the camera's.
+        frame: Of full size.
         step: Metres, by the camera's axes.
         plane: What is taken to be seen where nothing was read.
-        camera: Of both.
     """
-    image = np.asarray(grey, np.float32)
-    full = smaller(image, depth, camera, 1)
-    x, y = full.slopes
-    a, b, c = (plane.normal / plane.distance).astype(np.float32)
-    expected = np.maximum(a * x + (b * y + c)[:, None], 1 / FARTHEST_POINT)
-    z = 1 / np.where(full.inverse_depth > 0, full.inverse_depth, expected)
-    to_x, to_y, ahead = z * x + step[0], z * y[:, None] + step[1], np.maximum(z + step[2], NEAREST)
-    u = (float(camera.fx) * to_x / ahead + float(camera.cx)).astype(np.float32)
-    v = (float(camera.fy) * to_y / ahead + float(camera.cy)).astype(np.float32)
+    image, q, step = frame.grey, frame.inverse_depth, step.astype(np.float32)
+    z = 1 / np.where(q > 0, q, np.maximum(frame.inverse_depth_of(plane), 1 / FARTHEST_POINT))
+    x, y = frame.slopes
+    ahead = np.maximum(z + step[2], NEAREST)
+    (fx, _, cx), (_, fy, cy), _ = frame.intrinsics.astype(np.float32)
+    u = fx * (z * x + step[0]) / ahead + cx
+    v = fy * (z * y[:, None] + step[1]) / ahead + cy
     there = (u >= 0) & (u <= image.shape[1] - 1) & (v >= 0) & (v <= image.shape[0] - 1)
     moved = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return float(np.mean(np.square(moved - image)[there])) if there.any() else np.inf
@@ -187,12 +183,12 @@ def may_be_another_period(
     apart = found @ inverse(expected)
     if _pixels(apart, depth, camera) < LEAST_SHIFT:
         return False
-    for plane, others in repetitions(grey, depth, camera):
-        step = _step_of(apart, plane)
-        near = _nearest(others, step, NEARLY * float(np.linalg.norm(step)))
-        if _is_any_as_good(near, error, grey, depth, plane, camera):
-            return True
-    return False
+    near = [
+        (plane, _nearest(others, step, NEARLY * float(np.linalg.norm(step))))
+        for plane, others in repetitions(grey, depth, camera)
+        for step in [_step_of(apart, plane)]
+    ]
+    return _is_any_as_good(near, error, grey, depth, camera)
 
 
 def may_be_any_period(
@@ -209,10 +205,10 @@ def may_be_any_period(
         camera: As above.
     """
     reach = seconds * (FAST[0] + FAST[1] * _distance(depth, camera))
-    return any(
-        _is_any_as_good(_nearest(others, _step_of(found, plane), reach), error, grey, depth, plane, camera)
-        for plane, others in repetitions(grey, depth, camera)
-    )
+    near = [
+        (plane, _nearest(others, _step_of(found, plane), reach)) for plane, others in repetitions(grey, depth, camera)
+    ]
+    return _is_any_as_good(near, error, grey, depth, camera)
 
 
 def _ahead(depth: Any, camera: Camera) -> Plane:
@@ -251,8 +247,10 @@ def _nearest(
 
 
 def _is_any_as_good(
-    steps: Float64[np.ndarray, "k 3"], error: Any, grey: Any, depth: Any, plane: Plane, camera: Camera
+    near: list[tuple[Plane, Float64[np.ndarray, "k 3"]]], error: Any, grey: Any, depth: Any, camera: Camera
 ) -> bool:
-    """Whether an image differs from itself after one of the steps by no more than E allows."""
-    bound = AS_GOOD * max(float(error), NOISE)
-    return any(_difference(grey, depth, step, plane, camera) < bound for step in steps)
+    """Whether an image differs from itself after one of some planes' steps by no more than E allows."""
+    if not any(len(steps) for _, steps in near):
+        return False
+    bound, full = AS_GOOD * max(float(error), NOISE), smaller(grey, depth, camera, 1)
+    return any(_difference(full, step, plane) < bound for plane, steps in near for step in steps)
