@@ -212,7 +212,7 @@ class Recovering:
         """The first attempt if it is usable, else the second one if that is.
 
         If neither is, the first one's motion can be used all the same where a high error is all that speaks against it
-        and the second ends at the same motion (blur, or something that moves).
+        and the second ends at the same motion (blur, or something that moves). A reference should be better explained.
         """
         attempt = self.first.align(state, frame, clock)
         if attempt.usable:
@@ -221,7 +221,7 @@ class Recovering:
         if again.usable:
             return again
         confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
-        return attempt._replace(usable=confirmed and agree(attempt.result, again.result))
+        return attempt._replace(usable=confirmed and agree(attempt.result, again.result), fit=False)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the first one."""

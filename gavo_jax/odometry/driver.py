@@ -86,6 +86,8 @@ class Relocaliser(Protocol):
 
 MAX_HELD = 3
 """Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
+POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
+"""Of a frame with a motion that becomes the reference only then."""
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
@@ -305,8 +307,8 @@ class Odometry:
             after = after._replace(unknown=0)
             if before.unknown >= MAX_HELD:  # too many to go on in the same world
                 after = after._replace(segment=before.segment + 1, adrift=1)
-        overdue = finding.status is AlignmentStatus.PARTIAL_DEPTH and after.held >= MAX_HELD
-        if attempt.fit and (finding.use is Use.ALL or overdue):
+        overdue = after.held >= MAX_HELD and not POOR.isdisjoint(result.statuses) and (attempt.fit or not doubted)
+        if overdue or (attempt.fit and finding.use is Use.ALL):
             after = after._replace(
                 tracker=attempt.state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0
             )

@@ -636,7 +636,19 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
     step = odometry.register(sequence[1], 1 / 30)
     assert step is not None and step.lost is (x is None)
     assert step.world_T_camera[0, 3] == pytest.approx(-(x or 0.0))
-    assert odometry.progress.tracker == (sequence[0].timestamp if x is None else sequence[1].timestamp)
+    is_explained = AlignmentStatus.OK in (first.status, second.status)
+    assert odometry.progress.tracker == sequence[int(is_explained)].timestamp
+
+
+def test_a_frame_that_is_not_explained_is_no_reference_while_the_old_one_is_in_reach() -> None:
+    """The next frame would be compared with what was wrong in it: pairs behind one were off by three times as much."""
+    poor = Told(found(AlignmentStatus.HIGH_ERROR, 0.02))
+    odometry = Odometry(CAMERA, aligner=Recovering(poor, lambda: poor))
+    sequence = Rendered(frames=6, camera=CAMERA, noise=NONE)
+    steps = [odometry.register(frame, frame.timestamp) for frame in sequence]
+    of = [int(np.argmin(np.abs(sequence.timestamps - step.reference_timestamp))) for step in steps if step is not None]
+    assert of == [0, 0, 0, 3, 3]
+    assert not any(step.lost for step in steps if step is not None)
 
 
 @pytest.mark.parametrize(
