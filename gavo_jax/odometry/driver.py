@@ -86,10 +86,10 @@ class Relocaliser(Protocol):
 
 MAX_HELD = 3
 """Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
-POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
-"""Of a frame with a motion that becomes the reference only then."""
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
+POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
+"""Of frames that have a motion, but become the reference only where the old one is out of reach."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 
