@@ -1,12 +1,13 @@
 """The large planes that a frame shows, by its depth, and its image as it is seen from straight before one of them."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_ray
 
 MOST, LARGE = 3, 0.25
 """Planes that are looked for, and the share of the readings that each has at least."""
@@ -44,14 +45,14 @@ class Small(NamedTuple):
     grey: Float[np.ndarray, "h w"]
     inverse_depth: Float[np.ndarray, "h w"]
     """1/m; 0 where nothing was read."""
-    intrinsics: Float64[np.ndarray, "3 3"]
+    camera: Camera
+    """Of the smaller images."""
 
     @property
     def slopes(self) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:
         """The x and y of the rays (x, y, 1) through its columns and rows."""
-        (fx, _, cx), (_, fy, cy), _ = self.intrinsics
         rows, columns = (np.arange(size, dtype=np.float32) for size in self.grey.shape)
-        return (columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)
+        return to_ray(self.camera, columns, rows)
 
     def inverse_depth_of(self, plane: Plane) -> Float[np.ndarray, "h w"]:
         """What its pixels would read, 1/m, if they showed a plane; below 0 where they look away from it."""
@@ -79,14 +80,13 @@ def smaller(grey: Any, depth: Any, camera: Camera, factor: int) -> Small:
         camera: Of both.
         factor: By how much smaller along either side.
     """
-    image = np.asarray(grey, np.float32)
-    small = cv2.resize(image, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
-    read = cv2.resize(np.asarray(depth, np.float32), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    across, down = np.divide(small.shape[::-1], image.shape[::-1])
-    focal = np.diag([camera.fx * across, camera.fy * down, 1.0])
-    middle = [(camera.cx + 0.5) * across - 0.5, (camera.cy + 0.5) * down - 0.5, 1.0]
-    intrinsics = np.column_stack([focal[:, :2], middle])
-    return Small(small, np.where(read > 0, float(camera.depth_scale) / np.maximum(read, 1e-9), 0.0), intrinsics)
+    by = 1 / factor
+    small = cv2.resize(np.asarray(grey, np.float32), None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
+    read = cv2.resize(np.asarray(depth, np.float32), None, fx=by, fy=by, interpolation=cv2.INTER_NEAREST)
+    fx, fy, cx, cy = map(float, camera.scaled(by))
+    height, width = small.shape
+    seen_by = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+    return Small(small, np.where(read > 0, float(camera.depth_scale) / np.maximum(read, 1e-9), 0.0), seen_by)
 
 
 def planes(frame: Small) -> list[Plane]:
@@ -146,7 +146,7 @@ def seen_straight(frame: Small, plane: Plane) -> StraightView | None:
     if size.min() < NARROW:
         return None
     corner = plane.foot + low[0] * right + low[1] * down
-    homography = frame.intrinsics @ np.stack([pixel * right, pixel * down, corner], axis=-1)
+    homography = frame.camera.matrix @ np.stack([pixel * right, pixel * down, corner], axis=-1)
     grey, there = (
         cv2.warpPerspective(image, homography, size.astype(int).tolist(), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         for image in (frame.grey, inside.astype(np.float32))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Integer
 
 from gavo_jax.alignment.planes import Plane, Small, StraightView, planes, seen_straight, smaller
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.trajectory import inverse
 
 REPEATS = 0.6
@@ -145,9 +145,7 @@ def _difference(frame: Small, step: Float64[np.ndarray, " 3"], plane: Plane) -> 
     z = 1 / np.where(q > 0, q, np.maximum(frame.inverse_depth_of(plane), 1 / FARTHEST_POINT))
     x, y = frame.slopes
     ahead = np.maximum(z + step[2], NEAREST)
-    (fx, _, cx), (_, fy, cy), _ = frame.intrinsics.astype(np.float32)
-    u = fx * (z * x + step[0]) / ahead + cx
-    v = fy * (z * y[:, None] + step[1]) / ahead + cy
+    u, v = to_pixels(frame.camera, z * x + step[0], z * y[:, None] + step[1], 1 / ahead)
     there = (u >= 0) & (u <= image.shape[1] - 1) & (v >= 0) & (v <= image.shape[0] - 1)
     moved = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return float(np.mean(np.square(moved - image)[there])) if there.any() else np.inf
