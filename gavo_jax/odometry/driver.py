@@ -23,6 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
+from gavo_jax.odometry.depth_change import DepthWatch, delay_of, watch_from
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
@@ -122,6 +123,8 @@ class Progress(NamedTuple):
     """How the reference was reached, where its image may be of another moment."""
     beginning: Beginning | None = None
     """Of the track, as long as it may have followed a body."""
+    depth: DepthWatch | None = None
+    """Of the reference, and how depth has changed; None before the first reference."""
 
 
 class Odometry:
@@ -224,6 +227,13 @@ class Odometry:
             bodies = tuple(
                 in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
             )
+            if not lost and before.depth is not None:
+                still = without_bodies(usable, bodies)
+                watch = before.depth.after(still, float(clock.elapsed), result.target_T_reference, self.camera)
+                after = after._replace(depth=watch)
+                if watch.is_unexplained:
+                    result = with_finding(result, AlignmentStatus.DEPTH_MISMATCH)
+                    revises = max(revises, 0 if before.depth.is_unexplained else len(before.depth.left))
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -239,6 +249,9 @@ class Odometry:
             bodies = ()  # those that were seen moved against the last frame, which is not the reference any more
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
+        if usable is not None and after.tracker is not before.tracker:
+            watch = after.depth.seen_from(usable, self.camera) if after.depth else watch_from(usable, self.camera)
+            after = after._replace(depth=watch)
         self.progress, self.candidates = after, candidates
         if before.last_index == 0:
             return None
@@ -332,8 +345,15 @@ class Odometry:
 def clock_of(before: Progress, frame: Frame) -> Clock:
     """When a frame was taken, for a driver that counts it as its last one already."""
     elapsed = frame.timestamp - before.reference_timestamp
-    delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
-    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay), np.uint32(before.last_index))
+    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay_of(frame)), np.uint32(before.last_index))
+
+
+def without_bodies(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
+    """A frame without depth where something moves on its own."""
+    if not bodies:
+        return frame
+    covered = np.any([body.mask for body in bodies], axis=0)
+    return replace(frame, depth=np.where(covered, 0, frame.depth))
 
 
 def unwatched(frame: Frame | None, step: Step | None) -> None:

@@ -1,4 +1,6 @@
-"""What is known of earlier pairs only later: that they followed a body, or led to an image of another moment."""
+"""What is known of earlier pairs only later: that they followed a body, led to an image of another moment, or had depth
+that did not change as they say.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -17,8 +19,8 @@ from gavo_jax.trajectory import inverse
 
 
 def revised(steps: Iterable[Step]) -> list[Step]:
-    """The steps of a run, those that a later one revises as `moving_body` or `implausible_motion`, as its own
-    statuses say, with the covariance of what is unknown.
+    """The steps of a run, those that a later one revises as `moving_body`, `implausible_motion` or
+    `depth_mismatch`, as its own statuses say, with the covariance of what is unknown.
 
     Their poses stay as they are: how the camera moved meanwhile, nobody saw. Lost pairs stay as they are as well.
 
@@ -57,14 +59,16 @@ def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
 
 
 def _said_of_others(step: Step) -> AlignmentStatus:
-    """What a step finds of those that it revises: that an image is not of its stamp's moment, or else a body.
+    """What a step finds of those that it revises: that an image is not of its stamp's moment, that depth has not
+    changed as the motions say, or else a body.
 
     What was found of the step first counts: more may have been found since, of its image or by a later step.
     """
+    telling = (AlignmentStatus.MOVING_BODY, *BY_TIME, AlignmentStatus.DEPTH_MISMATCH)
     first, found = step.alignment.status, step.alignment.statuses
-    if first not in (AlignmentStatus.MOVING_BODY, *BY_TIME):
-        first = next((status for status in (AlignmentStatus.MOVING_BODY, *BY_TIME) if status in found), None)
-    return AlignmentStatus.IMPLAUSIBLE_MOTION if first in BY_TIME else AlignmentStatus.MOVING_BODY
+    if first not in telling:
+        first = next((status for status in telling if status in found), AlignmentStatus.MOVING_BODY)
+    return AlignmentStatus.IMPLAUSIBLE_MOTION if first in BY_TIME else first
 
 
 BY_TIME = (AlignmentStatus.IMPLAUSIBLE_MOTION, AlignmentStatus.BAD_TIMESTAMP)

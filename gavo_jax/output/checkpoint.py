@@ -16,6 +16,7 @@ import numpy as np
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
+from gavo_jax.odometry.depth_change import DepthWatch
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
@@ -65,6 +66,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
         "beginning": progress.beginning,
+        "depth": progress.depth and [progress.depth.inverse.tolist(), *progress.depth[1:]],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
@@ -109,6 +111,8 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
         beginning = numbers.get("beginning")
         numbers["beginning"] = beginning and Beginning(*beginning)
+        depth = numbers.get("depth")
+        numbers["depth"] = depth and DepthWatch(np.array(depth[0]), depth[1], *map(tuple, depth[2:]))
         progress = Progress(**numbers, **poses)
     except GavoError:
         raise

@@ -1,0 +1,126 @@
+"""Depth that was wrong from the first frame on does not change as the motions of the image say."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import CAMERA, Rendered, StandIn
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.bodies.records import Seen
+from gavo_jax.datasets.base import Frame
+from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.depth_change import MIN_REMEMBERED, REMEMBERED, left_unexplained, watch_from
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
+
+FRAMES = 20
+
+
+@cache
+def room() -> tuple[list[Frame], np.ndarray]:
+    """Frames, and the true world_T_camera of each."""
+    sequence = Rendered(FRAMES, camera=CAMERA)
+    truth, _ = sequence.ground_truth.interpolate(sequence.timestamps)
+    return [sequence[i] for i in range(FRAMES)], truth
+
+
+class Knowing(StandIn):
+    """An aligner that knows the truth, and sees some bodies."""
+
+    def __init__(self, bodies: tuple[Seen, ...] = ()) -> None:
+        frames, poses = room()
+        self.poses = {frame.timestamp: pose for frame, pose in zip(frames, poses, strict=True)}
+        self.bodies = bodies
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        motion = inverse(self.poses[frame.timestamp]) @ self.poses[state]
+        result = no_alignment(AlignmentStatus.OK)._replace(target_T_reference=motion, error=np.float32(1.0))
+        return Attempt(frame.timestamp, result, usable=True, candidates=(), bodies=self.bodies)
+
+
+def steps_of(frames: list[Frame], bodies: tuple[Seen, ...] = ()) -> list[Step]:
+    odometry = Odometry(CAMERA, aligner=Knowing(bodies))
+    return [step for frame in frames if (step := odometry.register(frame, frame.timestamp)) is not None]
+
+
+def flagged(steps: list[Step]) -> list[bool]:
+    return [AlignmentStatus.DEPTH_MISMATCH in step.alignment.statuses for step in steps]
+
+
+def turned_round(depth: np.ndarray) -> np.ndarray:
+    return depth[::-1, ::-1].copy()
+
+
+def as_disparity(depth: np.ndarray) -> np.ndarray:
+    return (CAMERA.depth_scale**2 * 4.0 / np.maximum(depth, 1)).astype(np.uint16)
+
+
+def test_depth_that_changes_as_the_camera_moves_is_right() -> None:
+    steps = steps_of(room()[0])
+    assert not any(flagged(steps)) and not any(step.revises for step in steps)
+
+
+@pytest.mark.parametrize("damage", [turned_round, np.flipud, as_disparity])
+def test_depth_that_was_never_right_is_told_of_every_pair(damage: Callable[[np.ndarray], np.ndarray]) -> None:
+    steps = steps_of([replace(frame, depth=damage(frame.depth)) for frame in room()[0]])
+    assert flagged(steps) == [False] * (MIN_REMEMBERED - 1) + [True] * (FRAMES - MIN_REMEMBERED)
+    assert all(flagged(revised(steps))) and all(flagged(revised(revised(steps))))
+
+
+def test_depth_of_another_moment_is_right_where_its_stamp_says_so() -> None:
+    frames = room()[0]
+    sources = [frames[2 * k + k % 2] for k in range(FRAMES // 2)]  # three intervals from one to the next, then one
+    late = [replace(frame, depth=source.depth) for frame, source in zip(frames[::2], sources, strict=True)]
+    stamped = [replace(frame, depth_timestamp=source.timestamp) for frame, source in zip(late, sources, strict=True)]
+    figures = []
+    for sequence in (late, stamped):
+        odometry = Odometry(CAMERA, aligner=Knowing())
+        for frame in sequence:
+            odometry.register(frame, frame.timestamp)
+        assert odometry.progress.depth is not None
+        figures.append(np.median(odometry.progress.depth.left))
+    assert figures[1] < 0.5 * figures[0]
+
+
+def test_depth_where_a_body_moves_says_nothing() -> None:
+    field = np.where(np.arange(80) < 40, 1.0, -1.0) * np.ones((60, 1))
+    body = Seen(1, field.astype(np.float32), 0.5, np.zeros(3))
+    halves = [replace(f, depth=np.where(np.arange(160) < 80, np.flipud(f.depth), f.depth)) for f in room()[0]]
+    assert not any(flagged(steps_of(halves, (body,))))
+    assert any(flagged(steps_of([replace(f, depth=np.flipud(f.depth)) for f in room()[0]], (body,))))
+
+
+@pytest.mark.parametrize("depth", [np.zeros((120, 160), np.uint16), np.full((120, 160), np.nan, np.float32)])
+def test_nothing_is_known_without_readings_or_without_motion(depth: np.ndarray) -> None:
+    frames, poses = room()
+    watch = watch_from(frames[0], CAMERA)
+    motion = inverse(poses[5]) @ poses[0]
+    assert np.isnan(left_unexplained(watch.inverse, depth, motion, CAMERA))
+    assert np.isnan(left_unexplained(np.zeros_like(watch.inverse), frames[5].depth, motion, CAMERA))
+    assert np.isnan(left_unexplained(watch.inverse, frames[0].depth, np.eye(4), CAMERA))
+    assert left_unexplained(watch.inverse, frames[5].depth, motion, CAMERA) < 0.5
+    assert left_unexplained(watch.inverse, frames[5].depth, inverse(motion), CAMERA) > 1.0
+
+
+def test_no_more_is_remembered_than_tells_and_it_survives_a_checkpoint(tmp_path: Path) -> None:
+    odometry = Odometry(CAMERA, aligner=Knowing())
+    for frame in room()[0]:
+        odometry.register(frame, frame.timestamp)
+    watch = odometry.progress.depth
+    assert watch is not None and len(watch.left) == REMEMBERED
+    progress = odometry.progress._replace(tracker=jnp.zeros(3))
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(progress, {}))
+    found = load_checkpoint(tmp_path / "checkpoint.npz", np.zeros(3, np.float32)).progress.depth
+    assert found is not None
+    np.testing.assert_array_equal(found.inverse, watch.inverse)
+    assert found[1:] == watch[1:]
