@@ -150,6 +150,19 @@ def test_faults_are_counted(load, tmp_path: Path) -> None:
         faults.main(clips=CLIP, faults="nonsense")
 
 
+def test_depth_that_is_always_wrong_is_measured(load, tmp_path: Path) -> None:
+    wrong_depth: ModuleType = load("wrong_depth")
+    slow = Rendered(20, camera=CAMERA, rate=10.0, speed=0.2)
+    wrong_depth.common.open_clip = lambda _: slow
+    wrong_depth.main(clips=CLIP, method="gauss-newton", faults="depth upside down", json=tmp_path / "wrong.json")
+    clean, damaged = read(tmp_path / "wrong.json")["faults"]
+    assert (clean["fault"], damaged["fault"]) == ("clean", "depth upside down") and clean["ratio"] == 1.0
+    assert clean["flagged"] == 0.0 and clean["most_left"] < 0.5 * wrong_depth.MOST_LEFT < damaged["most_left"]
+    assert damaged["flagged"] > 0.5 and damaged["silent"] <= damaged["wrong"]
+    with pytest.raises(GavoError, match="nonsense"):
+        wrong_depth.main(clips=CLIP, faults="nonsense")
+
+
 def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
     monkeypatch.syspath_prepend(str(FOLDER))
     open_clip = importlib.import_module("common").open_clip

@@ -1,0 +1,127 @@
+"""What depth that is wrong in every frame does to a run, and whether that is told.
+
+Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`). Prints, for each
+clip and fault, the share of the pairs that are not ok once the run has ended, how many pairs are off by more than 5 cm
+or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE), also over the clean run's, and of the change
+of depth the part that the motions leave: median over the run, and the most. Beyond `MOST_LEFT` depth is told to be
+wrong, so the clean clips' most says how far from a false alarm they are.
+
+    python benchmarks/wrong_depth.py
+    python benchmarks/wrong_depth.py --clips FOLDER --method gauss-newton --json wrong_depth.json
+
+On 2 cores the defaults take about 10 minutes.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+from faults import Alter, Damaged, drift, is_wrong, zoom
+
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry.depth_change import MIN_REMEMBERED, MOST_LEFT
+from gavo_jax.odometry.driver import track
+from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.output.screen import number
+
+CLEAN = "clean"
+
+
+def of_depth(make: Callable[[np.ndarray], np.ndarray]) -> Alter:
+    """Damage of the depth image."""
+    return lambda clip, index, frame: replace(frame, depth=make(frame.depth).astype(frame.depth.dtype))
+
+
+def late(frames: int) -> Alter:
+    """Depth of so many frames before, under this one's stamp."""
+    return lambda clip, index, frame: replace(frame, depth=clip[max(index - frames, 0)].depth)
+
+
+def disparity(clip: FrameSequence, index: int, frame: Frame) -> Frame:
+    """Depth as a disparity: large where a point is near."""
+    scale = float(clip.camera.depth_scale)
+    inverse = np.minimum(1.5 * scale**2 / np.maximum(frame.depth, 1), 65535)
+    return replace(frame, depth=np.where(frame.depth > 0, inverse, 0).astype(frame.depth.dtype))
+
+
+FAULTS: dict[str, Alter] = {
+    CLEAN: lambda clip, index, frame: frame,
+    "depth mirrored": of_depth(np.fliplr),
+    "depth upside down": of_depth(np.flipud),
+    "grey mirrored": lambda clip, index, frame: replace(frame, grey=np.fliplr(frame.grey).copy()),
+    "depth 1 frame late": late(1),
+    "depth 3 frames late": late(3),
+    "depth zoomed": of_depth(zoom),
+    "disparity": disparity,
+}
+
+
+def measure(clip: FrameSequence, alter: Alter, contender: common.Contender) -> dict[str, Any]:
+    """One run of which every frame is altered."""
+    sequence = Damaged(clip, list(range(len(clip))))
+    sequence.alter = dict.fromkeys(range(len(clip)), alter)
+    odometry, steps, left = contender.make(sequence.camera, 0), [], []
+    for step in track(sequence, odometry=odometry):
+        steps.append(step)
+        watch = odometry.progress.depth
+        if watch is not None and len(watch.left) >= MIN_REMEMBERED:
+            left.append(float(np.median(watch.left)))
+    told = revised(steps)
+    wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, clip.ground_truth)]
+    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    return {
+        "flagged": float(np.mean([step.alignment.status != 0 for step in told])),
+        "wrong": len(wrong),
+        "silent": sum(wrong),
+        "drift": drift(trajectory, sequence.timestamps, clip.ground_truth),
+        "left": float(np.median(left)) if left else None,
+        "most_left": max(left, default=None),
+    }
+
+
+def main(
+    clips: str = common.CLIPS, method: str = "ga:fast", faults: str = ",".join(FAULTS), json: Path | None = None
+) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: names with commas between, of clips with ground truth; see `common.open_clip`.
+        method: METHOD or METHOD:PRESET.
+        faults: names with commas between; the clean clip comes first in any case.
+        json: file for the figures.
+    """
+    contender, rows, cells = common.parse_methods(method)[0], [], []
+    chosen = [name for name in common.names(faults) if name != CLEAN]
+    for name in chosen:
+        if name not in FAULTS:
+            raise GavoError(f"unknown fault {name!r}: not one of {', '.join(FAULTS)}")
+    for clip in common.names(clips):
+        sequence = common.open_clip(clip)
+        if sequence.ground_truth is None:
+            raise GavoError(f"{clip}: no ground truth")
+        clean = np.nan
+        for name in (CLEAN, *chosen):
+            row = measure(sequence, FAULTS[name], contender)
+            clean = row["drift"] if name == CLEAN else clean
+            rows.append({"clip": clip, "fault": name, **row, "ratio": row["drift"] / clean})
+            figures = [number(rows[-1][key], digits) for key, digits in FIGURES.items()]
+            cells.append([clip, name, f"{row['flagged']:.0%}", f"{row['silent']} of {row['wrong']}", *figures])
+    columns = ("clip", "every frame", "flagged", "wrong and ok", "m/s", "drift / clean", "left", "most left")
+    common.print_table(f"wrong from the first frame on, {contender.name}; told above {MOST_LEFT}", columns, cells)
+    results = {"method": method, "faults": rows}
+    common.record(json, "wrong_depth", results)
+    return results
+
+
+FIGURES = {"drift": 4, "ratio": 2, "left": 2, "most_left": 2}
+"""Of a row, those that are printed as numbers, with their digits."""
+
+
+if __name__ == "__main__":
+    common.command(main)
