@@ -29,6 +29,7 @@ from gavo_jax.odometry.driver import track
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
+from gavo_jax.trajectory import Trajectory
 
 CLEAN = "clean"
 
@@ -62,7 +63,7 @@ FAULTS: dict[str, Alter] = {
 }
 
 
-def measure(clip: FrameSequence, alter: Alter, contender: common.Contender) -> dict[str, Any]:
+def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: common.Contender) -> dict[str, Any]:
     """One run of which every frame is altered."""
     sequence = Damaged(clip, list(range(len(clip))))
     sequence.alter = dict.fromkeys(range(len(clip)), alter)
@@ -73,13 +74,13 @@ def measure(clip: FrameSequence, alter: Alter, contender: common.Contender) -> d
         if watch is not None and len(watch.left) >= MIN_REMEMBERED:
             left.append(float(np.median(watch.left)))
     told = revised(steps)
-    wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, clip.ground_truth)]
+    wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, truth)]
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
     return {
         "flagged": float(np.mean([step.alignment.status != 0 for step in told])),
         "wrong": len(wrong),
         "silent": sum(wrong),
-        "drift": drift(trajectory, sequence.timestamps, clip.ground_truth),
+        "drift": drift(trajectory, sequence.timestamps, truth),
         "left": float(np.median(left)) if left else None,
         "most_left": max(left, default=None),
     }
@@ -107,7 +108,7 @@ def main(
             raise GavoError(f"{clip}: no ground truth")
         clean = np.nan
         for name in (CLEAN, *chosen):
-            row = measure(sequence, FAULTS[name], contender)
+            row = measure(sequence, sequence.ground_truth, FAULTS[name], contender)
             clean = row["drift"] if name == CLEAN else clean
             rows.append({"clip": clip, "fault": name, **row, "ratio": row["drift"] / clean})
             figures = [number(rows[-1][key], digits) for key, digits in FIGURES.items()]

@@ -152,8 +152,8 @@ def test_faults_are_counted(load, tmp_path: Path) -> None:
 
 def test_depth_that_is_always_wrong_is_measured(load, tmp_path: Path) -> None:
     wrong_depth: ModuleType = load("wrong_depth")
-    slow = Rendered(20, camera=CAMERA, rate=10.0, speed=0.2)
-    wrong_depth.common.open_clip = lambda _: slow
+    quick = Rendered(20, camera=CAMERA, rate=15.0, speed=0.5)
+    wrong_depth.common.open_clip = lambda _: quick
     wrong_depth.main(clips=CLIP, method="gauss-newton", faults="depth upside down", json=tmp_path / "wrong.json")
     clean, damaged = read(tmp_path / "wrong.json")["faults"]
     assert (clean["fault"], damaged["fault"]) == ("clean", "depth upside down") and clean["ratio"] == 1.0

@@ -24,6 +24,8 @@ CHANGED = 0.25
 """nor do those that are not among this share of all, at which they differ most;"""
 LEAST_POINTS = 50
 """nor so few."""
+EDGE = 0.05
+"""1/m between neighbouring pixels, from which on two things lie beside each other."""
 REMEMBERED, MIN_REMEMBERED = 15, 8
 """Pairs of which the median tells, and the fewest that do."""
 MOST_LEFT = 0.7
@@ -47,6 +49,10 @@ class DepthWatch(NamedTuple):
     def is_unexplained(self) -> bool:
         """Whether the motions explain the change of depth hardly better than rest."""
         return len(self.left) >= MIN_REMEMBERED and bool(np.median(self.left) > MOST_LEFT)
+
+    def spoken_of(self, pairs: int) -> int:
+        """Of so many pairs so far, how many of the last its figures speak of: all, until one has been forgotten."""
+        return len(self.left) if len(self.left) == REMEMBERED else pairs
 
     def after(self, frame: Frame, elapsed: float, target_T_reference: Any, camera: Camera) -> "DepthWatch":
         """With one more pair, of the same reference.
@@ -108,8 +114,8 @@ def left_unexplained(
         moved = rotation @ there + q * translation[:, None]
         u, v = camera.fx * moved[0] / moved[2] + camera.cx, camera.fy * moved[1] / moved[2] + camera.cy
         inside = (q > 0) & (moved[2] > 0) & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
-    place = (np.rint(np.where(inside, v, 0)).astype(int), np.rint(np.where(inside, u, 0)).astype(int))
-    seen, unmoved = _inverse(depth[place], camera), _inverse(depth[row, column].ravel(), camera)
+    seen = _sampled(depth, np.where(inside, u, 0), np.where(inside, v, 0), camera)
+    unmoved = _inverse(depth[row, column].ravel(), camera)
     inside &= (seen > 0) & (unmoved > 0)
     if np.count_nonzero(inside) < LEAST_POINTS:
         return np.nan
@@ -127,6 +133,16 @@ def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     step = max(camera.width // COLUMNS, 1)
     row, column = np.ogrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     return row, column
+
+
+def _sampled(depth: np.ndarray, u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
+    """1/depth between pixels, 1/m; 0 where one of the four around has no reading, or an edge lies between them."""
+    left, above = np.minimum(u.astype(int), camera.width - 2), np.minimum(v.astype(int), camera.height - 2)
+    around = np.stack([_inverse(depth[above + i, left + j], camera) for i in (0, 1) for j in (0, 1)])
+    along, down = u - left, v - above
+    weights = np.stack([(1 - down) * (1 - along), (1 - down) * along, down * (1 - along), down * along])
+    is_smooth = np.all(around > 0, axis=0) & (np.ptp(around, axis=0) < EDGE)
+    return np.where(is_smooth, np.sum(weights * around, axis=0), 0.0)
 
 
 def _inverse(depth: Any, camera: Camera) -> np.ndarray:

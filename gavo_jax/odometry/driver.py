@@ -233,7 +233,8 @@ class Odometry:
                 after = after._replace(depth=watch)
                 if watch.is_unexplained:
                     result = with_finding(result, AlignmentStatus.DEPTH_MISMATCH)
-                    revises = max(revises, 0 if before.depth.is_unexplained else len(before.depth.left))
+                    first = not before.depth.is_unexplained
+                    revises = max(revises, first * before.depth.spoken_of(before.last_index))
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
