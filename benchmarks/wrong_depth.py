@@ -65,7 +65,7 @@ FAULTS: dict[str, Alter] = {
 
 def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: common.Contender) -> dict[str, Any]:
     """One run of which every frame is altered."""
-    sequence = Damaged(clip, list(range(len(clip))))
+    sequence: Any = Damaged(clip, list(range(len(clip))))
     sequence.alter = dict.fromkeys(range(len(clip)), alter)
     odometry, steps, left = contender.make(sequence.camera, 0), [], []
     for step in track(sequence, odometry=odometry):
