@@ -138,7 +138,8 @@ def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def _sampled(depth: np.ndarray, u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
     """1/depth between pixels, 1/m; 0 where one of the four around has no reading, or an edge lies between them."""
     left, above = np.minimum(u.astype(int), camera.width - 2), np.minimum(v.astype(int), camera.height - 2)
-    around = np.stack([_inverse(depth[above + i, left + j], camera) for i in (0, 1) for j in (0, 1)])
+    down_by, along_by = np.array([[0], [0], [1], [1]]), np.array([[0], [1], [0], [1]])
+    around = _inverse(depth[above + down_by, left + along_by], camera)
     along, down = u - left, v - above
     weights = np.stack([(1 - down) * (1 - along), (1 - down) * along, down * (1 - along), down * along])
     is_smooth = np.all(around > 0, axis=0) & (np.ptp(around, axis=0) < EDGE)
