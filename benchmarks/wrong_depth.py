@@ -2,7 +2,8 @@
 
 Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`). Prints, for each
 clip and fault, the share of the pairs that are not ok once the run has ended, how many pairs are off by more than 5 cm
-or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE), also over the clean run's, and of the change
+or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE; a dash where no second is in one segment), also
+over the clean run's, and of the change
 of depth the part that the motions leave: median over the run, and the most. Beyond `MOST_LEFT` depth is told to be
 wrong, so the clean clips' most says how far from a false alarm they are.
 
@@ -12,6 +13,7 @@ wrong, so the clean clips' most says how far from a false alarm they are.
 On 2 cores the defaults take about 10 minutes.
 """
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -76,11 +78,15 @@ def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: com
     told = revised(steps)
     wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, truth)]
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
+    try:
+        metres = drift(trajectory, sequence.timestamps, truth)
+    except GavoError:  # broken into segments of less than a second
+        metres = None
     return {
         "flagged": float(np.mean([step.alignment.status != 0 for step in told])),
         "wrong": len(wrong),
         "silent": sum(wrong),
-        "drift": drift(trajectory, sequence.timestamps, truth),
+        "drift": metres,
         "left": float(np.median(left)) if left else None,
         "most_left": max(left, default=None),
     }
@@ -106,11 +112,13 @@ def main(
         sequence = common.open_clip(clip)
         if sequence.ground_truth is None:
             raise GavoError(f"{clip}: no ground truth")
-        clean = np.nan
+        clean = None
         for name in (CLEAN, *chosen):
             row = measure(sequence, sequence.ground_truth, FAULTS[name], contender)
             clean = row["drift"] if name == CLEAN else clean
-            rows.append({"clip": clip, "fault": name, **row, "ratio": row["drift"] / clean})
+            ratio = row["drift"] / clean if row["drift"] and clean else None
+            rows.append({"clip": clip, "fault": name, **row, "ratio": ratio})
+            print(f"{clip} {name}: {row['flagged']:.0%} flagged", file=sys.stderr)
             figures = [number(rows[-1][key], digits) for key, digits in FIGURES.items()]
             cells.append([clip, name, f"{row['flagged']:.0%}", f"{row['silent']} of {row['wrong']}", *figures])
     columns = ("clip", "every frame", "flagged", "wrong and ok", "m/s", "drift / clean", "left", "most left")
