@@ -2,10 +2,9 @@
 
 Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`). Prints, for each
 clip and fault, the share of the pairs that are not ok once the run has ended, how many pairs are off by more than 5 cm
-or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE; a dash where no second is in one segment), also
-over the clean run's, and of the change
-of depth the part that the motions leave: median over the run, and the most. Beyond `MOST_LEFT` depth is told to be
-wrong, so the clean clips' most says how far from a false alarm they are.
+or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE; a dash where no segment is that long), also
+over the clean run's, and of the change of depth the part that the motions leave: median over the run, and the most.
+Beyond `MOST_LEFT` depth is told to be wrong, so the clean clips' most says how far from a false alarm they are.
 
     python benchmarks/wrong_depth.py
     python benchmarks/wrong_depth.py --clips FOLDER --method gauss-newton --json wrong_depth.json
