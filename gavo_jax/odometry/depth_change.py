@@ -5,14 +5,18 @@ on is not: mirrored, of another camera, of other moments, or not depth at all. B
 the image say, and those explain it hardly better than if the camera had stood still.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.alignment.result import Alignment, with_finding
+from gavo_jax.bodies.records import Body
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp, log
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
@@ -78,6 +82,22 @@ class DepthWatch(NamedTuple):
     def seen_from(self, frame: Frame, camera: Camera) -> "DepthWatch":
         """With another reference."""
         return watch_from(frame, camera)._replace(velocity=self.velocity, left=self.left)
+
+
+def judge_by_depth(
+    watch: DepthWatch, frame: Frame, elapsed: float, result: Alignment, camera: Camera
+) -> tuple[Alignment, DepthWatch]:
+    """A pair's result with what the change of depth says against it among its findings; arguments as of `after`."""
+    watch = watch.after(frame, elapsed, result.target_T_reference, camera)
+    return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.is_unexplained else result, watch
+
+
+def without_bodies(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
+    """A frame without depth where something moves on its own."""
+    if not bodies:
+        return frame
+    covered = np.any([body.mask for body in bodies], axis=0)
+    return replace(frame, depth=np.where(covered, 0, frame.depth))
 
 
 def watch_from(frame: Frame, camera: Camera) -> DepthWatch:

@@ -23,7 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
-from gavo_jax.odometry.depth_change import DepthWatch, delay_of, watch_from
+from gavo_jax.odometry.depth_change import DepthWatch, delay_of, judge_by_depth, watch_from, without_bodies
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
@@ -229,12 +229,10 @@ class Odometry:
             )
             if not lost and before.depth is not None:
                 still = without_bodies(usable, bodies)
-                watch = before.depth.after(still, float(clock.elapsed), result.target_T_reference, self.camera)
+                result, watch = judge_by_depth(before.depth, still, float(clock.elapsed), result, self.camera)
                 after = after._replace(depth=watch)
-                if watch.is_unexplained:
-                    result = with_finding(result, AlignmentStatus.DEPTH_MISMATCH)
-                    first = not before.depth.is_unexplained
-                    revises = max(revises, first * before.depth.spoken_of(before.last_index))
+                if watch.is_unexplained and not before.depth.is_unexplained:
+                    revises = max(revises, before.depth.spoken_of(before.last_index))
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -347,14 +345,6 @@ def clock_of(before: Progress, frame: Frame) -> Clock:
     """When a frame was taken, for a driver that counts it as its last one already."""
     elapsed = frame.timestamp - before.reference_timestamp
     return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay_of(frame)), np.uint32(before.last_index))
-
-
-def without_bodies(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
-    """A frame without depth where something moves on its own."""
-    if not bodies:
-        return frame
-    covered = np.any([body.mask for body in bodies], axis=0)
-    return replace(frame, depth=np.where(covered, 0, frame.depth))
 
 
 def unwatched(frame: Frame | None, step: Step | None) -> None:
