@@ -71,7 +71,7 @@ class Damaged:
 
     def __getitem__(self, index: int) -> Frame:
         frame = self.clip[self.sources[index]]
-        delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+        delay = frame.depth_delay
         stamp = float(self.timestamps[index])
         frame = replace(frame, timestamp=stamp, depth_timestamp=stamp + delay)
         return self.alter[index](self.clip, self.sources[index], frame) if index in self.alter else frame

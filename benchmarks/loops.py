@@ -211,7 +211,7 @@ def after_cover(frames: list[Frame], now: float, between: float) -> Iterator[Fra
             yield dark(frames[0], now)
         else:
             frame = frames[i - COVERED]
-            delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+            delay = frame.depth_delay
             yield replace(frame, timestamp=now, depth_timestamp=now + delay)
 
 

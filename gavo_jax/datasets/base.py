@@ -54,6 +54,11 @@ class Frame:
     color: UInt8[np.ndarray, "height width 3"] | None = None
     depth_timestamp: float | None = None
 
+    @property
+    def depth_delay(self) -> float:
+        """From the colour image to the depth image, seconds; 0 where that is not known."""
+        return 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
+
 
 class Sequence(Protocol):
     """Frames in the order of their stamps, read one at a time.

@@ -182,7 +182,7 @@ class Keyframes:
             twist: Motion of the points in the camera at its moment, m/s and rad/s.
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """
-        delay = 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+        delay = frame.depth_delay
         images = still(frame.grey, frame.depth, self.full, twist, delay)
         return Keyframe(
             number=len(self.all),

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, with_finding
 from gavo_jax.bodies.records import Body
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp, log
 from gavo_jax.status import AlignmentStatus
@@ -74,7 +74,7 @@ class DepthWatch(NamedTuple):
             """From the reference's image on, before it as the camera came there."""
             return exp(seconds * (twist if seconds > 0 else earlier))
 
-        motion = moved_by(elapsed + delay_of(frame)) @ inverse(moved_by(self.delay))
+        motion = moved_by(elapsed + frame.depth_delay) @ inverse(moved_by(self.delay))
         left = left_unexplained(self.inverse, np.asarray(frame.depth), motion, camera)
         figures = (*self.left, left)[-REMEMBERED:] if np.isfinite(left) else self.left
         return self._replace(velocity=tuple(twist.tolist()), left=figures)
@@ -103,12 +103,7 @@ def without_bodies(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
 def watch_from(frame: Frame, camera: Camera) -> DepthWatch:
     """At a run's first reference."""
     rows, columns = _grid(camera)
-    return DepthWatch(_inverse(np.asarray(frame.depth)[rows, columns], camera), delay_of(frame))
-
-
-def delay_of(frame: Frame) -> float:
-    """From a frame's image to its depth, seconds; 0 where that is not known."""
-    return 0.0 if frame.depth_timestamp is None else frame.depth_timestamp - frame.timestamp
+    return DepthWatch(_inverse(np.asarray(frame.depth)[rows, columns], camera), frame.depth_delay)
 
 
 def left_unexplained(
@@ -126,13 +121,13 @@ def left_unexplained(
         0 where the motion explains all, 1 where rest explains as much; not-a-number where too little changes.
     """
     row, column = _grid(camera)
-    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    x, y = to_ray(camera, column, row)
     rotation, translation = target_T_reference[:3, :3], target_T_reference[:3, 3]
     there = np.stack(np.broadcast_arrays(x, y, 1.0)).reshape(3, -1)
     q = reference.ravel()
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = rotation @ there + q * translation[:, None]
-        u, v = camera.fx * moved[0] / moved[2] + camera.cx, camera.fy * moved[1] / moved[2] + camera.cy
+        u, v = to_pixels(camera, moved[0], moved[1], 1 / moved[2])
         inside = (q > 0) & (moved[2] > 0) & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
     seen = _sampled(depth, np.where(inside, u, 0), np.where(inside, v, 0), camera)
     unmoved = _inverse(depth[row, column].ravel(), camera)

@@ -23,7 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
-from gavo_jax.odometry.depth_change import DepthWatch, delay_of, judge_by_depth, watch_from, without_bodies
+from gavo_jax.odometry.depth_change import DepthWatch, judge_by_depth, watch_from, without_bodies
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
@@ -344,7 +344,7 @@ class Odometry:
 def clock_of(before: Progress, frame: Frame) -> Clock:
     """When a frame was taken, for a driver that counts it as its last one already."""
     elapsed = frame.timestamp - before.reference_timestamp
-    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(delay_of(frame)), np.uint32(before.last_index))
+    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(before.last_index))
 
 
 def unwatched(frame: Frame | None, step: Step | None) -> None:
