@@ -36,6 +36,7 @@ TRACED_WITH = ("jax", "jaxlib", "jaxlie", "numpy", "optax")
 
 _folder: Path | None = None
 _loaded: dict[Any, Callable[..., Any]] = {}
+_loading: dict[Any, threading.Lock] = {}
 _lock = threading.Lock()
 
 
@@ -93,10 +94,14 @@ class CachedProgram(Generic[P, R]):
             return self._jitted(*args, **kwargs)
         kinds = tuple(map(Kind.of, leaves))
         signature = (self._function, structure, kinds, tuple(kwargs.items()))
-        with _lock:
-            program = _loaded.get(signature)
-            if program is None:
-                program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)
+        program = _loaded.get(signature)
+        if program is None:
+            with _lock:
+                loading = _loading.setdefault(signature, threading.Lock())
+            with loading:  # once, whoever asks for it meanwhile; others side by side
+                program = _loaded.get(signature)
+                if program is None:
+                    program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)
         return program(*leaves)
 
     def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:

@@ -6,10 +6,11 @@ the image. A search that knows the mean alone explains the stretch by a step to 
 centimetre and more. So how far the frame's own velocity is from the mean, its sway, is an unknown beside the motion.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from gavo_jax.image.shutter import row_time
@@ -53,7 +54,9 @@ class Unrest(NamedTuple):
     @classmethod
     def unknown(cls) -> "Unrest":
         """Before the first pair."""
-        return cls(jnp.zeros(6), jnp.square(jnp.array(FIRST_CHANGES)))
+        still: Any = np.zeros(6, np.float32)
+        changes: Any = np.square(np.asarray(FIRST_CHANGES, np.float32))
+        return cls(still, changes)
 
     def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "Unrest":
         """With one more pair: its sway and its mean velocity's change, m/s and rad/s."""

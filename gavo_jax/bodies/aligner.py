@@ -5,15 +5,15 @@ move, that is all.
 """
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float64, Integer
+from jaxtyping import Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.bodies.belief import Belief, suspect
@@ -24,12 +24,10 @@ from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import exp as exp_on_host
-from gavo_jax.mapping.motions import log as log_on_host
+from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 
@@ -112,15 +110,13 @@ class BodyAware:
         return self.search.settings.odometry.bodies == "track"
 
     def warm_up(self) -> float:
-        """Compile what every frame needs: the search, and the look at what it explains."""
-        seconds, start = self.first.warm_up(), time.perf_counter()
-        state = self.blank_state()
-        look = self.retina.look(state.scene, state.tracker, np.eye(4))
-        if look.opinion is not None:
-            clock = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
-            jax.block_until_ready(self._without(state.tracker, look.opinion, clock))
-        jax.block_until_ready(look)
-        return seconds + time.perf_counter() - start
+        """Compile what every frame needs, side by side: the search, and the look at what it explains."""
+        start, state = time.perf_counter(), self.blank_state()
+        with ThreadPoolExecutor(max_workers=1) as worker:
+            look = worker.submit(self.retina.look, state.scene, state.tracker, np.eye(4))
+            self.first.warm_up()
+            jax.block_until_ready(look.result())
+        return time.perf_counter() - start
 
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
@@ -224,7 +220,8 @@ class BodyAware:
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
         """A tracker without the points that dissent, whose search begins from the motion that the others ask for."""
-        guess = log(opinion.target_T_reference) * (tracker.seconds / clock.elapsed)
+        motion = np.asarray(opinion.target_T_reference, np.float64)
+        guess = np.float32(log(motion) * (float(tracker.seconds) / float(clock.elapsed)))
         return self.retina.without(tracker, opinion.dissenting)._replace(guess=guess)
 
     def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
@@ -243,7 +240,7 @@ class BodyAware:
         def search_from(tracker: TrackerState) -> Candidate:
             return candidate(self.search.align(tracker, frame, clock))
 
-        def search_without(mask: Array) -> Candidate:
+        def search_without(mask: Any) -> Candidate:
             return search_from(retina.without(tracker, mask))
 
         found = candidate(first)
@@ -252,7 +249,7 @@ class BodyAware:
         if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
             tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]
         if not first.usable and not known:
-            at_rest = tracker._replace(previous=state.whole, keyframe=state.whole, guess=jnp.zeros(6))
+            at_rest = tracker._replace(previous=state.whole, keyframe=state.whole, guess=np.zeros(6, np.float32))
             tried += [search_from(at_rest)]
         best = max(tried, key=lambda candidate: candidate.rank)
         for _ in range(ROUNDS):
@@ -279,10 +276,10 @@ class BodyAware:
         both, weighted by their covariances.
         """
         found = np.asarray(attempt.result.target_T_reference)
-        onward = log_on_host(self.predict(state, float(clock.elapsed)) @ inverse(found))
+        onward = log(self.predict(state, float(clock.elapsed)) @ inverse(found))
         covariance, prior = np.float64(attempt.result.covariance), np.diag(np.repeat(np.square(GOES_ON), 3))
         share = covariance @ np.linalg.inv(covariance + prior)
-        motion = exp_on_host(share @ onward) @ found
+        motion = exp(share @ onward) @ found
         return _moved(state, attempt, motion, share @ prior)
 
     def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
@@ -298,13 +295,10 @@ def _moved(
     state: AwareState, attempt: Attempt, motion: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
 ) -> Attempt:
     """An attempt of another motion than the one that was found, which can be used."""
-    xi = log_on_host(motion).astype(np.float32)
+    xi: Any = log(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
-    twist = jnp.asarray(xi)
-    tracker = tracker._replace(
-        keyframe=tracker.previous, motion=twist, guess=twist, passing=twist, usual=state.tracker.usual
-    )
+    tracker = tracker._replace(keyframe=tracker.previous, motion=xi, guess=xi, passing=xi, usual=state.tracker.usual)
     return attempt._replace(state=tracker, result=result, usable=True)
 
 
@@ -316,8 +310,7 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
     seen = known or float(belief.contradicted) > LEAST
-    moving, hidden = jax.device_get((belief.moving, belief.hidden))
-    in_view = 1.0 - np.mean((moving > 0) | hidden)
+    in_view = 1.0 - np.mean((belief.moving > 0) | belief.hidden)
     excused = EXCUSED if float(result.explained.depth) > MOST * in_view else bit(AlignmentStatus.HIGH_ERROR)
     if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
         result = result._replace(status=AlignmentStatus.OK, findings=0)

@@ -1,8 +1,7 @@
 """Which bodies a frame shows, and how each has moved: the same search on a body's own points."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, Integer
 
@@ -65,14 +64,14 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
     whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.passing) else state.whole
-    motion = jnp.asarray(before.motions[place], jnp.float32)
+    motion: Any = np.float32(before.motions[place])
     tracker = state.tracker._replace(
         previous=whole,
         keyframe=whole,
         motion=motion,
         guess=motion,
         unrest=Unrest.unknown(),
-        seconds=jnp.float32(before.seconds[place]),
+        seconds=np.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )
     return aware.search.align(aware.retina.without(tracker, before.labels != number), frame, clock).result

@@ -98,8 +98,8 @@ class Retina:
 
     @cached_property
     def planes(self) -> ImagePlane:
-        """Of the levels searched."""
-        return self.levels.planes(self.full)
+        """Of the levels searched, on the host."""
+        return jax.tree.map(np.asarray, self.levels.planes(self.full))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -107,22 +107,29 @@ class Retina:
         return self.camera.height, self.camera.width
 
     def view(self, tracker: TrackerState) -> View:
-        """Of a tracker's last frame."""
-        return view_of(tracker.previous_image, self.levels, tracker.passing * (self.full.readout / tracker.seconds))
+        """Of a tracker's last frame, on the host: to slice a device's array takes a program."""
+        sweep = np.asarray(tracker.passing) * (self.full.readout / np.asarray(tracker.seconds))
+        return self._cut(tracker, sweep)
 
     def blank(self) -> Scene:
         """A scene before the first frame, in the shapes and types of every scene."""
         words: Any = np.zeros((3, *self.size), np.uint32)
-        views = View(Target(words, words), jnp.zeros((3, 6)))
+        sweeps: Any = np.zeros((3, 6), np.float32)
+        unknown: Any = np.zeros(self.size, np.float32)
+        still: Any = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
         nothing: Any = np.zeros((), np.float32)
-        unknown, still = jnp.zeros(self.size), jnp.tile(jnp.eye(4), (3, 1, 1))
+        views = View(Target(words, words), sweeps)
         return Scene(unknown, unknown, Roll.empty(self.size), views, still, nothing, nothing)
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
-        unknown = jnp.full(6, jnp.nan, jnp.float32)  # of the type of every scene's: another one takes another program
-        view = view_of(tracker.previous_image, self.levels, unknown)
-        return self.blank()._replace(views=jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), view))
+        unknown = np.full(6, np.nan, np.float32)  # of the type of every scene's: another one takes another program
+        view = self._cut(tracker, unknown)
+        return self.blank()._replace(views=jax.tree.map(lambda leaf: np.stack([leaf] * 3), view))
+
+    def _cut(self, tracker: TrackerState, sweep: Any) -> View:
+        image = jax.tree.map(np.asarray, tracker.previous_image)
+        return view_of(image, self.levels, sweep)
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
@@ -137,14 +144,15 @@ class Retina:
         )
 
     def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
-        """What a motion makes of the last frame's pixels."""
-        return _look_back(
+        """What a motion makes of the last frame's pixels, on the host."""
+        belief = _look_back(
             (scene.known, scene.views),
             (tracker.previous_image, tracker.passing, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             self.full,
             levels=self.levels,
         )
+        return jax.device_get(belief)
 
     def renewed(self, scene: Scene, look: Look, elapsed: float) -> Scene:
         """The scene with the new frame as its last one, so many seconds later."""
@@ -159,7 +167,7 @@ class Retina:
 
     def without(self, tracker: TrackerState, mask: Bool[Array | np.ndarray, "h w"]) -> TrackerState:
         """A tracker whose references have lost the points on a mask."""
-        return without_points(tracker, self.planes, mask, self.levels)
+        return without_points(tracker, self.planes, np.asarray(mask), self.levels)
 
 
 def _age_after(scene: Scene, elapsed: float) -> float:

@@ -259,7 +259,7 @@ class Polished:
         attempt = self.first.align(state, frame, clock)
         if not attempt.usable:
             return attempt
-        guess = attempt.result.xi * (state.seconds / clock.elapsed)
+        guess = attempt.result.xi * (np.float32(state.seconds) / clock.elapsed)
         again = self.fine.align(state._replace(guess=guess), frame, clock)
         if again.result.status not in POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
             return attempt

@@ -74,7 +74,8 @@ class Usual(NamedTuple):
     @classmethod
     def unknown(cls) -> "Usual":
         """Before the first pair."""
-        return cls(*(jnp.full(REMEMBERED, jnp.nan, jnp.float32) for _ in cls._fields))
+        nothing: Any = np.full(REMEMBERED, np.nan, np.float32)
+        return cls(*(nothing for _ in cls._fields))
 
     def after(self, result: Alignment, contrast: Float[Array, ""]) -> "Usual":
         """With one more pair."""

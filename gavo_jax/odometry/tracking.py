@@ -227,15 +227,16 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
     words: Any = np.zeros((levels.layout.height, levels.layout.width), np.uint32)
     reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
     zero: Any = np.float32(0.0)
+    still: Any = np.zeros(6, np.float32)
     return TrackerState(
         previous=reference,
         keyframe=reference,
         previous_image=Target(words, words),
-        motion=jnp.zeros(6),
-        guess=jnp.zeros(6),
-        passing=jnp.zeros(6),
+        motion=still,
+        guess=still,
+        passing=still,
         unrest=Unrest.unknown(),
-        seconds=jnp.float32(1.0),
+        seconds=np.float32(1.0),  # pyright: ignore[reportArgumentType]
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),
     )
