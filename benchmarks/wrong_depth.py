@@ -72,8 +72,8 @@ def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: com
     for step in track(sequence, odometry=odometry):
         steps.append(step)
         watch = odometry.progress.depth
-        if watch is not None and len(watch.left) >= MIN_REMEMBERED:
-            left.append(float(np.median(watch.left)))
+        if watch is not None and len(watch.change.left) >= MIN_REMEMBERED:
+            left.append(float(np.median(watch.change.left)))
     told = revised(steps)
     wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, truth)]
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)

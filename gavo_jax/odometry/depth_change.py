@@ -5,18 +5,14 @@ on is not: mirrored, of another camera, of other moments, or not depth at all. B
 the image say, and those explain it hardly better than if the camera had stood still.
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment.result import Alignment, with_finding
-from gavo_jax.bodies.records import Body
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp, log
-from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
@@ -37,7 +33,7 @@ MOST_LEFT = 0.7
 with a body over 40 % of the image."""
 
 
-class DepthWatch(NamedTuple):
+class DepthChange(NamedTuple):
     """What is known of the reference's depth, and of how the last pairs' depth changed."""
 
     inverse: Float64[np.ndarray, "rows columns"]
@@ -58,7 +54,7 @@ class DepthWatch(NamedTuple):
         """Of so many pairs so far, how many of the last its figures speak of: all, until one has been forgotten."""
         return len(self.left) if len(self.left) == REMEMBERED else pairs
 
-    def after(self, frame: Frame, elapsed: float, target_T_reference: Any, camera: Camera) -> "DepthWatch":
+    def after(self, frame: Frame, elapsed: float, target_T_reference: Any, camera: Camera) -> "DepthChange":
         """With one more pair, of the same reference.
 
         Args:
@@ -79,31 +75,15 @@ class DepthWatch(NamedTuple):
         figures = (*self.left, left)[-REMEMBERED:] if np.isfinite(left) else self.left
         return self._replace(velocity=tuple(twist.tolist()), left=figures)
 
-    def seen_from(self, frame: Frame, camera: Camera) -> "DepthWatch":
+    def seen_from(self, frame: Frame, camera: Camera) -> "DepthChange":
         """With another reference."""
-        return watch_from(frame, camera)._replace(velocity=self.velocity, left=self.left)
+        return self._replace(inverse=depth_on_grid(frame, camera), delay=frame.depth_delay)
 
 
-def judge_by_depth(
-    watch: DepthWatch, frame: Frame, elapsed: float, result: Alignment, camera: Camera
-) -> tuple[Alignment, DepthWatch]:
-    """A pair's result with what the change of depth says against it among its findings; arguments as of `after`."""
-    watch = watch.after(frame, elapsed, result.target_T_reference, camera)
-    return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.is_unexplained else result, watch
-
-
-def without_bodies(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
-    """A frame without depth where something moves on its own."""
-    if not bodies:
-        return frame
-    covered = np.any([body.mask for body in bodies], axis=0)
-    return replace(frame, depth=np.where(covered, 0, frame.depth))
-
-
-def watch_from(frame: Frame, camera: Camera) -> DepthWatch:
-    """At a run's first reference."""
+def depth_on_grid(frame: Frame, camera: Camera) -> Float64[np.ndarray, "rows columns"]:
+    """1/depth of a frame on the grid, 1/m; 0 without a reading."""
     rows, columns = _grid(camera)
-    return DepthWatch(_inverse(np.asarray(frame.depth)[rows, columns], camera), frame.depth_delay)
+    return _inverse(np.asarray(frame.depth)[rows, columns], camera)
 
 
 def left_unexplained(

@@ -23,7 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
-from gavo_jax.odometry.depth_change import DepthWatch, judge_by_depth, watch_from, without_bodies
+from gavo_jax.odometry.depth_watch import DepthWatch, judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
@@ -228,11 +228,11 @@ class Odometry:
                 in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
             )
             if not lost and before.depth is not None:
-                still = without_bodies(usable, bodies)
-                result, watch = judge_by_depth(before.depth, still, float(clock.elapsed), result, self.camera)
+                elapsed = float(clock.elapsed)
+                result, watch = judge_by_depth(before.depth, usable, bodies, elapsed, result, self.camera)
                 after = after._replace(depth=watch)
-                if watch.is_unexplained and not before.depth.is_unexplained:
-                    revises = max(revises, before.depth.spoken_of(before.last_index))
+                if watch.told and not before.depth.told:
+                    revises = max(revises, watch.spoken_of(before.last_index))
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -249,8 +249,7 @@ class Odometry:
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:
-            watch = after.depth.seen_from(usable, self.camera) if after.depth else watch_from(usable, self.camera)
-            after = after._replace(depth=watch)
+            after = after._replace(depth=watch_from(after.depth, usable, self.camera))
         self.progress, self.candidates = after, candidates
         if before.last_index == 0:
             return None

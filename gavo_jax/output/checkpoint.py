@@ -16,12 +16,15 @@ import numpy as np
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
-from gavo_jax.odometry.depth_change import DepthWatch
+from gavo_jax.odometry.depth_change import DepthChange
+from gavo_jax.odometry.depth_edges import DepthEdges
+from gavo_jax.odometry.depth_watch import DepthWatch
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
+INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
 
 
 class Mark(NamedTuple):
@@ -54,7 +57,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         GavoError: The file cannot be written.
     """
-    progress = checkpoint.progress
+    progress, watch = checkpoint.progress, checkpoint.progress.depth
     numbers = {
         "last_index": progress.last_index,
         "reference_timestamp": progress.reference_timestamp,
@@ -66,7 +69,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
         "beginning": progress.beginning,
-        "depth": progress.depth and [progress.depth.inverse.tolist(), *progress.depth[1:]],
+        "depth": watch and [watch.change[1:], watch.edges[1:], watch.told],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,
@@ -75,6 +78,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays = {NUMBERS: np.array(json.dumps(numbers))}
     arrays |= {name: np.asarray(getattr(progress, name)) for name in POSES}
     arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    if watch is not None:
+        arrays |= {INVERSE_DEPTH: watch.change.inverse, EDGES: watch.edges.sums}
     data = io.BytesIO()
     arrays[SEAL] = np.array(_seal(arrays))
     np.savez(data, **arrays)  # pyright: ignore[reportArgumentType] (NumPy 2.0 takes allow_pickle=False for an array)
@@ -111,8 +116,10 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
         beginning = numbers.get("beginning")
         numbers["beginning"] = beginning and Beginning(*beginning)
-        depth = numbers.get("depth")
-        numbers["depth"] = depth and DepthWatch(np.array(depth[0]), depth[1], *map(tuple, depth[2:]))
+        if depth := numbers.get("depth"):
+            (delay, *known), seen, told = depth
+            change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
+            numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
         progress = Progress(**numbers, **poses)
     except GavoError:
         raise

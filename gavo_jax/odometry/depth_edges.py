@@ -1,0 +1,117 @@
+"""Whether depth lies on the image: where depth jumps, one thing ends before another, and most images have an edge.
+
+No motion is needed to see that, so it tells where `depth_change` has nothing to go by. Depth is taken to lie elsewhere
+only where it lies clearly better there: mirrored, upside down, turned by both, or shifted by more than two cameras
+beside each other would see.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+
+WIDTH = 160
+"""Pixels across the images that are compared."""
+REACH, NEAR = 24, 8
+"""Pixels of these by which depth may be shifted: those that are looked at, and those of depth that is not registered
+to the image (20 of 640 in 7-Scenes are 5)."""
+JUMP = 0.08
+"""1/m between neighbours of these pixels, from which on depth jumps."""
+FEWEST_JUMPS = 0.003
+"""Of all pixels; a frame with fewer says nothing."""
+CONTRAST = 21
+"""Pixels across the surroundings that an edge of the image is set against."""
+EVERY, SELDOM, EARLY = 3, 30, 24
+"""Of the references every so many are looked at, and fewer of those that come after the first so many."""
+KEPT = 0.95
+"""Of what the ones before said, at each."""
+MIN_SEEN = 5
+"""Frames that have to be seen before anything is said."""
+BETTER, CLEAR = 2.0, 5.0
+"""How many times as well, and how many standard deviations better than at other places, depth has to lie elsewhere."""
+
+
+class DepthEdges(NamedTuple):
+    """How much of an edge the image has where depth jumps, summed over frames, for each way depth may lie."""
+
+    sums: Float32[np.ndarray, "4 n n"]
+    """For depth as it is, mirrored, upside down, and both: by the shift, down and to the right."""
+    references: int = 0
+    """So many there were."""
+    seen: int = 0
+    """So many of them were looked at and had enough jumps."""
+    lie_elsewhere: bool = False
+    """Whether depth lies clearly better another way than it does."""
+
+    @classmethod
+    def none(cls) -> "DepthEdges":
+        """Before the first frame."""
+        return cls(np.zeros((4, 2 * REACH + 1, 2 * REACH + 1), np.float32))
+
+    def spoken_of(self, pairs: int) -> int:
+        """Of so many pairs so far, how many of the last its figures speak of."""
+        return pairs if self.references <= EARLY + SELDOM else SELDOM
+
+    def after(self, frame: Frame, camera: Camera) -> "DepthEdges":
+        """With one more reference."""
+        number = self.references
+        counted = self._replace(references=number + 1)
+        if number % (EVERY if number < EARLY else SELDOM):
+            return counted
+        jumps = depth_jumps(np.asarray(frame.depth), camera)
+        if np.mean(jumps) < FEWEST_JUMPS:
+            return counted
+        sums = KEPT * self.sums + likeness(edges(np.asarray(frame.grey)), jumps)
+        is_said = self.seen + 1 >= MIN_SEEN and lies_elsewhere(sums)
+        return counted._replace(sums=sums, seen=self.seen + 1, lie_elsewhere=is_said)
+
+
+def lies_elsewhere(sums: Float32[np.ndarray, "4 n n"]) -> bool:
+    """Whether depth lies clearly better another way than as it is, by `DepthEdges.sums`."""
+    as_it_is = _near(sums[0]).max()
+    shifted = sums[0].copy()
+    _near(shifted)[:] = -np.inf
+    best = np.array([shifted.max(), *(_near(way).max() for way in sums[1:])])
+    clear = sums.mean(axis=(1, 2)) + CLEAR * sums.std(axis=(1, 2))
+    return bool(np.any((best > BETTER * as_it_is) & (best > clear)))
+
+
+def edges(grey: np.ndarray) -> Float32[np.ndarray, "h w"]:
+    """How much more of an edge each pixel is on than its surroundings, in a small image."""
+    small = cv2.resize(grey, _size(*grey.shape[::-1]), interpolation=cv2.INTER_AREA).astype(np.float32)
+    slope = np.log1p(np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)))
+    return (slope - cv2.blur(slope, (CONTRAST, CONTRAST))).astype(np.float32)
+
+
+def depth_jumps(depth: np.ndarray, camera: Camera) -> Float32[np.ndarray, "h w"]:
+    """1 where the depths around a pixel are of two things, in a small image; 0 elsewhere and without readings."""
+    small = cv2.resize(depth, _size(*depth.shape[::-1]), interpolation=cv2.INTER_NEAREST)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.float32(camera.depth_scale) / small.astype(np.float32)
+    known, around = np.isfinite(inverse) & (inverse > 0), np.ones((3, 3), np.uint8)
+    nearest = cv2.dilate(np.where(known, inverse, 0).astype(np.float32), around)
+    farthest = cv2.erode(np.where(known, inverse, np.inf).astype(np.float32), around)
+    return (known & (nearest - farthest > JUMP)).astype(np.float32)
+
+
+def likeness(edges: Float32[np.ndarray, "h w"], jumps: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "4 n n"]:
+    """Mean edge under the jumps of depth as it is, mirrored, upside down, and both, at each shift within reach."""
+    size = [cv2.getOptimalDFTSize(length + REACH) for length in edges.shape]  # nothing comes round from the other side
+    ways = np.stack([jumps, jumps[:, ::-1], jumps[::-1], jumps[::-1, ::-1]])
+    products = np.fft.rfft2(edges, size) * np.conj(np.fft.rfft2(ways, size))
+    shifts = np.arange(-REACH, REACH + 1)
+    found = np.fft.irfft2(products, size)[:, shifts[:, None], shifts]
+    return (found / jumps.sum()).astype(np.float32)
+
+
+def _size(width: int, height: int) -> tuple[int, int]:
+    return WIDTH, max(round(height * WIDTH / width), 1)
+
+
+def _near(way: np.ndarray) -> np.ndarray:
+    inside = slice(REACH - NEAR, REACH + NEAR + 1)
+    return way[inside, inside]

@@ -1,0 +1,68 @@
+"""What speaks against a run's depth as a whole, from its first frame on: how it changes, and where it lies."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gavo_jax.alignment.result import Alignment, with_finding
+from gavo_jax.bodies.records import Body
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.odometry.depth_change import DepthChange, depth_on_grid
+from gavo_jax.odometry.depth_edges import DepthEdges
+from gavo_jax.status import AlignmentStatus
+
+
+class DepthWatch(NamedTuple):
+    """What is known of a run's depth."""
+
+    change: DepthChange
+    edges: DepthEdges
+    told: bool = False
+    """Whether the last pair was told to have wrong depth."""
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether one of the two speaks against it."""
+        return self.change.is_unexplained or self.edges.lie_elsewhere
+
+    def spoken_of(self, pairs: int) -> int:
+        """Of so many pairs so far, how many of the last are spoken against."""
+        by_change = self.change.spoken_of(pairs) if self.change.is_unexplained else 0
+        return max(by_change, self.edges.spoken_of(pairs) if self.edges.lie_elsewhere else 0)
+
+
+def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
+    """With another reference, or a run's first one."""
+    if before is None:
+        change = DepthChange(depth_on_grid(frame, camera), frame.depth_delay)
+        return DepthWatch(change, DepthEdges.none().after(frame, camera))
+    return before._replace(change=before.change.seen_from(frame, camera), edges=before.edges.after(frame, camera))
+
+
+def judge_by_depth(
+    watch: DepthWatch, frame: Frame, bodies: tuple[Body, ...], elapsed: float, result: Alignment, camera: Camera
+) -> tuple[Alignment, DepthWatch]:
+    """A pair's result, with wrong depth among its findings where that is known, and what is known then.
+
+    Args:
+        watch: What was known before.
+        frame: The target.
+        bodies: What moves on its own in it.
+        elapsed: Between the two images, seconds.
+        result: Of the pair.
+        camera: Of both.
+    """
+    change = watch.change.after(_without(frame, bodies), elapsed, result.target_T_reference, camera)
+    watch = watch._replace(change=change)
+    watch = watch._replace(told=watch.is_wrong)
+    return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.told else result, watch
+
+
+def _without(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
+    """A frame without depth where something moves on its own."""
+    if not bodies:
+        return frame
+    covered = np.any([body.mask for body in bodies], axis=0)
+    return replace(frame, depth=np.where(covered, 0, frame.depth))
