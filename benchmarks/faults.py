@@ -98,9 +98,19 @@ def with_grey(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault
     return altered(lambda clip, index, frame: replace(frame, grey=make(frame.grey)), count)
 
 
-def with_depth(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault:
+def of_depth(make: Callable[[np.ndarray], np.ndarray]) -> Alter:
     """Damage of the depth image."""
-    return altered(lambda clip, index, frame: replace(frame, depth=make(frame.depth).astype(frame.depth.dtype)), count)
+    return lambda clip, index, frame: replace(frame, depth=make(frame.depth).astype(frame.depth.dtype))
+
+
+def late(frames: int) -> Alter:
+    """Depth of so many frames before, under this one's stamp."""
+    return lambda clip, index, frame: replace(frame, depth=clip[max(index - frames, 0)].depth)
+
+
+def with_depth(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault:
+    """Damage of the depth image of some frames."""
+    return altered(of_depth(make), count)
 
 
 def dropped(count: int, restamped: bool = False) -> Fault:
@@ -191,11 +201,6 @@ def half_old(clip: FrameSequence, index: int, frame: Frame) -> Frame:
     return replace(frame, grey=grey)
 
 
-def old_depth(clip: FrameSequence, index: int, frame: Frame) -> Frame:
-    """Depth of five frames before."""
-    return replace(frame, depth=clip[max(index - 5, 0)].depth)
-
-
 def permuted(depth: np.ndarray) -> np.ndarray:
     """Depth whose tiles are mixed up."""
     tiles = [tile for row in np.split(depth, 8) for tile in np.split(row, 8, axis=1)]
@@ -278,7 +283,7 @@ FAULTS: dict[str, Fault] = {
     "depth permuted": with_depth(permuted),
     "depth of 2 m": with_depth(lambda depth: np.full_like(depth, 10000)),
     "depth shifted": with_depth(lambda depth: np.roll(depth, 40, axis=1)),
-    "depth old": altered(old_depth),
+    "depth old": altered(late(5)),
     "depth frozen": frozen_depth,
     "depth x 2 for 10": with_depth(lambda depth: np.minimum(depth.astype(int) * 2, 65535), 10),
     "depth upside down for 10": with_depth(np.flipud, 10),

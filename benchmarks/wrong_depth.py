@@ -1,9 +1,10 @@
 """What depth that is wrong in every frame does to a run, and whether that is told.
 
-Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`). Prints, for each
-clip and fault, the share of the pairs that are not ok once the run has ended, how many pairs are off by more than 5 cm
-or 3 degrees and how many of these are ok, the drift (RPE over 1 s, RMSE; a dash where no segment is that long), also
-over the clean run's, and of the change of depth the part that the motions leave: median over the run, and the most.
+Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`), and where it
+lies (`odometry/depth_edges.py`). Prints, for each clip and fault, the share of the pairs that are not ok once the run
+has ended, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, the drift (RPE over 1 s,
+RMSE; a dash where no segment is that long), also over the clean run's, and of the change of depth the part that the
+motions leave: median over the run, and the most.
 Beyond `MOST_LEFT` depth is told to be wrong, so the clean clips' most says how far from a false alarm they are.
 
     python benchmarks/wrong_depth.py
@@ -13,14 +14,13 @@ On 2 cores the defaults take about 10 minutes.
 """
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import common
 import numpy as np
-from faults import Alter, Damaged, drift, is_wrong, zoom
+from faults import Alter, Damaged, drift, is_wrong, late, of_depth, zoom
 
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -33,16 +33,6 @@ from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory
 
 CLEAN = "clean"
-
-
-def of_depth(make: Callable[[np.ndarray], np.ndarray]) -> Alter:
-    """Damage of the depth image."""
-    return lambda clip, index, frame: replace(frame, depth=make(frame.depth).astype(frame.depth.dtype))
-
-
-def late(frames: int) -> Alter:
-    """Depth of so many frames before, under this one's stamp."""
-    return lambda clip, index, frame: replace(frame, depth=clip[max(index - frames, 0)].depth)
 
 
 def disparity(clip: FrameSequence, index: int, frame: Frame) -> Frame:
@@ -60,6 +50,7 @@ FAULTS: dict[str, Alter] = {
     "depth 1 frame late": late(1),
     "depth 3 frames late": late(3),
     "depth zoomed": of_depth(zoom),
+    "depth shifted": of_depth(lambda depth: np.roll(depth, 60, axis=1)),
     "disparity": disparity,
 }
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from small import StandIn
@@ -31,11 +32,21 @@ from gavo_jax.odometry.tracking import Clock
 from gavo_jax.status import AlignmentStatus
 
 TOLD_WITHIN = 24
+
+
+def zoomed(depth: np.ndarray, factor: float) -> np.ndarray:
+    height, width = depth.shape
+    about = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), 0.0, factor)
+    return cv2.warpAffine(depth, about, (width, height), flags=cv2.INTER_NEAREST)
+
+
 WAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored": np.fliplr,
     "upside down": np.flipud,
     "turned by half": lambda depth: depth[::-1, ::-1],
     "60 pixels to the left": lambda depth: np.roll(depth, -60, axis=1),
+    "too large": lambda depth: zoomed(depth, 1.3),
+    "too small": lambda depth: zoomed(depth, 0.67),
 }
 
 
@@ -102,7 +113,7 @@ def test_likeness_is_the_mean_edge_under_the_jumps() -> None:
     found, wide = likeness(image, jumps), np.pad(image, REACH)
     for down, right in ((0, 0), (-3, 5), (REACH, -REACH)):
         moved = wide[REACH + down : REACH + down + 50, REACH + right : REACH + right + 60]
-        for way, depth in zip(found, (jumps, jumps[:, ::-1], jumps[::-1], jumps[::-1, ::-1]), strict=True):
+        for way, depth in zip(found[:4], (jumps, jumps[:, ::-1], jumps[::-1], jumps[::-1, ::-1]), strict=True):
             assert way[REACH + down, REACH + right] == pytest.approx(moved[depth > 0].mean(), abs=1e-5)
 
 
