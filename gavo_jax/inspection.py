@@ -11,6 +11,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame
+from gavo_jax.odometry.depth_edges import DepthEdges
 from gavo_jax.status import AlignmentStatus
 
 Facts = dict[str, Any]
@@ -74,7 +75,7 @@ def _source(sequence: Sequence) -> Facts:
 def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
     """Decode every frame and check it as a run would, before anything is aligned."""
     history, statuses, reasons, delays, ranges, coverages = History(), Counter(), [], [], [], []
-    used, contrast, doubted = 0, [], Counter()
+    used, contrast, doubted, edges = 0, [], Counter(), DepthEdges.none()
     for index, timestamp in enumerate(sequence.timestamps):
         try:
             frame: Frame | FrameError = sequence[index]
@@ -89,6 +90,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
             if finding.status is not AlignmentStatus.OK:
                 doubted[str(finding.status)] += 1
         if isinstance(frame, Frame):
+            edges = edges.after(frame, sequence.camera)
             readings = frame.depth[::4, ::4][frame.depth[::4, ::4] > 0] / sequence.camera.depth_scale
             coverages.append(readings.size / frame.depth[::4, ::4].size)
             contrast.append((float(frame.grey.mean()), float(frame.grey.std())))
@@ -109,6 +111,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
         "depth": {
             **{"near_m": low, "median_m": median, "far_m": high},
             "coverage": float(np.mean(coverages)) if coverages else None,
+            "lies": edges.fault or None,
         },
     }
 

@@ -44,6 +44,8 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines += [("depth", _depth(facts))]
     if fault := facts["depth"]["fault"]:
         lines.append(("depth scale", f"WRONG? {fault}"))
+    if fault := facts["depth"]["lies"]:
+        lines.append(("depth image", f"WRONG? {fault} beside the colour image, by the edges of both"))
     if (delay := facts["delay_of_depth_ms"]) is not None:
         words = f"{delay['median']:.1f} ms after colour in the median, {delay['least']:.1f} to {delay['most']:.1f}"
         lines.append(("delay of depth", words))

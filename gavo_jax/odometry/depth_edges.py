@@ -29,6 +29,8 @@ CONTRAST = 21
 ZOOMS = (1.5, 1.3, 0.77, 0.67)
 """How many times as large depth may belong on the image: it is of another angle of view then. That of a depth camera
 that is not registered (1.11 in 7-Scenes) lies nearer to 1."""
+FAULTS = ("shifted", "mirrored", "upside down", "turned by half", *("of another angle of view" for _ in ZOOMS))
+"""What depth is that would lie better elsewhere, or each other way."""
 EVERY, SELDOM, EARLY = 3, 30, 24
 """Of the references every so many are looked at, and fewer of those that come after the first so many."""
 KEPT = 0.95
@@ -48,13 +50,13 @@ class DepthEdges(NamedTuple):
     """So many there were."""
     seen: int = 0
     """So many of them were looked at and had enough jumps."""
-    lie_elsewhere: bool = False
-    """Whether depth lies clearly better another way than it does."""
+    fault: str = ""
+    """How depth lies, where it would lie clearly better otherwise: one of `FAULTS`."""
 
     @classmethod
     def none(cls) -> "DepthEdges":
         """Before the first frame."""
-        return cls(np.zeros((4 + len(ZOOMS), 2 * REACH + 1, 2 * REACH + 1), np.float32))
+        return cls(np.zeros((len(FAULTS), 2 * REACH + 1, 2 * REACH + 1), np.float32))
 
     def spoken_of(self, pairs: int) -> int:
         """Of so many pairs so far, how many of the last its figures speak of."""
@@ -70,18 +72,19 @@ class DepthEdges(NamedTuple):
         if np.mean(jumps) < FEWEST_JUMPS:
             return counted
         sums = KEPT * self.sums + likeness(edges(np.asarray(frame.grey)), jumps)
-        is_said = self.seen + 1 >= MIN_SEEN and lies_elsewhere(sums)
-        return counted._replace(sums=sums, seen=self.seen + 1, lie_elsewhere=is_said)
+        fault = fault_by(sums) if self.seen + 1 >= MIN_SEEN else ""
+        return counted._replace(sums=sums, seen=self.seen + 1, fault=fault)
 
 
-def lies_elsewhere(sums: Float32[np.ndarray, "ways n n"]) -> bool:
-    """Whether depth lies clearly better another way than as it is, by `DepthEdges.sums`."""
+def fault_by(sums: Float32[np.ndarray, "ways n n"]) -> str:
+    """How depth lies by `DepthEdges.sums`, or an empty string where no other way is clearly better."""
     as_it_is = _near(sums[0]).max()
     shifted = sums[0].copy()
     _near(shifted)[:] = -np.inf
     best = np.array([shifted.max(), *(_near(way).max() for way in sums[1:])])
     clear = sums.mean(axis=(1, 2)) + CLEAR * sums.std(axis=(1, 2))
-    return bool(np.any((best > BETTER * as_it_is) & (best > clear)))
+    is_better = (best > BETTER * as_it_is) & (best > clear)
+    return FAULTS[int(np.argmax(np.where(is_better, best, -np.inf)))] if is_better.any() else ""
 
 
 def edges(grey: np.ndarray) -> Float32[np.ndarray, "h w"]:

@@ -25,12 +25,12 @@ class DepthWatch(NamedTuple):
     @property
     def is_wrong(self) -> bool:
         """Whether one of the two speaks against it."""
-        return self.change.is_unexplained or self.edges.lie_elsewhere
+        return self.change.is_unexplained or bool(self.edges.fault)
 
     def spoken_of(self, pairs: int) -> int:
         """Of so many pairs so far, how many of the last are spoken against."""
         by_change = self.change.spoken_of(pairs) if self.change.is_unexplained else 0
-        return max(by_change, self.edges.spoken_of(pairs) if self.edges.lie_elsewhere else 0)
+        return max(by_change, self.edges.spoken_of(pairs) if self.edges.fault else 0)
 
 
 def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
