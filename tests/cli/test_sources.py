@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from command import Done, runner
@@ -122,6 +123,22 @@ def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
         file.write_bytes(sorted((clip / "depth").iterdir())[0].read_bytes())
     done = gavo("inspect", clip)
     assert done.status == 0 and "frames used: 8 of 8\nof these, 7 frozen: its depth is the last one" in done.out
+
+
+def test_inspect_tells_of_depth_that_is_mirrored(gavo, data_dir, tmp_path):
+    source, folder = data_dir / "fr1_desk", tmp_path / "mirrored"
+    folder.mkdir()
+    (folder / "rgb").symlink_to(source / "rgb", target_is_directory=True)
+    for name in ("rgb.txt", "depth.txt"):
+        (folder / name).write_text("\n".join((source / name).read_text().splitlines()[:24]) + "\n")
+    (folder / "depth").mkdir()
+    for file in sorted((source / "depth").iterdir())[:24]:
+        depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert depth is not None and cv2.imwrite(str(folder / "depth" / file.name), depth[:, ::-1])
+    done = gavo("inspect", folder, "--camera", "fr1")
+    assert done.status == 0
+    assert "depth image: WRONG? mirrored beside the colour image, by the edges of both\n" in done.out
+    assert "WRONG" not in gavo("inspect", source, "--frames", 21, "--camera", "fr1").out
 
 
 def test_inspect_does_not_say_that_a_frame_after_a_gap_is_used_in_part(gavo, clip):
