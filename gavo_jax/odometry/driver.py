@@ -127,6 +127,18 @@ class Progress(NamedTuple):
     """Of the reference, and how depth has changed; None before the first reference."""
 
 
+class Outcome(NamedTuple):
+    """What became of a frame, before a map is asked."""
+
+    after: Progress
+    result: Alignment
+    lost: bool
+    candidates: tuple[Population, ...] = ()
+    bodies: tuple[Body, ...] = ()
+    revises: int = 0
+    """See `Step`."""
+
+
 class Odometry:
     """Frame-by-frame tracking: it holds an aligner, and between two frames all it knows is its `progress`.
 
@@ -200,39 +212,15 @@ class Odometry:
         usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
-        candidates: tuple[Population, ...] = ()
-        bodies: tuple[Body, ...] = ()
-        revises = 0
         if before.tracker is None:
-            fit = usable if finding.use is Use.ALL else None
-            after = before if fit is None else self._restart(before, fit)
-            result, lost = no_alignment(AlignmentStatus.NO_REFERENCE if fit else finding.status), True
+            known = self._begun(before, usable, finding)
         elif usable is None:
-            after, result, lost = self._lose(before, None, timestamp), no_alignment(finding.status), True
+            after, result = self._lose(before, None, timestamp), no_alignment(finding.status)
             revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
+            known = Outcome(after, result, lost=True, revises=revises)
         else:
-            clock = clock_of(before, usable)
-            attempt, leap = align_leaping(self.aligner, before.tracker, usable, clock, before.leap)
-            renewed = arrival_of(self.aligner, before.tracker, clock, attempt)
-            attempt, kept = doubt_reference(before.arrival, clock, attempt)
-            after, result, lost = self._advance(before, usable, finding, attempt)
-            after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
-            candidates, revises = attempt.candidates, attempt.revises
-            if not lost:
-                shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
-                revises = max(revises, revised_by(before.beginning, shown))
-                beginning = followed(before.beginning, timestamp, shown, is_reference=is_reference)
-                after = after._replace(beginning=beginning)
-            size = (self.camera.height, self.camera.width)
-            bodies = tuple(
-                in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies
-            )
-            if not lost and before.depth is not None:
-                elapsed = float(clock.elapsed)
-                result, watch = judge_by_depth(before.depth, usable, bodies, elapsed, result, self.camera)
-                after = after._replace(depth=watch)
-                if watch.told and not before.depth.told:
-                    revises = max(revises, watch.spoken_of(before.last_index))
+            known = self._followed(before, usable, finding)
+        after, result, lost, bodies = known.after, known.result, known.lost, known.bodies
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -250,7 +238,7 @@ class Odometry:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:
             after = after._replace(depth=watch_from(after.depth, usable, self.camera))
-        self.progress, self.candidates = after, candidates
+        self.progress, self.candidates = after, known.candidates
         if before.last_index == 0:
             return None
         milliseconds = (time.perf_counter() - start) * 1e3
@@ -266,8 +254,37 @@ class Odometry:
             after.segment,
             origin,
             bodies,
-            revises,
+            known.revises,
         )
+
+    def _begun(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
+        """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
+        if frame is None or finding.use is not Use.ALL:
+            return Outcome(before, no_alignment(finding.status), lost=True)
+        return Outcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
+
+    def _followed(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
+        """Of a frame that is aligned."""
+        clock = clock_of(before, frame)
+        attempt, leap = align_leaping(self.aligner, before.tracker, frame, clock, before.leap)
+        renewed = arrival_of(self.aligner, before.tracker, clock, attempt)
+        attempt, kept = doubt_reference(before.arrival, clock, attempt)
+        after, result, lost = self._advance(before, frame, finding, attempt)
+        after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
+        size = (self.camera.height, self.camera.width)
+        bodies = tuple(in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies)
+        revises = attempt.revises
+        if not lost:
+            shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
+            revises = max(revises, revised_by(before.beginning, shown))
+            beginning = followed(before.beginning, frame.timestamp, shown, is_reference=is_reference)
+            after = after._replace(beginning=beginning)
+        if not lost and before.depth is not None:
+            result, watch = judge_by_depth(before.depth, frame, bodies, float(clock.elapsed), result, self.camera)
+            after = after._replace(depth=watch)
+            if watch.told and not before.depth.told:
+                revises = max(revises, watch.spoken_of(before.last_index))
+        return Outcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
         """Look for a frame in the map, where it is the reference of a segment that is adrift."""
