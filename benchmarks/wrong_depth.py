@@ -1,7 +1,7 @@
 """What depth that is wrong in every frame does to a run, and whether that is told.
 
 Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`), and where it
-lies (`odometry/depth_edges.py`). Prints, for each clip and fault, the share of the pairs that are not ok once the run
+lies (`depth_edges.py`). Prints, for each clip and fault, the share of the pairs that are not ok once the run
 has ended, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, the drift (RPE over 1 s,
 RMSE; a dash where no segment is that long), also over the clean run's, and of the change of depth the part that the
 motions leave: median over the run, and the most.

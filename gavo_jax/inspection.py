@@ -10,8 +10,8 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
+from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame
-from gavo_jax.odometry.depth_edges import DepthEdges
 from gavo_jax.status import AlignmentStatus
 
 Facts = dict[str, Any]

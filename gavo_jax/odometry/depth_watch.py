@@ -9,8 +9,8 @@ from gavo_jax.alignment.result import Alignment, with_finding
 from gavo_jax.bodies.records import Body
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.odometry.depth_change import DepthChange, depth_on_grid
-from gavo_jax.odometry.depth_edges import DepthEdges
 from gavo_jax.status import AlignmentStatus
 
 

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_change import DepthChange
-from gavo_jax.odometry.depth_edges import DepthEdges
 from gavo_jax.odometry.depth_watch import DepthWatch
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap

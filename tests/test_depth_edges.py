@@ -14,8 +14,7 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.odometry.aligners import Attempt
-from gavo_jax.odometry.depth_edges import (
+from gavo_jax.depth_edges import (
     EARLY,
     EVERY,
     MIN_SEEN,
@@ -26,6 +25,7 @@ from gavo_jax.odometry.depth_edges import (
     edges,
     likeness,
 )
+from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.tracking import Clock
