@@ -71,9 +71,8 @@ class Damaged:
 
     def __getitem__(self, index: int) -> Frame:
         frame = self.clip[self.sources[index]]
-        delay = frame.depth_delay
         stamp = float(self.timestamps[index])
-        frame = replace(frame, timestamp=stamp, depth_timestamp=stamp + delay)
+        frame = replace(frame, timestamp=stamp, depth_timestamp=stamp + frame.depth_delay)
         return self.alter[index](self.clip, self.sources[index], frame) if index in self.alter else frame
 
 

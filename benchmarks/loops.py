@@ -211,8 +211,7 @@ def after_cover(frames: list[Frame], now: float, between: float) -> Iterator[Fra
             yield dark(frames[0], now)
         else:
             frame = frames[i - COVERED]
-            delay = frame.depth_delay
-            yield replace(frame, timestamp=now, depth_timestamp=now + delay)
+            yield replace(frame, timestamp=now, depth_timestamp=now + frame.depth_delay)
 
 
 def try_covered(

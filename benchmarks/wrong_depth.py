@@ -25,7 +25,7 @@ from faults import Alter, Damaged, drift, is_wrong, late, of_depth, zoom
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.depth_change import MIN_REMEMBERED, MOST_LEFT
+from gavo_jax.odometry.depth_change import MOST_LEFT
 from gavo_jax.odometry.driver import track
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
@@ -63,8 +63,8 @@ def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: com
     for step in track(sequence, odometry=odometry):
         steps.append(step)
         watch = odometry.progress.depth
-        if watch is not None and len(watch.change.left) >= MIN_REMEMBERED:
-            left.append(float(np.median(watch.change.left)))
+        if watch is not None and np.isfinite(watch.change.usually_left):
+            left.append(watch.change.usually_left)
     told = revised(steps)
     wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, truth)]
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)

@@ -166,6 +166,13 @@ def to_ray(camera: Any, u: Any, v: Any) -> tuple[Any, Any]:
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
+def inverse_depth(depth: Any, camera: Any) -> np.ndarray:
+    """1/depth of raw readings, 1/m, in double precision on the host; 0 where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = float(camera.depth_scale) / np.asarray(depth, np.float64)
+    return np.where(np.isfinite(inverse) & (inverse > 0), inverse, 0.0)
+
+
 READOUT = 0.02
 """Seconds, of freiburg1. The images alone (`benchmarks/shutter.py`) say 0.019 on two clips and less on a third; 0.02
 drifted a little less there. Taken over for the two others, which are of like make but were not at hand."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 from scipy import fft
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, inverse_depth
 from gavo_jax.datasets.base import Frame
 
 WIDTH = 160
@@ -100,11 +100,10 @@ def depth_jumps(depth: np.ndarray, camera: Camera) -> Float32[np.ndarray, "h w"]
     width, height = _size(*depth.shape[::-1])
     row, column = np.arange(height) * depth.shape[0] // height, np.arange(width) * depth.shape[1] // width
     small = depth[row[:, None], column]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.float32(camera.depth_scale) / small.astype(np.float32)
-    known, around = np.isfinite(inverse) & (inverse > 0), np.ones((3, 3), np.uint8)
-    nearest = cv2.dilate(np.where(known, inverse, 0).astype(np.float32), around)
-    farthest = cv2.erode(np.where(known, inverse, np.inf).astype(np.float32), around)
+    inverse = inverse_depth(small, camera).astype(np.float32)
+    known, around = inverse > 0, np.ones((3, 3), np.uint8)
+    nearest = cv2.dilate(inverse, around)
+    farthest = cv2.erode(np.where(known, inverse, np.float32(np.inf)), around)
     return (known & (nearest - farthest > JUMP)).astype(np.float32)
 
 

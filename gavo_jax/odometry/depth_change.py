@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.camera import Camera, to_pixels, to_ray
+from gavo_jax.camera import Camera, inverse_depth, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp, log
 from gavo_jax.trajectory import inverse
@@ -46,9 +46,14 @@ class DepthChange(NamedTuple):
     """Of the last pairs, how much of what rest would leave unexplained the motion leaves."""
 
     @property
+    def usually_left(self) -> float:
+        """Median of `left`; not-a-number of fewer than tell."""
+        return float(np.median(self.left)) if len(self.left) >= MIN_REMEMBERED else np.nan
+
+    @property
     def is_unexplained(self) -> bool:
         """Whether the motions explain the change of depth hardly better than rest."""
-        return len(self.left) >= MIN_REMEMBERED and bool(np.median(self.left) > MOST_LEFT)
+        return self.usually_left > MOST_LEFT
 
     def spoken_of(self, pairs: int) -> int:
         """Of so many pairs so far, how many of the last its figures speak of: all, until one has been forgotten."""
@@ -83,7 +88,7 @@ class DepthChange(NamedTuple):
 def depth_on_grid(frame: Frame, camera: Camera) -> Float64[np.ndarray, "rows columns"]:
     """1/depth of a frame on the grid, 1/m; 0 without a reading."""
     rows, columns = _grid(camera)
-    return _inverse(np.asarray(frame.depth)[rows, columns], camera)
+    return inverse_depth(np.asarray(frame.depth)[rows, columns], camera)
 
 
 def left_unexplained(
@@ -110,7 +115,7 @@ def left_unexplained(
         u, v = to_pixels(camera, moved[0], moved[1], 1 / moved[2])
         inside = (q > 0) & (moved[2] > 0) & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
     seen = _sampled(depth, np.where(inside, u, 0), np.where(inside, v, 0), camera)
-    unmoved = _inverse(depth[row, column].ravel(), camera)
+    unmoved = inverse_depth(depth[row, column].ravel(), camera)
     inside &= (seen > 0) & (unmoved > 0)
     if np.count_nonzero(inside) < LEAST_POINTS:
         return np.nan
@@ -134,15 +139,8 @@ def _sampled(depth: np.ndarray, u: np.ndarray, v: np.ndarray, camera: Camera) ->
     """1/depth between pixels, 1/m; 0 where one of the four around has no reading, or an edge lies between them."""
     left, above = np.minimum(u.astype(int), camera.width - 2), np.minimum(v.astype(int), camera.height - 2)
     down_by, along_by = np.array([[0], [0], [1], [1]]), np.array([[0], [1], [0], [1]])
-    around = _inverse(depth[above + down_by, left + along_by], camera)
+    around = inverse_depth(depth[above + down_by, left + along_by], camera)
     along, down = u - left, v - above
     weights = np.stack([(1 - down) * (1 - along), (1 - down) * along, down * (1 - along), down * along])
     is_smooth = np.all(around > 0, axis=0) & (np.ptp(around, axis=0) < EDGE)
     return np.where(is_smooth, np.sum(weights * around, axis=0), 0.0)
-
-
-def _inverse(depth: Any, camera: Camera) -> np.ndarray:
-    """1/depth of raw readings, 1/m; 0 where there is none."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = float(camera.depth_scale) / np.asarray(depth, np.float64)
-    return np.where(np.isfinite(inverse) & (inverse > 0), inverse, 0.0)

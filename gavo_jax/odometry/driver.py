@@ -213,14 +213,14 @@ class Odometry:
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
         if before.tracker is None:
-            known = self._begun(before, usable, finding)
+            outcome = self._begin(before, usable, finding)
         elif usable is None:
             after, result = self._lose(before, None, timestamp), no_alignment(finding.status)
             revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
-            known = Outcome(after, result, lost=True, revises=revises)
+            outcome = Outcome(after, result, lost=True, revises=revises)
         else:
-            known = self._followed(before, usable, finding)
-        after, result, lost, bodies = known.after, known.result, known.lost, known.bodies
+            outcome = self._align(before, usable, finding)
+        after, result, lost, bodies = outcome.after, outcome.result, outcome.lost, outcome.bodies
         origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
@@ -238,7 +238,7 @@ class Odometry:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:
             after = after._replace(depth=watch_from(after.depth, usable, self.camera))
-        self.progress, self.candidates = after, known.candidates
+        self.progress, self.candidates = after, outcome.candidates
         if before.last_index == 0:
             return None
         milliseconds = (time.perf_counter() - start) * 1e3
@@ -254,16 +254,16 @@ class Odometry:
             after.segment,
             origin,
             bodies,
-            known.revises,
+            outcome.revises,
         )
 
-    def _begun(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
+    def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
         """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
             return Outcome(before, no_alignment(finding.status), lost=True)
         return Outcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
-    def _followed(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
+    def _align(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
         """Of a frame that is aligned."""
         clock = clock_of(before, frame)
         attempt, leap = align_leaping(self.aligner, before.tracker, frame, clock, before.leap)
