@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
 
 from gavo_jax.camera import Camera
+from gavo_jax.image.numbers import grey_bytes
 
 FeatureKind = Literal["sift", "orb"]
 
@@ -73,7 +74,7 @@ def detect(
         camera: Of the image.
         kind: What finds and describes them.
     """
-    keypoints, descriptors = _detector(kind).detectAndCompute(np.ascontiguousarray(grey), None)
+    keypoints, descriptors = _detector(kind).detectAndCompute(grey_bytes(grey), None)
     if descriptors is None or not keypoints:
         return Features(np.zeros((0, 2)), np.zeros((0, 1), np.float32), np.zeros((0, 3)))
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64)

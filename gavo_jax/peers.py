@@ -21,6 +21,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.feature_peers import FeaturePeer
 from gavo_jax.features import FeatureKind
+from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.peer import Peer, PeerResult, check_size, failure, result_of
 
 
@@ -63,7 +64,7 @@ class OpenCVPeer:
         check_size(frame, self._camera)
         metres = frame.depth.astype(np.float32) / np.float32(self._camera.depth_scale)
         metres[metres >= self.DEPTH_LIMIT] = 0.0
-        prepared = cv2.OdometryFrame(depth=metres, image=frame.grey)
+        prepared = cv2.OdometryFrame(depth=metres, image=grey_bytes(frame.grey))
         self._odometry.prepareFrame(prepared)
         return prepared
 
@@ -116,7 +117,7 @@ class Open3DLegacyPeer:
         check_size(frame, self._camera)
         image = self._open3d.geometry.Image
         return self._open3d.geometry.RGBDImage.create_from_color_and_depth(
-            image(np.ascontiguousarray(frame.grey)),
+            image(grey_bytes(frame.grey)),
             image(np.ascontiguousarray(frame.depth)),
             depth_scale=float(self._camera.depth_scale),
             depth_trunc=self._max_depth,
@@ -163,7 +164,7 @@ class Open3DTensorPeer:
         """
         check_size(frame, self._camera)
         image, tensor = self._open3d.t.geometry.Image, self._open3d.core.Tensor
-        color = np.repeat(frame.grey[..., None], 3, axis=-1)
+        color = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=-1)
         depth = np.ascontiguousarray(frame.depth[..., None])
         return self._open3d.t.geometry.RGBDImage(image(tensor(color)), image(tensor(depth)))
 

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
+from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory, inverse
@@ -141,7 +142,7 @@ class MapBuilder:
         if not np.any((metres > 0) & (metres < self.farthest)):
             return
         depth = image(np.ascontiguousarray(metres))
-        rgb = np.repeat(frame.grey[..., None], 3, axis=2) if frame.color is None else frame.color
+        rgb = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=2) if frame.color is None else frame.color
         color = image(np.ascontiguousarray(rgb, np.float32))
         extrinsic = core.Tensor(inverse(world_T_camera))
         reach = (1.0, self.farthest, TRUNCATION)

@@ -68,3 +68,17 @@ def test_a_plain_frame_has_no_keypoints() -> None:
     dots[40:46, 30:36] = 255
     features = detect(dots, np.zeros((120, 160), np.uint16), CAMERA)
     assert len(features.pixels) and np.isnan(features.points).all()
+
+
+@pytest.mark.parametrize("kind", ["sift", "orb"])
+def test_grey_of_any_numbers_has_the_keypoints_of_bytes(kind: FeatureKind) -> None:
+    """OpenCV ended the program."""
+    coarse = np.random.default_rng(1).integers(40, 220, (15, 20)).astype(np.uint8)
+    grey = cv2.resize(coarse, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_CUBIC)
+    depth = np.full(grey.shape, 7500, np.uint16)
+    expected = detect(grey, depth, CAMERA, kind)
+    assert len(expected.pixels) > 20
+    for other in (grey.astype(np.float32) + np.float32(0.2), grey.astype(np.int64)):
+        np.testing.assert_array_equal(detect(other, depth, CAMERA, kind).descriptors, expected.descriptors)
+    blank = np.full(grey.shape, np.nan, np.float32)
+    assert len(detect(blank, depth, CAMERA, kind).pixels) == 0

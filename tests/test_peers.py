@@ -110,6 +110,17 @@ def test_depth_scale_is_the_cameras(peer: Peer) -> None:
     assert np.linalg.norm(millimetres.align(a, b).target_T_reference - expected) < 0.005
 
 
+def test_images_may_be_of_any_numbers(peer: Peer) -> None:
+    """OpenCV ended the program where grey was not bytes."""
+    first, second = render(np.eye(4)), render(motion(*MOTIONS["forward"]))
+    expected = peer.align(peer.prepare(first), peer.prepare(second)).target_T_reference
+    metric = make_peer(peer.name, replace(CAMERA, depth_scale=1.0))
+    metres = [frame.depth / np.float32(CAMERA.depth_scale) for frame in (first, second)]
+    floats = [frame.grey.astype(np.float32) for frame in (first, second)]
+    a, b = (metric.prepare(Frame(*images, 0.0)) for images in zip(floats, metres, strict=True))  # pyright: ignore
+    np.testing.assert_allclose(metric.align(a, b).target_T_reference, expected, atol=1e-3)
+
+
 @pytest.mark.parametrize("name", [*OPENCV, "open3d-tensor-hybrid"])
 def test_failure_is_the_identity(name: str) -> None:
     """Without any depth there is nothing to align: success is false and the motion the identity."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
 
 from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.image.settling import filled_inverse_depth
 
 MOST = 500
@@ -54,7 +55,7 @@ def track_corners(
         target_T_reference: The motion as far as it is known.
         camera: Of both, without distortion.
     """
-    grey, depth = reference
+    grey, depth, target = grey_bytes(reference[0]), reference[1], grey_bytes(target)
     column, row, seen = _view(depth, target_T_reference, camera)
     size = 2 * int(0.5 * WINDOW * camera.width) + 1
     seen = cv2.erode(seen, np.ones((size, size), np.uint8)) * (depth > 0)

@@ -261,7 +261,7 @@ def align(
         GavoError: The images are not of the camera's size, or of a wrong shape.
     """
     settings = as_settings(settings, solver, alignment=options)
-    sides = [stacked_images([frame], camera) for frame in (reference, target)]
+    sides = stacked_sides([reference], [target], camera)
     key = jax.random.key(0) if key is None else key
     if not isinstance(key, jax.Array):
         raise GavoError(f"a key is needed, jax.random.key(seed), not {type(key).__name__}")
@@ -311,12 +311,12 @@ def align_batch(
 def stacked_pairs(
     references: Any, targets: Any, camera: Camera, keys: PRNGKeyArray | None
 ) -> tuple[list[Images], PRNGKeyArray]:
-    """Both sides of B pairs as of `stacked_images`, and their keys.
+    """Both sides of B pairs as of `stacked_sides`, and their keys.
 
     Raises:
         GavoError: As of `stacked_images`, or there are not as many of one as of the other.
     """
-    sides = [stacked_images(side, camera) for side in (references, targets)]
+    sides = stacked_sides(references, targets, camera)
     count, others = (len(side.grey) for side in sides)
     if others != count:
         raise GavoError(f"{count} references but {others} targets")
@@ -339,6 +339,16 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
+
+
+def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
+    """Both sides as of `stacked_images`: bytes and 16 bits, or float32 throughout. For each other combination of types
+    the search would be compiled anew.
+    """
+    sides = [stacked_images(side, camera) for side in (references, targets)]
+    if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):
+        return sides
+    return [Images(*(jnp.asarray(image, jnp.float32) for image in side)) for side in sides]
 
 
 def stacked_images(side: Any, camera: Camera) -> Images:

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, Shaped, UInt8
 
-from gavo_jax.camera import Camera, to_ray
+from gavo_jax.camera import Camera, inverse_depth, to_ray
+from gavo_jax.image.numbers import Depth, grey_bytes, readings_like
 from gavo_jax.image.pyramid import EDGE_TOLERANCE
 from gavo_jax.image.shutter import row_time
 
@@ -24,13 +25,13 @@ class Still(NamedTuple):
     """What a keyframe keeps of its images: a camera of half the size, `Camera.level(1)`."""
 
     grey: UInt8[np.ndarray, "h w"]
-    depth: UInt16[np.ndarray, "h w"]
+    depth: Depth
     """In the camera's units, 0 = no reading."""
 
 
 def still(
-    grey: UInt8[np.ndarray, "height width"],
-    depth: UInt16[np.ndarray, "height width"],
+    grey: Shaped[np.ndarray, "height width"],
+    depth: Shaped[np.ndarray, "height width"],
     camera: Camera,
     twist: Float[np.ndarray, " 6"],
     depth_delay: float = 0.0,
@@ -47,7 +48,7 @@ def still(
         twist: Motion of the points in the camera, (v, w) in m/s and rad/s.
         depth_delay: Seconds from the colour image's moment to the depth image's.
     """
-    grey, depth, camera = halve_grey(grey), halve_depth(depth), camera.level(1)
+    grey, depth, camera = halve_grey(grey_bytes(grey)), halve_depth(depth), camera.level(1)
     twist = np.asarray(twist, np.float32)
     if not np.any(twist):
         return Still(grey, depth)
@@ -62,9 +63,7 @@ def still(
     column, row = u + seconds * flow[0], v + seconds * flow[1]
     read = cv2.remap(depth, column, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     moved = read - seconds * (read * flow[2] + np.float32(twist[2] * camera.depth_scale))
-    top = np.iinfo(np.uint16).max
-    depth = np.where((read > 0) & (moved > 0) & (moved < top), np.round(moved), 0.0).astype(np.uint16)
-    return Still(grey, depth)
+    return Still(grey, readings_like(depth, np.where((read > 0) & (moved > 0), moved, 0.0)))
 
 
 def pixel_flow(
@@ -82,8 +81,8 @@ def pixel_flow(
 
 def filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """1/z [1/m], gaps filled from their surroundings."""
-    known = depth > 0
-    q = np.where(known, camera.depth_scale / np.maximum(depth, 1), 0.0).astype(np.float32)
+    q = inverse_depth(depth, camera).astype(np.float32)
+    known = q > 0
     usual = np.float32(np.median(q[known])) if known.any() else np.float32(1.0 / UNKNOWN_DEPTH)
     size = (2 * (camera.width // 16) + 1,) * 2
     count = cv2.blur(known.astype(np.float32), size)
@@ -100,7 +99,7 @@ def halve_grey(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
     return np.clip(np.round(blurred[::2, ::2]), 0, 255).astype(np.uint8)
 
 
-def halve_depth(depth: UInt16[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h2 w2"]:
+def halve_depth(depth: Shaped[np.ndarray, "h w"]) -> Depth:
     """Half the size: of each 2 × 2 block the mean of the nearest surface's readings, as the pyramid does it."""
     height, width = (size // 2 * 2 for size in depth.shape)
     block = depth[:height, :width].reshape(height // 2, 2, width // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
@@ -109,4 +108,4 @@ def halve_depth(depth: UInt16[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h2 w2"]
     kept = readings <= nearest / (1.0 - EDGE_TOLERANCE)
     kept &= np.isfinite(readings)
     mean = np.where(kept, readings, 0.0).sum(axis=0) / np.maximum(kept.sum(axis=0), 1)
-    return np.round(mean).astype(np.uint16).reshape(height // 2, width // 2)
+    return readings_like(depth, mean).reshape(height // 2, width // 2)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.viewer.colors import RESIDUAL_COLORS, color_of_body
 
 IMAGE_WIDTH = 320
@@ -51,7 +52,7 @@ def shrink(frame: Frame, camera: Camera, depth_scale: float) -> Shown:
     def resized(image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w *channels"]:
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA) if step > 1 else image
 
-    grey = resized(np.asarray(frame.grey))
+    grey = resized(grey_bytes(frame.grey))
     picture = grey if frame.color is None else cv2.cvtColor(resized(frame.color), cv2.COLOR_RGB2BGR)
     raw = np.asarray(frame.depth)[step // 2 :: step, step // 2 :: step][: size[1], : size[0]]
     depth = raw.astype(np.float32) * np.float32(1 / depth_scale)

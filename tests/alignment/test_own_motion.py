@@ -47,6 +47,17 @@ def test_a_rolling_shutter_is_told_from_the_motion() -> None:
     assert max(errors[CAMERA.readout]) < 0.5 * min(errors[0.0])
 
 
+def test_images_of_any_numbers_have_the_same_corners() -> None:
+    """OpenCV ended the program where grey was not bytes; depth in metres was taken for a metre at least."""
+    frame = images(swinging()[5])
+    metres = frame[0].astype(np.float32), frame[1].astype(np.float32) / np.float32(2 * CAMERA.depth_scale)
+    near = frame[0], frame[1] // 2
+    found = refine_moving(near, near, CAMERA, ASIDE)
+    again = refine_moving(metres, metres, replace(CAMERA, depth_scale=1.0), ASIDE)
+    assert found is not None and again is not None
+    np.testing.assert_allclose(again.target_T_reference, found.target_T_reference, atol=1e-4)
+
+
 def test_noise_has_no_corners() -> None:
     rng = np.random.default_rng(0)
     shape = (CAMERA.height, CAMERA.width)

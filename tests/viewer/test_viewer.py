@@ -263,6 +263,15 @@ def test_warping_back_gives_the_reference():
     assert not colors[~seen].any()
 
 
+def test_images_of_any_numbers_are_shown():
+    frame = SyntheticSequence(frames=2, camera=CAMERA)[0]
+    shown = pictures.shrink(frame, CAMERA, CAMERA.depth_scale)
+    metric = replace(frame, grey=frame.grey.astype(np.float32), depth=frame.depth / np.float32(CAMERA.depth_scale))
+    again = pictures.shrink(metric, CAMERA, 1.0)
+    assert again.jpeg == shown.jpeg
+    np.testing.assert_allclose(again.depth, shown.depth, rtol=1e-6)
+
+
 def test_residuals_are_blue_below_and_vermilion_above():
     bright, dark = np.full((2, 3), 200, np.uint8), np.full((2, 3), 100, np.uint8)
     seen = np.array([[True, True, False]] * 2)

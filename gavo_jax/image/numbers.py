@@ -1,0 +1,22 @@
+"""Images come in any numbers, grey from 0 to 255, depth in any unit; some of what looks at them wants certain types."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+Depth = UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
+"""Of 16 bits, or float32 where it came as anything else: it may be in metres."""
+
+
+def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:
+    """A grey image as OpenCV's keypoints, corners and colours need it; black where it is no number."""
+    image = np.ascontiguousarray(grey)
+    return image if image.dtype == np.uint8 else np.nan_to_num(image.clip(0, 255)).round().astype(np.uint8)
+
+
+def readings_like(depth: np.ndarray, readings: Float[np.ndarray, "*n"]) -> np.ndarray:
+    """Readings in 16 bits where the depth they were made of is so (0 where they do not fit), else as float32."""
+    if depth.dtype != np.uint16:
+        return readings.astype(np.float32)
+    return np.where(readings < np.iinfo(np.uint16).max, np.round(readings), 0.0).astype(np.uint16)
