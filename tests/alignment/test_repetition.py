@@ -12,7 +12,7 @@ from gavo_jax import se3
 from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period, repetitions
 from gavo_jax.datasets.synthetic import SyntheticSequence
 
-SETTINGS = replace(gavo.preset("gauss-newton", "fast"), odometry=ALONE)
+SETTINGS = replace(gavo.preset("gauss-newton"), odometry=ALONE)
 DISTANCE = 1.5
 DEPTH = np.full((CAMERA.height, CAMERA.width), DISTANCE * CAMERA.depth_scale, np.uint16)
 

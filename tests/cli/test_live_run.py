@@ -20,6 +20,7 @@ from gavo_jax.scene_map import build_map
 from gavo_jax.trajectory import Trajectory
 
 needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
+WIDE = replace(CAMERA, width=320)
 LENS = replace(CAMERA, distortion=(0.1, -0.1, 0.0, 0.0, 0.0))
 FRAMES = SyntheticSequence(5, noise=NONE, camera=CAMERA, color=True)
 
@@ -109,7 +110,7 @@ def test_what_cannot_be_is_one_line(arguments, words, tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
     register_device("player", Player)
     register_device("empty", lambda: Player(frames=()))
-    register_device("odd", lambda: Player(camera=replace(CAMERA, width=320)))
+    register_device("odd", lambda: Player(frames=SyntheticSequence(1, noise=NONE, camera=WIDE, color=True)))
     done = runner(capsys)("run", *arguments, "--method", "small-newton")
     assert done.status == 2
     assert words in done.err and done.err.count("\n") == 1

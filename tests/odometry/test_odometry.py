@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small
 from small import Rendered, StandIn
 
 from gavo_jax.alignment.result import Alignment, no_alignment
@@ -108,13 +109,13 @@ def errors(result: OdometryRun, sequence: Any) -> np.ndarray:
 
 
 def test_what_is_no_sequence_is_refused_by_name():
-    frames = list(SyntheticSequence(frames=2, camera=DEFAULT_CAMERA.level(2)))
+    frames = list(SyntheticSequence(frames=2, camera=small.CAMERA))
     for wrong in (frames, "fr1_xyz"):
         with pytest.raises(GavoError, match="a Sequence is needed, not (list|str)"):
             run_odometry(wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="Camera is needed"):
         Odometry("fr1")  # pyright: ignore[reportArgumentType]
-    odometry = Odometry(DEFAULT_CAMERA.level(2))
+    odometry = Odometry(small.CAMERA, small.NEWTON)
     dark = frames[0].grey / np.float32(255.0)
     with pytest.raises(GavoError, match="multiply by 255"):
         odometry.register(replace(frames[0], grey=dark), 0.0)
