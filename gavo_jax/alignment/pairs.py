@@ -18,6 +18,7 @@ from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
+from gavo_jax.image.numbers import as_array
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
@@ -326,10 +327,15 @@ def stacked_pairs(
     return sides, keys
 
 
+def _plain(image: Any) -> Any:
+    """An array that a program takes; one that is on a device stays there."""
+    return image if isinstance(image, jax.Array) else as_array(image)
+
+
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
         raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
-    grey, depth = (frame.grey, frame.depth) if isinstance(frame, Frame) else frame
+    grey, depth = map(_plain, (frame.grey, frame.depth) if isinstance(frame, Frame) else frame)
     expected = (camera.height, camera.width)
     for name, image in (("grey", grey), ("depth", depth)):
         if np.shape(image) != expected:
@@ -362,6 +368,7 @@ def stacked_images(side: Any, camera: Camera) -> Images:
     if not len(side[0] if is_stacked else side):
         raise GavoError("a batch of no frames: at least one pair is needed")
     if is_stacked:
+        side = tuple(map(_plain, side))
         if camera.is_distorted:
             return stacked_images(list(zip(*side, strict=True)), camera)
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):

@@ -9,6 +9,12 @@ Depth = UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
 """Of 16 bits, or float32 where it came as anything else: it may be in metres."""
 
 
+def as_array(image: Any) -> np.ndarray:
+    """An image as a plain array of this machine's byte order; what is masked is 0, as where there is no reading."""
+    array = np.asarray(image.filled(0) if isinstance(image, np.ma.MaskedArray) else image)
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+
+
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:
     """A grey image as OpenCV's keypoints, corners and colours need it; black where it is no number."""
     image = np.ascontiguousarray(grey)

@@ -21,6 +21,7 @@ from gavo_jax.camera import Camera, require_size
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
+from gavo_jax.image.numbers import as_array
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
 from gavo_jax.odometry.depth_watch import DepthWatch, judge_by_depth, watch_from
@@ -410,14 +411,15 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         FrameError: An image is not of the camera's size, or not one number per pixel.
     """
     size = (camera.height, camera.width)
-    for name, image in (("grey", frame.grey), ("depth", frame.depth)):
-        kind = np.asarray(image).dtype
-        if np.shape(image) != size or kind.kind not in "uif":
-            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
+    grey, depth = as_array(frame.grey), as_array(frame.depth)
+    for name, image in (("grey", grey), ("depth", depth)):
+        if image.shape != size or image.dtype.kind not in "uif":
+            fault = f"{name} image is {image.dtype} of shape {image.shape}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
     if not camera.is_distorted:
-        return frame
-    grey, depth = camera.undistort(np.asarray(frame.grey), np.asarray(frame.depth))
+        is_plain = grey is frame.grey and depth is frame.depth
+        return frame if is_plain else replace(frame, grey=grey, depth=depth)
+    grey, depth = camera.undistort(grey, depth)
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)
 

@@ -17,6 +17,7 @@ import pytest
 import small
 from small import Rendered, StandIn
 
+from gavo_jax.alignment.pairs import align
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.aligner import BodyAware
@@ -122,6 +123,32 @@ def test_what_is_no_sequence_is_refused_by_name():
     odometry.register(frames[0], 0.0)
     step = odometry.register(replace(frames[1], grey=dark), 1 / 30)  # a covered lens is no reason to end a run
     assert step is not None and step.alignment.status is not AlignmentStatus.OK
+
+
+def big_endian(image: np.ndarray) -> np.ndarray:
+    return image.astype(image.dtype.newbyteorder(">"))
+
+
+def masked(image: np.ndarray) -> np.ndarray:
+    """What is 0 holds numbers that do not count."""
+    return np.ma.masked_array(np.where(image == 0, 77, image), image == 0)
+
+
+@pytest.mark.parametrize("form", [np.ndarray.tolist, np.asfortranarray, big_endian, masked, jnp.asarray])
+def test_images_are_arrays_of_any_kind(form: Callable[[np.ndarray], Any]) -> None:
+    frames = list(Rendered(3, camera=small.CAMERA))
+    assert any((frame.depth == 0).any() for frame in frames)
+
+    def poses(form: Callable[[np.ndarray], Any]) -> list[np.ndarray]:
+        odometry = Odometry(small.CAMERA, small.NEWTON)
+        shaped = [replace(frame, grey=form(frame.grey), depth=form(frame.depth)) for frame in frames]
+        steps = [odometry.register(frame, frame.timestamp) for frame in shaped]
+        return [step.world_T_camera for step in steps if step is not None]
+
+    np.testing.assert_array_equal(poses(form), poses(np.asarray))
+    kinds = [[(kind(frame.grey), kind(frame.depth)) for frame in frames] for kind in (form, np.asarray)]
+    pairs = [align(first, second, small.CAMERA, small.NEWTON) for first, second, _ in kinds]
+    np.testing.assert_array_equal(pairs[0].target_T_reference, pairs[1].target_T_reference)
 
 
 def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
