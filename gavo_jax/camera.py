@@ -192,17 +192,42 @@ PRESETS = {
 Dynamic dataset (Palazzolo et al. 2019), like them; of the rendered ICL-NUIM (Handa et al. 2014)."""
 
 
-def require_size(camera: Camera) -> None:
-    """Refuse what is no camera, and one whose images are too small for a pyramid.
+NUMBERS_OF_DISTORTION = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
+"""How many there may be, as OpenCV takes them."""
+
+
+def require_camera(camera: Camera) -> None:
+    """Refuse what is no camera, one whose values cannot be, and one whose images are too small for a pyramid.
 
     Raises:
-        GavoError: A side has fewer than `MIN_SIDE` pixels, say.
+        GavoError: A side has fewer than `MIN_SIDE` pixels, a focal length is not positive, say.
     """
     if not isinstance(camera, Camera):
         raise GavoError(f"a Camera is needed, not {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
+    for name in ("width", "height"):
+        if not isinstance(size := getattr(camera, name), int | np.integer):
+            raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
+    for name, least in {"fx": 0.0, "fy": 0.0, "cx": -np.inf, "cy": -np.inf, "depth_scale": 0.0}.items():
+        if not (_is_number(value := getattr(camera, name)) and value > least):
+            raise GavoError(f"camera: {name}: a {'positive ' * (least == 0)}number is needed, not {value!r}")
+    if not (_is_number(camera.readout) and camera.readout >= 0):
+        raise GavoError(f"camera: readout: seconds from 0 on are needed, not {camera.readout!r}")
+    if camera.model not in NUMBERS_OF_DISTORTION:
+        raise GavoError(f"camera: model: one of {', '.join(NUMBERS_OF_DISTORTION)} is needed, not {camera.model!r}")
+    counts, distortion = NUMBERS_OF_DISTORTION[camera.model], camera.distortion
+    if not (isinstance(distortion, tuple) and len(distortion) in (0, *counts) and all(map(_is_number, distortion))):
+        raise GavoError(
+            f"camera: distortion: a tuple of {', '.join(map(str, counts))} numbers is needed, not {distortion!r}"
+        )
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise GavoError(f"images of {size} are too small: the search needs {MIN_SIDE} pixels a side at least")
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a finite real number, of Python, NumPy or JAX."""
+    array = np.asarray(value)
+    return array.ndim == 0 and array.dtype.kind in "iuf" and bool(np.isfinite(array))
 
 
 def _stack(*arrays: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import MAX_SIDE, MIN_SIDE, PRESETS, Camera
+from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, Camera
 from gavo_jax.camera_makes import MODELS, PARSERS, PROJECTION, Table
 from gavo_jax.errors import GavoError, read_text, shown
 
@@ -214,7 +214,7 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
     if model is None:
         raise GavoError(f"{path}: {part}model: {shown(given)} is none of {', '.join(MODELS)}")
     numbers = values.get("distortion", [])
-    lengths = (0, 4) if model == "fisheye" else (0, 4, 5, 8, 12, 14)
+    lengths = (0, *NUMBERS_OF_DISTORTION[model])
     if not isinstance(numbers, list) or len(numbers) not in lengths or ("distortion" in values and numbers == []):
         wanted = (
             "4 numbers (k1 k2 k3 k4)"

@@ -1,6 +1,7 @@
 """Intrinsics, levels, projection, undistortion and camera files."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import jax
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import RIM, Camera, preset_for_sequence
+from gavo_jax.camera import RIM, Camera, preset_for_sequence, require_camera
 from gavo_jax.camera_files import load_camera
 from gavo_jax.errors import GavoError
 
@@ -248,3 +249,28 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
     path.write_bytes(content)
     with pytest.raises(GavoError):
         load_camera(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"fx": -131.0}, "fx: a positive number"),
+        ({"fy": float("nan")}, "fy: a positive number"),
+        ({"cx": "80"}, "cx: a number"),
+        ({"width": 160.0}, "width: a whole number"),
+        ({"width": 8}, "too small"),
+        ({"depth_scale": 0.0}, "depth_scale: a positive number"),
+        ({"readout": -0.02}, "readout: seconds from 0 on"),
+        ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: a tuple of 4, 5, 8, 12, 14 numbers"),
+        ({"distortion": (0.1, 0.2, 0.3)}, "distortion: a tuple"),
+        ({"distortion": (0.1,) * 5, "model": "fisheye"}, "distortion: a tuple of 4 numbers"),
+        ({"model": "panorama"}, "model: one of pinhole, fisheye"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: dict[str, Any], words: str) -> None:
+    """A negative focal length was `ok`; others ended with a traceback, or said that there is no depth."""
+    camera = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+    require_camera(camera)
+    require_camera(replace(camera, fx=np.float32(131.0), cx=jnp.float32(79.5), width=np.int64(160), distortion=()))  # pyright: ignore
+    with pytest.raises(GavoError, match=words):
+        require_camera(replace(camera, **values))

@@ -13,7 +13,7 @@ from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_peri
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
-from gavo_jax.camera import Camera, require_size
+from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
@@ -363,7 +363,7 @@ def stacked_images(side: Any, camera: Camera) -> Images:
     Raises:
         GavoError: They are none, too small, or not of the camera's size.
     """
-    require_size(camera)
+    require_camera(camera)
     is_stacked = isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3
     if not len(side[0] if is_stacked else side):
         raise GavoError("a batch of no frames: at least one pair is needed")

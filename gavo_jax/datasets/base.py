@@ -32,6 +32,16 @@ def require_grey_levels(grey: Any) -> None:
         raise FrameError("grey levels reach from 0 to 255, not from 0 to 1: multiply by 255")
 
 
+def require_seconds(name: str, stamp: Any) -> None:
+    """Refuse what is no time in seconds: text, a date.
+
+    Raises:
+        GavoError: It is no single number.
+    """
+    if np.ndim(stamp) or np.asarray(stamp).dtype.kind not in "iuf":
+        raise GavoError(f"{name}: seconds are needed, a number, not {type(stamp).__name__}")
+
+
 class TimestampError(FrameError):
     """A frame whose time is in doubt."""
 
@@ -53,6 +63,11 @@ class Frame:
     timestamp: float
     color: UInt8[np.ndarray, "height width 3"] | None = None
     depth_timestamp: float | None = None
+
+    def __post_init__(self):
+        for name in ("timestamp", "depth_timestamp"):
+            if (stamp := getattr(self, name)) is not None or name == "timestamp":
+                require_seconds(name, stamp)
 
     @property
     def depth_delay(self) -> float:

@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, in_world
-from gavo_jax.camera import Camera, require_size
-from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_levels, what_helps
+from gavo_jax.camera import Camera, require_camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_levels, require_seconds, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.image.numbers import as_array
@@ -172,7 +172,7 @@ class Odometry:
         aligner: Aligner | None = None,
         relocaliser: Relocaliser | None = None,
     ):
-        require_size(camera)
+        require_camera(camera)
         self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
@@ -197,7 +197,8 @@ class Odometry:
 
         Raises:
             FrameError: There is no first frame to start from.
-            GavoError: What is given is no frame, or its images are not of the camera's size or no grey and depth.
+            GavoError: What is given is no frame, its images are not of the camera's size or no grey and depth, or a
+                stamp is no number.
         """
         if isinstance(frame, Frame):
             frame = rectified(frame, self.recorded)
@@ -205,6 +206,7 @@ class Odometry:
                 require_grey_levels(frame.grey)
         elif not (frame is None or isinstance(frame, FrameError)):
             raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
+        require_seconds("timestamp", timestamp)
         if self.progress.last_index < 0 and not isinstance(frame, Frame):
             raise frame or FrameError("the first frame could not be read")
         start = time.perf_counter()

@@ -125,6 +125,17 @@ def test_what_is_no_sequence_is_refused_by_name():
     assert step is not None and step.alignment.status is not AlignmentStatus.OK
 
 
+@pytest.mark.parametrize("stamp", ["0.1", None, np.datetime64("2026-01-01"), [0.1], np.array([0.1]), 1j])
+def test_what_is_no_time_is_refused_by_name(stamp: Any) -> None:
+    frame = Rendered(1, camera=small.CAMERA)[0]
+    with pytest.raises(GavoError, match="timestamp: seconds are needed, a number, not"):
+        Odometry(small.CAMERA, small.NEWTON).register(frame, stamp)
+    with pytest.raises(GavoError, match="timestamp: seconds are needed"):
+        replace(frame, timestamp=stamp)
+    with pytest.raises(GavoError, match="depth_timestamp: seconds are needed"):
+        replace(frame, depth_timestamp=stamp or "")
+
+
 def big_endian(image: np.ndarray) -> np.ndarray:
     return image.astype(image.dtype.newbyteorder(">"))
 
