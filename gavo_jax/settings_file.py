@@ -201,6 +201,7 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
             new = _convert(where, type(part), field, current, value)
         settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
     _check_schedules(place, settings.solver)
+    _check_values(place, settings)
     return settings
 
 
@@ -303,3 +304,31 @@ def _check_schedules(place: str, solver: Any) -> None:
     for level, size in enumerate(population if isinstance(population, tuple) else ()):
         if iterations[level] and size < 4:
             raise GavoError(f"{place}: solver.population: level {level} is searched and needs at least 4, not {size}")
+
+
+LEAST = {
+    "alignment.points": 1,
+    "alignment.estimation_points": 1,
+    "alignment.views": 1,
+    "alignment.islands": 1,
+    "alignment.depth_weight": 0,
+    "alignment.min_overlap": 0,
+    "alignment.outside_cost": 0,
+    "alignment.bounds": 1e-6,
+    "alignment.bounds_factor": 1e-6,
+    "alignment.scout_spread": 0,
+    "odometry.keyframe_overlap": 0,
+}
+"""Of settings that no search can do with less of, on the levels that it visits."""
+
+
+def _check_values(place: str, settings: Settings) -> None:
+    for name, least in LEAST.items():
+        room, _, field = name.partition(".")
+        value = getattr(getattr(settings, room), field)
+        entries = value if isinstance(value, tuple) else (value,)
+        if len(entries) == LEVELS:
+            entries = [entries[level] for level in settings.solver.levels]
+        for entry in entries:
+            if entry is not None and entry < least:
+                raise GavoError(f"{place}: {name}: must be at least {least}, not {entry}")

@@ -41,7 +41,7 @@ def test_values_of_every_kind():
     assert preset.alignment.outside_cost == 0.5 and preset.alignment.bounds == (0.1, 0.2)
     assert preset.odometry.on_lost == "stop"
     for name in ("default", "fast", "paper"):
-        for points in (900, [0, 900, 600, 300, 300]):
+        for points in (900, [1200 * (name == "paper"), 900, 600, 300, 300]):
             chosen = override(presets.preset("ga", name), {"alignment.points": points}).alignment.points
             assert chosen == (points if isinstance(points, int) else tuple(points))
         assert override(presets.preset("ga", name), {"alignment.points": "none"}).alignment.points is None
@@ -68,6 +68,12 @@ def test_values_of_every_kind():
         ("solver.iterations", [0, 0, 0, 0, 0], ["iterations"]),
         ("alignment.points", [900, 900], ["points", "5 entries"]),
         ("alignment.points", 0.5, ["points", "whole"]),
+        ("alignment.points", 0, ["points", "at least 1"]),
+        ("alignment.points", [0, 900, 900, 0, 900], ["points", "at least 1"]),
+        ("alignment.islands", [1, 1, 1, 1, 0], ["islands", "at least 1"]),
+        ("alignment.depth_weight", -1, ["depth_weight", "at least 0"]),
+        ("alignment.bounds", 0, ["bounds", "at least"]),
+        ("odometry.keyframe_overlap", -0.1, ["keyframe_overlap", "at least 0"]),
         ("odometry.on_lost", "panic", ["on_lost", "hold, predict, stop"]),
         ("odometry.prior", 1, ["prior", "true or false"]),
     ],
