@@ -32,7 +32,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.error import Objective
 from gavo_jax.objective.problem import Problem
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import TrackerState
 from gavo_jax.output.screen import number
 from gavo_jax.se3 import exp

@@ -31,9 +31,10 @@ from gavo_jax.datasets.files import open_pair
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.mapping.motions import size
-from gavo_jax.odometry.driver import Step, track
+from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory, inverse
 

@@ -37,9 +37,10 @@ from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.mapping.motions import exp, size
 from gavo_jax.mapping.pose_graph import COUNTED, optimise
 from gavo_jax.mapping.verification import Edge
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import ABSOLUTE_ERROR, DRIFT, FRAMES_PER_SECOND, ROTATION_DRIFT
 from gavo_jax.odometry.run import run_odometry, trajectory_of
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse

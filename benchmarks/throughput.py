@@ -27,7 +27,8 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.experiments.together import track_together
-from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
 
 METHODS = "ga,ga:fast,ga:wide,ga:paper,pso,gauss-newton,adam"

@@ -31,8 +31,9 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.experiments.together import track_together
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
 from gavo_jax.settings import Settings
 

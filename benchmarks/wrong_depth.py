@@ -26,9 +26,9 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.depth_change import MOST_LEFT
-from gavo_jax.odometry.driver import track
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory
 

@@ -47,10 +47,10 @@ from gavo_jax.evaluation import relative_pose_error as relative_pose_error
 from gavo_jax.objective.losses import LOSSES as LOSSES
 from gavo_jax.odometry.driver import Odometry as Odometry
 from gavo_jax.odometry.driver import Step as Step
-from gavo_jax.odometry.driver import track as track
 from gavo_jax.odometry.metrics import Metrics as Metrics
 from gavo_jax.odometry.run import OdometryRun as OdometryRun
 from gavo_jax.odometry.run import run_odometry as run_odometry
+from gavo_jax.odometry.stream import track as track
 from gavo_jax.output.trajectories import write_trajectory as write_trajectory
 from gavo_jax.presets import preset as preset
 from gavo_jax.presets import register as register

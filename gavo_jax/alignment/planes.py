@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from gavo_jax.camera import Camera, to_ray
+from gavo_jax.camera import Camera, inverse_depth, to_ray
 
 MOST, LARGE = 3, 0.25
 """Planes that are looked for, and the share of the readings that each has at least."""
@@ -86,7 +86,7 @@ def smaller(grey: Any, depth: Any, camera: Camera, factor: int) -> Small:
     fx, fy, cx, cy = map(float, camera.scaled(by))
     height, width = small.shape
     seen_by = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-    return Small(small, np.where(read > 0, float(camera.depth_scale) / np.maximum(read, 1e-9), 0.0), seen_by)
+    return Small(small, inverse_depth(read, camera).astype(np.float32), seen_by)
 
 
 def planes(frame: Small) -> list[Plane]:

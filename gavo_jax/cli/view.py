@@ -15,7 +15,8 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
 from gavo_jax.locks import hold
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.files import CONFIG, VIEW
 from gavo_jax.output.frames import RecordedRun, read_run
 from gavo_jax.output.screen import pair_progress, say, tell

@@ -48,7 +48,7 @@ class TimestampError(FrameError):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D image.
+    """One RGB-D image, its arrays of any numbers: bytes and 16 bits are those that `Odometry.warm_up` compiles for.
 
     Attributes:
         grey: intensities, 0 to 255.
@@ -56,6 +56,9 @@ class Frame:
         timestamp: of the colour image, seconds.
         color: RGB, where the sequence was asked for it.
         depth_timestamp: of the depth image, seconds, where it is known: the two are not exposed together.
+
+    Raises:
+        GavoError: A stamp is no number.
     """
 
     grey: UInt8[np.ndarray, "height width"]

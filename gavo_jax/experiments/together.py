@@ -24,8 +24,9 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recovery
-from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, decoded
+from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of
 from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.settings import Settings
 

@@ -1,12 +1,9 @@
 """The thin driver: frames in, chained poses out.
 
-It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses; a thread decodes
-the next frame meanwhile.
+It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
 """
 
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -18,7 +15,7 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera, require_camera
-from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_grey_levels, require_seconds, what_helps
+from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.image.numbers import as_array
@@ -366,48 +363,8 @@ def clock_of(before: Progress, frame: Frame) -> Clock:
     return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(before.last_index))
 
 
-def unwatched(frame: Frame | None, step: Step | None) -> None:
-    """Nobody looks."""
-
-
-def track(
-    sequence: Sequence,
-    settings: Settings | Solver | None = None,
-    *,
-    seed: int = 0,
-    odometry: Odometry | None = None,
-    watch: Callable[[Frame | None, Step | None], None] = unwatched,
-) -> Iterator[Step]:
-    """Stream a sequence: a step for every frame after the first, as it is done.
-
-    The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
-    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
-
-    Args:
-        sequence: The frames.
-        settings: As of `Odometry`.
-        seed: As of `Odometry`.
-        odometry: A driver to use instead of a new one; if it has seen frames already it goes on with the next one.
-        watch: Is shown every frame (None: it could not be read) with its step (None: it is the first).
-
-    Raises:
-        FrameError: The first frame cannot be read.
-    """
-    if odometry is None:
-        odometry = Odometry(sequence.camera, settings, seed=seed)
-
-    first = odometry.progress.last_index + 1
-    for index, frame in enumerate(decoded(sequence, first), start=first):
-        step = odometry.register(frame, float(sequence.timestamps[index]))
-        watch(frame if isinstance(frame, Frame) else None, step)
-        if step is not None:
-            yield step
-            if step.lost and odometry.settings.odometry.on_lost == "stop":
-                return
-
-
 def rectified(frame: Frame, camera: Camera) -> Frame:
-    """A frame without the camera's lens distortion.
+    """A frame of plain arrays, without the camera's lens distortion.
 
     Raises:
         FrameError: An image is not of the camera's size, or not one number per pixel.
@@ -424,23 +381,3 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
     grey, depth = camera.undistort(grey, depth)
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)
-
-
-def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
-    """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
-
-    def read(index: int) -> Frame | FrameError:
-        try:
-            return rectified(sequence[index], sequence.camera.rectified())
-        except FrameError as error:
-            return error
-
-    if first >= len(sequence):
-        return
-    with ThreadPoolExecutor(max_workers=1) as decoder:
-        coming = decoder.submit(read, first)
-        for index in range(first, len(sequence)):
-            frame = coming.result()
-            if index + 1 < len(sequence):
-                coming = decoder.submit(read, index + 1)
-            yield frame

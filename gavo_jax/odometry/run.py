@@ -15,9 +15,10 @@ from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
-from gavo_jax.odometry.driver import Odometry, Step, track, unwatched
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
+from gavo_jax.odometry.stream import track, unwatched
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver

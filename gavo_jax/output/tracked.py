@@ -7,10 +7,11 @@ from typing import NamedTuple
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import pair_progress, tell
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer

@@ -27,7 +27,8 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import Attempt, Search, blank_of
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.stream import track
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings

@@ -20,7 +20,8 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.sampling import Target
-from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton

@@ -21,8 +21,9 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.aligners import Attempt, Search
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings

@@ -20,8 +20,9 @@ from gavo_jax.experiments.plan import Plan, read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import override
 

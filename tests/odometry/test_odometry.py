@@ -38,9 +38,10 @@ from gavo_jax.odometry.aligners import (
     Search,
     blank_of,
 )
-from gavo_jax.odometry.driver import Odometry, Step, track
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
+from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings

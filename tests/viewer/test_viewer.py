@@ -19,7 +19,8 @@ from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Odometry, track
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.se3 import exp
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer import colors, live, pictures, search_space

@@ -1,0 +1,69 @@
+"""A sequence through the driver, frame after frame; a thread decodes the next one meanwhile."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.odometry.driver import Odometry, Step, rectified
+from gavo_jax.settings import Settings
+from gavo_jax.solvers.base import Solver
+
+
+def unwatched(frame: Frame | None, step: Step | None) -> None:
+    """Nobody looks."""
+
+
+def track(
+    sequence: Sequence,
+    settings: Settings | Solver | None = None,
+    *,
+    seed: int = 0,
+    odometry: Odometry | None = None,
+    watch: Callable[[Frame | None, Step | None], None] = unwatched,
+) -> Iterator[Step]:
+    """Stream a sequence: a step for every frame after the first, as it is done.
+
+    The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
+
+    Args:
+        sequence: The frames.
+        settings: As of `Odometry`.
+        seed: As of `Odometry`.
+        odometry: A driver to use instead of a new one; if it has seen frames already it goes on with the next one.
+        watch: Is shown every frame (None: it could not be read) with its step (None: it is the first).
+
+    Raises:
+        FrameError: The first frame cannot be read.
+    """
+    if odometry is None:
+        odometry = Odometry(sequence.camera, settings, seed=seed)
+
+    first = odometry.progress.last_index + 1
+    for index, frame in enumerate(decoded(sequence, first), start=first):
+        step = odometry.register(frame, float(sequence.timestamps[index]))
+        watch(frame if isinstance(frame, Frame) else None, step)
+        if step is not None:
+            yield step
+            if step.lost and odometry.settings.odometry.on_lost == "stop":
+                return
+
+
+def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
+    """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
+
+    def read(index: int) -> Frame | FrameError:
+        try:
+            return rectified(sequence[index], sequence.camera.rectified())
+        except FrameError as error:
+            return error
+
+    if first >= len(sequence):
+        return
+    with ThreadPoolExecutor(max_workers=1) as decoder:
+        coming = decoder.submit(read, first)
+        for index in range(first, len(sequence)):
+            frame = coming.result()
+            if index + 1 < len(sequence):
+                coming = decoder.submit(read, index + 1)
+            yield frame
