@@ -8,9 +8,10 @@ from typing import NamedTuple, Protocol, Self
 import cv2
 import numpy as np
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
+from gavo_jax.image.numbers import as_array
 
 
 class LiveImages(NamedTuple):
@@ -53,6 +54,10 @@ class LiveDevice(Protocol):
         ...
 
 
+LEAST_UNITS = 500.0
+"""Whole units per metre to which depth in metres is rounded; of a camera with fewer, metres say, it stays as it is."""
+
+
 def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
     """A frame of raw images, without the camera's lens distortion.
 
@@ -64,19 +69,22 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
     Raises:
         GavoError: an image is of another size or type than it may be; the message says what was expected.
     """
+    require_camera(camera)
     size = (camera.height, camera.width)
-    image, depth = np.asarray(images.color), np.asarray(images.depth)
+    image, depth = as_array(images.color), as_array(images.depth)
+    of_color, of_depth = np.asarray(images.color).dtype, np.asarray(images.depth).dtype
     if image.dtype != np.uint8 or image.shape not in (size, (*size, 3)):
         raise GavoError(
-            f"colour image is {image.dtype} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
+            f"colour image is {of_color} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
         )
-    if depth.shape != size or not (depth.dtype == np.uint16 or depth.dtype.kind == "f"):
+    if depth.shape != size or not (depth.dtype == np.uint16 or of_depth.kind == "f"):
         raise GavoError(
-            f"depth image is {depth.dtype} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
+            f"depth image is {of_depth} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
         )
     if depth.dtype != np.uint16:
-        raw = depth * camera.depth_scale
-        depth = np.where(np.isfinite(raw) & (raw > 0) & (raw < 65535), raw + 0.5, 0).astype(np.uint16)
+        raw = depth * np.float32(camera.depth_scale)
+        raw = np.where(np.isfinite(raw) & (raw > 0) & (raw < 65535), raw, np.float32(0))
+        depth = raw if camera.depth_scale < LEAST_UNITS else (raw + np.float32(0.5)).astype(np.uint16)
     image, depth = camera.undistort(np.ascontiguousarray(image), np.ascontiguousarray(depth))
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     rgb = None

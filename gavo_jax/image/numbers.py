@@ -9,10 +9,18 @@ Depth = UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
 """Of 16 bits, or float32 where it came as anything else: it may be in metres."""
 
 
+KNOWN = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+"""What OpenCV and the programs take."""
+
+
 def as_array(image: Any) -> np.ndarray:
-    """An image as a plain array of this machine's byte order; what is masked is 0, as where there is no reading."""
+    """An image as a plain array of one of the `KNOWN` types, other numbers as float32; what is masked is 0, as where
+    there is no reading. What holds no real numbers stays as it is.
+    """
     array = np.asarray(image.filled(0) if isinstance(image, np.ma.MaskedArray) else image)
-    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+    if array.dtype in KNOWN or array.dtype.kind not in "iuf":
+        return array
+    return array.astype(np.uint16 if array.dtype == ">u2" else np.float32)
 
 
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:

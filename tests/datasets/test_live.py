@@ -76,6 +76,7 @@ def test_a_devices_fault_is_one_line_after_the_last_frame(fault):
     [
         ({"color": np.zeros((10, 10, 3), np.uint8)}, r"colour image is uint8 of shape \(10, 10, 3\)"),
         ({"color": np.zeros((*SIZE, 3), np.float32)}, "colour image is float32"),
+        ({"color": np.zeros((*SIZE, 3), np.int64)}, "colour image is int64"),
         ({"color": np.zeros((*SIZE, 4), np.uint8)}, "colour image"),
         ({"depth": np.zeros((10, 10), np.uint16)}, r"depth image is uint16 of shape \(10, 10\)"),
         ({"depth": np.zeros(SIZE, np.int32)}, "depth image is int32"),
@@ -100,6 +101,10 @@ def test_depth_may_be_floats_in_metres():
     metres[0, :3] = (np.nan, np.inf, -1)
     depth = frame_of(images()._replace(depth=metres), CAMERA).depth
     assert depth[0, :4].tolist() == [0, 0, 0, 7500]
+    metric = frame_of(images()._replace(depth=metres), replace(CAMERA, depth_scale=1.0)).depth
+    assert metric[0, :4].tolist() == [0, 0, 0, 1.5], "it was rounded to whole metres"
+    hidden = np.ma.masked_array(np.full(SIZE, 5000, np.uint16), metres != 1.5)
+    assert frame_of(images()._replace(depth=hidden), CAMERA).depth[0, :4].tolist() == [0, 0, 0, 5000]
 
 
 def intrinsics(model: str, coefficients: tuple[float, ...]) -> SimpleNamespace:

@@ -38,7 +38,7 @@ from gavo_jax.odometry.aligners import (
     Search,
     blank_of,
 )
-from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.driver import Odometry, Step, rectified
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
 from gavo_jax.odometry.stream import track
@@ -161,6 +161,18 @@ def test_images_are_arrays_of_any_kind(form: Callable[[np.ndarray], Any]) -> Non
     kinds = [[(kind(frame.grey), kind(frame.depth)) for frame in frames] for kind in (form, np.asarray)]
     pairs = [align(first, second, small.CAMERA, small.NEWTON) for first, second, _ in kinds]
     np.testing.assert_array_equal(pairs[0].target_T_reference, pairs[1].target_T_reference)
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64, np.float16, np.float64, ">u2"])
+def test_numbers_of_any_kind_are_free_of_the_lens(kind: Any) -> None:
+    """OpenCV ended the program where a distorted camera's depth was of other whole numbers."""
+    camera = replace(small.CAMERA, distortion=(0.1, -0.2, 0.001, 0.0, 0.0))
+    frame = Rendered(1, camera=small.CAMERA)[0]
+    depth = np.minimum(frame.depth, 2000)  # which all of them hold exactly
+    other = replace(frame, grey=frame.grey.astype(kind), depth=depth.astype(kind))
+    plain, same = (rectified(each, camera) for each in (replace(frame, depth=depth), other))
+    np.testing.assert_array_equal(same.depth, plain.depth)
+    np.testing.assert_allclose(same.grey, plain.grey, atol=1.0)
 
 
 def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:
