@@ -34,6 +34,8 @@ from gavo_jax.errors import GavoError
 from gavo_jax.image.shutter import row_time
 from gavo_jax.trajectory import Trajectory
 
+DEPTH_SCALES = (100.0, 20_000.0)
+"""Units per metre in which 16 bits hold depth to a centimetre at least, and three metres at least."""
 DEFAULT_CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
 """The factory calibration commonly used for Kinect-like cameras, 640 x 480, no distortion."""
 DEFAULT_FRAMES, DEFAULT_RATE = 30, 30.0
@@ -209,6 +211,10 @@ class SyntheticSequence:
                 raise GavoError(f"synthetic: {key}: must be a number above 0, not {value!r}")
         self._noise, self._color, self._seed = noise, color, seed
         self._camera = (camera or DEFAULT_CAMERA).rectified()
+        low, high = DEPTH_SCALES
+        if not low <= self._camera.depth_scale <= high:
+            fault = f"camera.depth_scale: from {low:g} to {high:g}, as 16 bits hold a room's depth, not"
+            raise GavoError(f"synthetic: {fault} {self._camera.depth_scale!r}")
         if trajectory is None:
             self._truth = builtin_path(frames or DEFAULT_FRAMES, rate or DEFAULT_RATE, speed, seed)
             self._half_extent, self._height = _HALF_EXTENT, _HEIGHT

@@ -376,3 +376,10 @@ def test_rendering_keeps_up():
     for _ in sequence:
         pass
     assert time.process_time() - started < 2.5
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e5, float("nan")])
+def test_a_unit_in_which_16_bits_hold_no_room_is_refused(scale: float) -> None:
+    """Depth came in whole metres, or not at all."""
+    with pytest.raises(GavoError, match="depth_scale: from 100 to 20000"):
+        SyntheticSequence(2, camera=replace(DEFAULT_CAMERA, depth_scale=scale))
