@@ -71,16 +71,16 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
     """
     require_camera(camera)
     size = (camera.height, camera.width)
-    image, depth = as_array(images.color), as_array(images.depth)
-    of_color, of_depth = np.asarray(images.color).dtype, np.asarray(images.depth).dtype
+    image, depth = np.asarray(images.color), np.asarray(images.depth)
     if image.dtype != np.uint8 or image.shape not in (size, (*size, 3)):
         raise GavoError(
-            f"colour image is {of_color} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
+            f"colour image is {image.dtype} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
         )
-    if depth.shape != size or not (depth.dtype == np.uint16 or of_depth.kind == "f"):
+    if depth.shape != size or not (depth.dtype.newbyteorder("=") == np.uint16 or depth.dtype.kind == "f"):
         raise GavoError(
-            f"depth image is {of_depth} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
+            f"depth image is {depth.dtype} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
         )
+    image, depth = as_array(images.color), as_array(images.depth)
     if depth.dtype != np.uint16:
         raw = depth * np.float32(camera.depth_scale)
         raw = np.where(np.isfinite(raw) & (raw > 0) & (raw < 65535), raw, np.float32(0))

@@ -370,14 +370,11 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         FrameError: An image is not of the camera's size, or not one number per pixel.
     """
     size = (camera.height, camera.width)
-    grey, depth = as_array(frame.grey), as_array(frame.depth)
-    for name, image in (("grey", grey), ("depth", depth)):
-        if image.shape != size or image.dtype.kind not in "uif":
-            fault = f"{name} image is {image.dtype} of shape {image.shape}: numbers of shape {size} are needed"
+    for name, image in (("grey", frame.grey), ("depth", frame.depth)):
+        kind = np.asarray(image).dtype
+        if np.shape(image) != size or kind.kind not in "uif":
+            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
-    if not camera.is_distorted:
-        is_plain = grey is frame.grey and depth is frame.depth
-        return frame if is_plain else replace(frame, grey=grey, depth=depth)
-    grey, depth = camera.undistort(grey, depth)
+    grey, depth = camera.undistort(as_array(frame.grey), as_array(frame.depth))
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)
