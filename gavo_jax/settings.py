@@ -11,7 +11,8 @@ import jax
 
 from gavo_jax.image.levels import PointsPerLevel
 from gavo_jax.objective.losses import Loss, geman_mcclure
-from gavo_jax.solvers.base import Solver, static
+from gavo_jax.settings_check import require_settings
+from gavo_jax.solvers.base import Solver, static, within
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 
 
@@ -68,19 +69,19 @@ class AlignmentOptions:
     features: Literal["off", "sift", "orb", "both"] = static("off")
     robust_scale: bool = static(True)
     precondition: bool = static(True)
-    points: PointsPerLevel = static(4800)
-    estimation_points: int | None = static(1200)
-    views: tuple[int, ...] = static((2, 2, 1, 1, 1))
-    islands: tuple[int, ...] = static((1, 1, 1, 1, 1))
-    depth_weight: tuple[float, ...] = (0.05, 0.05, 0.05, 0.3, 0.3)
+    points: PointsPerLevel = static(4800, least=1)
+    estimation_points: int | None = static(1200, least=1)
+    views: tuple[int, ...] = static((2, 2, 1, 1, 1), least=1)
+    islands: tuple[int, ...] = static((1, 1, 1, 1, 1), least=1)
+    depth_weight: tuple[float, ...] = within((0.05, 0.05, 0.05, 0.3, 0.3), 0)
     doubt_depth: bool = static(False)
     last_step: bool = static(True)
-    min_overlap: float = 0.35
-    outside_cost: float | None = None
-    bounds: tuple[float, float] = (0.5, 0.8)
-    bounds_factor: float = 1.0
+    min_overlap: float = within(0.35, 0, 1)
+    outside_cost: float | None = within(None, 0)
+    bounds: tuple[float, float] = within((0.5, 0.8), 1e-6)
+    bounds_factor: float = within(1.0, 1e-6)
     scouts: int = static(0)
-    scout_spread: tuple[float, float] = (0.15, 0.4)
+    scout_spread: tuple[float, float] = within((0.15, 0.4), 0)
 
 
 @jax.tree_util.register_dataclass
@@ -107,7 +108,7 @@ class OdometryOptions:
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")
-    keyframe_overlap: float = 0.7
+    keyframe_overlap: float = within(0.7, 0)
     prior: bool = static(True)
     synchronise: bool = static(True)
     rolling_shutter: bool = static(True)
@@ -143,7 +144,8 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         parts: `alignment` and `odometry`, likewise: what callers of version 0.1 hand over one by one.
 
     Raises:
-        TypeError: `value` is neither, or the loss is no function.
+        TypeError: `value` is neither.
+        GavoError: A value in it is of the wrong kind or out of its range.
     """
     if value is None:
         settings = Settings()
@@ -160,6 +162,5 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
     if solver is not None:
         given["solver"] = solver
     settings = replace(settings, **given)
-    if not callable(settings.alignment.loss):
-        raise TypeError(f"loss: a function is needed, as in gavo_jax.LOSSES, not {settings.alignment.loss!r}")
+    require_settings(settings)
     return settings

@@ -7,7 +7,6 @@ A settings file is TOML: `method` and `preset` at the top say what it starts fro
 import dataclasses
 import difflib
 import json
-import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -17,10 +16,9 @@ import tomli_w
 
 from gavo_jax import presets
 from gavo_jax.errors import GavoError, parse_toml, read_text, read_toml, shown, write_bytes
-from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
-from gavo_jax.solvers.base import Schedule
+from gavo_jax.settings_check import MAX_REAL, alternatives, is_whole, kind_of, require_settings
 
 ROOMS = tuple(field.name for field in dataclasses.fields(Settings))
 """First part of a dotted name: the parts of the settings."""
@@ -29,8 +27,6 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 }
 """optax's optimisers that need nothing but a learning rate."""
-MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
-"""What the device's numbers hold."""
 MAX_FILE_BYTES = 2**20
 
 
@@ -200,8 +196,7 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
         else:
             new = _convert(where, type(part), field, current, value)
         settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
-    _check_schedules(place, settings.solver)
-    _check_values(place, settings)
+    require_settings(settings, place)
     return settings
 
 
@@ -236,45 +231,31 @@ def _with_level(where: str, current: Any, level: str, value: Any) -> tuple[Any, 
     if not isinstance(current, tuple) or not level.isdecimal() or int(level) >= len(current):
         raise GavoError(f"{where}: no such entry of {current!r}")
     entries = list(current)
-    entries[int(level)] = _number(where, value, isinstance(current[0], int))
+    entries[int(level)] = _plain(value, is_whole(current))
     return tuple(entries)
 
 
 def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> Any:
-    """The value as the field's kind, which its present value tells."""
+    """A value of TOML as the field holds it: words and lists become functions, None and tuples."""
+    kinds = alternatives(kind_of(owner, field))
     if value == "none":
-        if type(None) not in typing.get_args(typing.get_type_hints(owner)[field]):
+        if type(None) not in kinds:
             raise GavoError(f"{where}: cannot be left out")
         return None
     if callable(current):
         return _callable(where, field, value)
-    if isinstance(current, str):
-        allowed = typing.get_args(typing.get_type_hints(owner)[field])
-        if value not in allowed:
-            raise GavoError(f"{where}: must be one of {', '.join(allowed)}, not {shown(value)}")
-        return value
-    if isinstance(current, bool):
-        if not isinstance(value, bool):
-            raise GavoError(f"{where}: must be true or false, not {shown(value)}")
-        return value
-    if field == "points":
-        return _entries(where, value, LEVELS, True) if isinstance(value, list) else _number(where, value, True)
-    if isinstance(current, tuple):
-        whole = all(isinstance(entry, int) for entry in current)
-        if not isinstance(value, list):
-            if whole:
-                raise GavoError(f"{where}: must be a list of {len(current)} whole numbers, not {shown(value)}")
-            return (_number(where, value, whole),) * len(current)
-        return _entries(where, value, len(current), whole)
-    if isinstance(value, list) and (current is None or typing.get_type_hints(owner)[field] is Schedule):
-        return _entries(where, value, LEVELS, isinstance(current, int))
-    return _number(where, value, isinstance(current, int))
+    whole = is_whole(current) or int in kinds
+    if isinstance(value, list):
+        return tuple(_plain(entry, whole) for entry in value)
+    if isinstance(current, tuple) and not whole:
+        return (_plain(value, whole),) * len(current)
+    return _plain(value, whole)
 
 
-def _entries(where: str, value: list[Any], count: int, whole: bool) -> tuple[Any, ...]:
-    if len(value) != count:
-        raise GavoError(f"{where}: must have {count} entries, not {len(value)}")
-    return tuple(_number(where, entry, whole) for entry in value)
+def _plain(value: Any, whole: bool) -> Any:
+    """A number as the field holds it; what is none is for `require_settings` to refuse."""
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if is_number and not whole and abs(value) <= MAX_REAL else value
 
 
 def _callable(where: str, field: str, value: Any) -> Any:
@@ -283,52 +264,3 @@ def _callable(where: str, field: str, value: Any) -> Any:
         raise GavoError(f"{where}: must be a name, not {shown(value)}")
     refuse_unknown(where, [value], known, "name")
     return known[value]
-
-
-def _number(where: str, value: Any, whole: bool) -> int | float:
-    kinds = (int,) if whole else (int, float)
-    largest = MAX_WHOLE if whole else MAX_REAL
-    if isinstance(value, bool) or not isinstance(value, kinds) or not abs(value) <= largest:
-        raise GavoError(f"{where}: must be a {'whole ' if whole else ''}number, not {shown(value)}")
-    if whole and value < 0:
-        raise GavoError(f"{where}: must be at least 0, not {value}")
-    return int(value) if whole else float(value)
-
-
-def _check_schedules(place: str, solver: Any) -> None:
-    """Refuse sizes that no search can run with."""
-    iterations = solver.iterations
-    if not any(iterations):
-        raise GavoError(f"{place}: solver.iterations: every level has 0")
-    population = getattr(solver, "population", ())
-    for level, size in enumerate(population if isinstance(population, tuple) else ()):
-        if iterations[level] and size < 4:
-            raise GavoError(f"{place}: solver.population: level {level} is searched and needs at least 4, not {size}")
-
-
-LEAST = {
-    "alignment.points": 1,
-    "alignment.estimation_points": 1,
-    "alignment.views": 1,
-    "alignment.islands": 1,
-    "alignment.depth_weight": 0,
-    "alignment.min_overlap": 0,
-    "alignment.outside_cost": 0,
-    "alignment.bounds": 1e-6,
-    "alignment.bounds_factor": 1e-6,
-    "alignment.scout_spread": 0,
-    "odometry.keyframe_overlap": 0,
-}
-"""Of settings that no search can do with less of, on the levels that it visits."""
-
-
-def _check_values(place: str, settings: Settings) -> None:
-    for name, least in LEAST.items():
-        room, _, field = name.partition(".")
-        value = getattr(getattr(settings, room), field)
-        entries = value if isinstance(value, tuple) else (value,)
-        if len(entries) == LEVELS:
-            entries = [entries[level] for level in settings.solver.levels]
-        for entry in entries:
-            if entry is not None and entry < least:
-                raise GavoError(f"{place}: {name}: must be at least {least}, not {entry}")

@@ -1,7 +1,11 @@
 """What a caller may mean by settings."""
 
+import re
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import gavo_jax as gavo
@@ -38,3 +42,45 @@ def test_old_names_still_work_and_warn(old, new):
         assert getattr(gavo, old) is getattr(gavo, new)
     with pytest.raises(AttributeError):
         gavo.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "part, name, value, words",
+    [
+        ("solver", "population", -1, "solver.population: must be at least 4, not -1"),
+        ("solver", "population", (0, 16, 16, 16, 2), "solver.population, level 4: must be at least 4, not 2"),
+        ("solver", "iterations", 10, "solver.iterations: must be a list of 5 whole numbers, not 10"),
+        ("solver", "iterations", [0, 0, 0, 0, 3], "a tuple is needed"),
+        ("solver", "iterations", (0,) * 5, "solver.iterations: every level has 0"),
+        ("solver", "patience", 0, "solver.patience: must be at least 1, not 0"),
+        ("solver", "mutants", 1.5, "solver.mutants: must be at most 1, not 1.5"),
+        ("solver", "mutation_rate", None, "solver.mutation_rate: must be a number, not None"),
+        ("alignment", "points", 0, "alignment.points: must be at least 1, not 0"),
+        ("alignment", "points", "many", "alignment.points: must be a whole number, none or a list of 5 whole numbers"),
+        ("alignment", "depth", 1, "alignment.depth: must be true or false, not 1"),
+        ("alignment", "loss", "huber", "alignment.loss: must be a function, not 'huber'"),
+        ("alignment", "bounds", (0.1, 0.2, 0.3), "alignment.bounds: must be a list of 2 numbers"),
+        ("alignment", "min_overlap", float("nan"), "alignment.min_overlap: must be a number, not nan"),
+        ("odometry", "bodies", True, "odometry.bodies: must be one of off, mask, track, not True"),
+    ],
+)
+def test_values_by_hand_are_checked_where_they_are_used(part, name, value, words):
+    settings = gavo.Settings()
+    changed = replace(settings, **{part: replace(getattr(settings, part), **{name: value})})
+    with pytest.raises(gavo.GavoError, match=re.escape(words)):
+        as_settings(changed)
+
+
+@pytest.mark.parametrize("part", ["solver", "alignment", "odometry"])
+def test_a_part_of_another_kind_is_told(part):
+    with pytest.raises(gavo.GavoError, match=f"settings: {part}: must be of type"):
+        as_settings(replace(gavo.Settings(), **{part: gavo.Settings()}))
+
+
+def test_numbers_of_arrays_and_what_is_traced_are_numbers():
+    def same(rate):
+        solver = gavo.GeneticAlgorithm(population=16, mutation_rate=rate)
+        return as_settings(solver).solver is solver
+
+    assert all(same(rate) for rate in (np.float32(0.2), jnp.float32(0.2), 1))
+    assert jax.jit(lambda rate: rate * same(rate))(0.2) == jnp.float32(0.2)

@@ -8,4 +8,5 @@ from gavo_jax.solvers.base import PerLevel as PerLevel
 from gavo_jax.solvers.base import Schedule as Schedule
 from gavo_jax.solvers.base import Solver as Solver
 from gavo_jax.solvers.base import static as static
+from gavo_jax.solvers.base import within as within
 from gavo_jax.solvers.operators import initial_population as initial_population

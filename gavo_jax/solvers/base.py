@@ -1,7 +1,7 @@
 """The solver protocol and the one loop that runs every solver on a pyramid level."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,22 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.objective.problem import Problem
 
 
-def static(default: Any) -> Any:
-    """A dataclass field that shapes arrays or picks an operator: part of the program, not an input of it."""
-    return field(default=default, metadata={"static": True})
+def static(default: Any, least: float | None = None) -> Any:
+    """A dataclass field that shapes arrays or picks an operator: part of the program, not an input of it.
+
+    Args:
+        default: Its value.
+        least: What a number must at least be, on the levels that are searched.
+    """
+    return field(default=default, metadata={"static": True, "range": (least, None)})
 
 
-Schedule = Any
+def within(default: Any, least: float, most: float | None = None) -> Any:
+    """A dataclass field that is an input of the program, and the range of its numbers on levels that are searched."""
+    return field(default=default, metadata={"range": (least, most)})
+
+
+Schedule = Annotated[Any, "schedule"]
 """A tuple with an entry per pyramid level, level 0 first, or one number for all."""
 
 
@@ -53,7 +63,7 @@ class Solver(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
-    def iterations(self) -> Schedule:
+    def iterations(self) -> tuple[int, ...]:
         """Largest number of iterations; 0 skips a level."""
         ...
 
@@ -110,7 +120,7 @@ class PerLevel:
         level: The level that is being searched; an input of the compiled program.
     """
 
-    progress: Schedule = 1e-4
+    progress: Schedule = within(1e-4, 0, 1)
     level: Integer[Array, ""] | int = field(default=0, repr=False)
 
     def at_level(self, level: Integer[Array, ""] | int) -> Self:
@@ -129,6 +139,8 @@ class PerLevel:
     def levels(self) -> tuple[int, ...]:
         """Levels with at least one iteration, coarsest first."""
         iterations: tuple[int, ...] = self.iterations  # pyright: ignore[reportAttributeAccessIssue]
+        if not isinstance(iterations, tuple):  # for `require_settings` to refuse
+            return ()
         return tuple(k for k in reversed(range(len(iterations))) if iterations[k] > 0)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.problem import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, static, within
 
 
 class GaussNewtonState(NamedTuple):
@@ -39,9 +39,9 @@ class GaussNewton(PerLevel):
         damping: First damping, relative to the Hessian's diagonal.
     """
 
-    iterations: Schedule = static((0, 12, 12, 15, 20))
-    patience: int = static(3)
-    damping: float = 1e-4
+    iterations: tuple[int, ...] = static((0, 12, 12, 15, 20))
+    patience: int = static(3, least=1)
+    damping: float = within(1e-4, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GaussNewtonState:
         """The first guess."""

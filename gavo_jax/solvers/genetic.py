@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective.problem import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static, within
 from gavo_jax.solvers.operators import (
     crossover,
     draw,
@@ -60,17 +60,17 @@ class GeneticAlgorithm(PerLevel):
         pressure: Factor in the `fitness`, 8 in the paper.
     """
 
-    population: Schedule = static((0, 16, 20, 24, 64))
-    iterations: Schedule = static((0, 8, 8, 10, 12))
-    patience: int = static(1000)
-    mutants: float = 0.3
+    population: Schedule = static((0, 16, 20, 24, 64), least=4)
+    iterations: tuple[int, ...] = static((0, 8, 8, 10, 12))
+    patience: int = static(1000, least=1)
+    mutants: float = within(0.3, 0, 1)
     surrogate: bool = static(True)
-    spread: Schedule | None = (0.5, 0.5, 2.0, 3.0, 6.0)
-    mutation_step: Schedule | None = (0.5, 0.5, 2.0, 3.0, 6.0)
-    mutation_decay: float = 0.8
-    mutation_rate: float = 0.1
-    crossover_range: float = 0.25
-    pressure: float = 8.0
+    spread: Schedule | None = within((0.5, 0.5, 2.0, 3.0, 6.0), 0)
+    mutation_step: Schedule | None = within((0.5, 0.5, 2.0, 3.0, 6.0), 0)
+    mutation_decay: float = within(0.8, 0, 1)
+    mutation_rate: float = within(0.1, 0, 1)
+    crossover_range: float = within(0.25, 0)
+    pressure: float = within(8.0, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GeneticState:
         """The first population, which waits to be evaluated."""

@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective.problem import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, static, within
 
 
 class GradientState(NamedTuple):
@@ -39,10 +39,10 @@ class GradientDescent(PerLevel):
         optimizer: optax's constructor, called with a learning rate of 1 (static).
     """
 
-    iterations: Schedule = static((0, 30, 40, 50, 60))
-    patience: int = static(15)
-    learning_rate: Schedule = (0.5, 0.5, 1.0, 2.0, 4.0)
-    decay: float = 0.93
+    iterations: tuple[int, ...] = static((0, 30, 40, 50, 60))
+    patience: int = static(15, least=1)
+    learning_rate: Schedule = within((0.5, 0.5, 1.0, 2.0, 4.0), 0)
+    decay: float = within(0.93, 0)
     optimizer: Callable[[float], optax.GradientTransformation] = static(optax.adam)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GradientState:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.objective.problem import Problem
-from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static
+from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, largest, static, within
 from gavo_jax.solvers.operators import initial_population
 
 
@@ -40,14 +40,14 @@ class ParticleSwarm(PerLevel):
         velocity_clamp: Largest velocity as a share of the bounds' width, or of 6 x spread where a spread is given.
     """
 
-    population: Schedule = static((0, 20, 24, 32, 64))
-    iterations: Schedule = static((0, 12, 14, 16, 24))
-    patience: int = static(1000)
-    spread: Schedule | None = (1.0, 1.0, 1.5, 2.0, 6.0)
-    constriction: float = 0.7298
-    cognitive: float = 2.05
-    social: float = 2.05
-    velocity_clamp: float = 0.2
+    population: Schedule = static((0, 20, 24, 32, 64), least=4)
+    iterations: tuple[int, ...] = static((0, 12, 14, 16, 24))
+    patience: int = static(1000, least=1)
+    spread: Schedule | None = within((1.0, 1.0, 1.5, 2.0, 6.0), 0)
+    constriction: float = within(0.7298, 0)
+    cognitive: float = within(2.05, 0)
+    social: float = within(2.05, 0)
+    velocity_clamp: float = within(0.2, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> SwarmState:
         """Particles about the guesses, at rest."""

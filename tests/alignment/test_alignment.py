@@ -408,7 +408,7 @@ def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> 
         align(frame.grey, frame.depth, CAMERA, NEWTON)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="frame_of"):
         align((np.repeat(frame.grey[..., None], 3, axis=2), frame.depth), frame, CAMERA, NEWTON)
-    with pytest.raises(TypeError, match="LOSSES"):
+    with pytest.raises(GavoError, match="alignment.loss: must be a function, not 'huber'"):
         align(frame, frame, CAMERA, Settings(NEWTON.solver, AlignmentOptions(loss="huber")))  # pyright: ignore
 
 
