@@ -34,8 +34,8 @@ NO_POSE = "numbers that are not finite, or a zero quaternion"
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
 
-SEGMENT_COMMENT = "# segment "
-"""Start of the comment line before the first pose of a segment, except the first."""
+SEGMENT_COMMENT = re.compile(r"# segment (\d+)\b")
+"""Start of the comment line before a pose of another segment than the last one's, with that segment's number from 1."""
 
 
 _APART = r"[^\w\n]+"
@@ -45,15 +45,24 @@ W_FIRST = re.compile(
 """A comment that ends with the names of the last columns, as EuRoC's does: w before x."""
 
 
-def segment_comment(segment: int, before: float, after: float) -> str:
-    """The comment line before a segment's first pose.
+def segment_comment(segment: int, before: float | None, after: float) -> str:
+    """The comment line before the first of some poses of a segment.
 
     Args:
         segment: its number, from 0.
-        before: stamp of the last pose of the segment before, seconds.
-        after: stamp of its first pose.
+        before: stamp of the last pose, which is of another segment, seconds; None where there is none.
+        after: stamp of the first of these poses.
     """
-    return f"{SEGMENT_COMMENT}{segment + 1}: the motion from {before:.6f} to {after:.6f} is unknown"
+    unknown = "" if before is None else f": the motion from {before:.6f} to {after:.6f} is unknown"
+    return f"# segment {segment + 1}{unknown}"
+
+
+def _segments_of(text: str, lines: list[int]) -> Int[np.ndarray, " n"]:
+    """The segments of the poses in some lines of a trajectory file, the first line being 1."""
+    said = [(n, SEGMENT_COMMENT.match(line)) for n, line in enumerate(text.splitlines(), 1)]
+    begun = [(n, int(match[1]) - 1) for n, match in said if match is not None and int(match[1]) > 0]
+    numbers = np.array([0] + [segment for _, segment in begun])
+    return numbers[np.searchsorted([n for n, _ in begun], lines)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +106,7 @@ class Trajectory:
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
         Where a comment names the columns with qw before qx, as EuRoC's does, quaternions are read so.
-        A comment of `segment_comment` starts a new segment. Rows come back in the order of their stamps; of rows with
+        After a comment of `segment_comment` rows are of that segment. Rows come back in the order of their stamps; of rows with
         equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of a zero
         quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
 
@@ -116,8 +125,7 @@ class Trajectory:
             raise GavoError(f"{all_places[0][0]}: no pose in it, nor in any other row: {NO_POSE}")
         if lost := len(parsed) - len(rows):
             warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
-        breaks = [n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SEGMENT_COMMENT)]
-        segments = np.searchsorted(breaks, [int(place.rpartition(":")[2]) for place, _ in places])
+        segments = _segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
         if W_FIRST.search(text):
             table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
@@ -136,10 +144,12 @@ class Trajectory:
             GavoError: the file cannot be written; nothing is left under its name then.
         """
         lines = [TRAJECTORY_HEADER]
+        before, stamp = 0, None
         for i, row in enumerate(map(format_tum_row, self.timestamps, self.world_T_camera)):
-            if i and self.segments[i] != self.segments[i - 1]:
-                lines.append(segment_comment(self.segments[i], self.timestamps[i - 1], self.timestamps[i]))
+            if self.segments[i] != before:
+                lines.append(segment_comment(self.segments[i], stamp, self.timestamps[i]))
             lines.append(row)
+            before, stamp = self.segments[i], self.timestamps[i]
         write_lines(path, lines)
 
     def write_kitti(self, path: str | Path) -> None:

@@ -141,6 +141,14 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, none):
     assert trajectory.timestamps[-1] == 3 and len(trajectory) == 2 and trajectory.segments.tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("segments", [[0, 0, 1, 1, 0, 0], [1, 1, 2, 2, 2, 4], [0, 0, 0, 0, 0, 0]])
+def test_segments_come_back_by_their_numbers(tmp_path, segments):
+    """A stretch that was found in the map goes on with the first segment: read back, it was a third one."""
+    one = random_trajectory(6, 0)
+    Trajectory(one.timestamps, one.world_T_camera, np.array(segments)).write_tum(tmp_path / "t.txt")
+    assert Trajectory.read_tum(tmp_path / "t.txt").segments.tolist() == segments
+
+
 def test_missing_files_and_folders_are_refused(tmp_path):
     for path in (tmp_path / "none.txt", tmp_path):
         with pytest.raises(GavoError, match=str(path)):

@@ -108,7 +108,9 @@ class Progress(NamedTuple):
     """Frames since the reference was renewed."""
     history: History = History()
     segment: int = 0
-    """Of the reference."""
+    """Of the reference;"""
+    last_segment: int = 0
+    """and the largest number that one was given."""
     adrift: int = 0
     """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
     doubted: bool = False
@@ -298,9 +300,8 @@ class Odometry:
         """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new
         segment.
         """
-        return before._replace(
-            segment=before.segment + (before.last_index > 0),
-            adrift=int(before.last_index > 0),
+        here = before if before.last_index == 0 else _in_new_segment(before)
+        return here._replace(
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
             world_T_reference=before.world_T_camera,
@@ -334,7 +335,7 @@ class Odometry:
         elif before.unknown:
             after = after._replace(unknown=0)
             if before.unknown >= MAX_HELD:  # too many to go on in the same world
-                after = after._replace(segment=before.segment + 1, adrift=1)
+                after = _in_new_segment(after)
         overdue = after.held >= MAX_HELD and not POOR.isdisjoint(result.statuses) and (attempt.fit or not doubted)
         if overdue or (attempt.fit and finding.use is Use.ALL):
             after = after._replace(
@@ -355,6 +356,12 @@ class Odometry:
             motion = self.aligner.predict(before.tracker, timestamp - before.reference_timestamp)
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
+
+
+def _in_new_segment(progress: Progress) -> Progress:
+    """Where the driver stands in a segment that nothing ties to those before; its number was given to no other one."""
+    number = progress.last_segment + 1
+    return progress._replace(segment=number, last_segment=number, adrift=1)
 
 
 def clock_of(before: Progress, frame: Frame) -> Clock:

@@ -28,7 +28,7 @@ class Metrics(TypedDict):
     segments: int
     """Stretches of the trajectory between which the motion is unknown; every error is computed within them."""
     unknown_motions: int
-    """Places where one ends and the next begins."""
+    """Places where one ends and another begins, or goes on."""
     rpe_translation_rmse_m_per_s: float | None
     """Drift, as by TUM's tool: relative pose error over 1 s."""
     rpe_rotation_rmse_deg_per_s: float | None
@@ -107,8 +107,8 @@ def compute_metrics(
         "lost_pairs": sum(step.lost for step in steps),
         "guessed_pairs": sum(step.origin == "guessed" and not step.lost for step in steps),
         "statuses": dict(Counter(str(step.alignment.status) for step in steps)),
-        "segments": 1 + (breaks := steps[-1].segment if steps else 0),
-        "unknown_motions": breaks,
+        "segments": len(np.unique(trajectory.segments)),
+        "unknown_motions": int(np.count_nonzero(np.diff(trajectory.segments))),
         "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
         "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
         "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),

@@ -63,6 +63,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "reference_timestamp": progress.reference_timestamp,
         "held": progress.held,
         "segment": progress.segment,
+        "last_segment": progress.last_segment,
         "adrift": progress.adrift,
         "doubted": progress.doubted,
         "unknown": progress.unknown,

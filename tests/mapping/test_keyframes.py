@@ -19,6 +19,7 @@ from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
+from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import guessed, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
 from gavo_jax.settings import Settings
@@ -163,6 +164,26 @@ class Knows:
             return None
         pose = exp(np.array([0.5, 0, 0, 0, 0, 0]))
         return Found(no_alignment(AlignmentStatus.OK), 0.1, pose, self.segment)
+
+
+def test_a_segment_s_number_is_given_once():
+    """Lost, found in the first segment, and lost again: the new stretch had the number of the second."""
+    relocaliser = Knows(0)
+    driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=relocaliser)
+    steps = []
+    for i in range(24):
+        frame = replace(WALK[i % len(WALK)], timestamp=i / RATE)
+        if 4 <= i < 8 or 12 <= i < 16:
+            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        relocaliser.segment = 0 if i == 10 else None
+        step = driver.register(frame, frame.timestamp)
+        if step is not None:
+            steps.append(step)
+    trajectory = trajectory_of(0.0, steps)
+    assert list(dict.fromkeys(trajectory.segments.tolist())) == [0, 1, 2]
+    assert trajectory.segments[10] == 0 and trajectory.segments[-1] == 2
+    metrics = compute_metrics(trajectory, None, steps, 1.0, 0.0)
+    assert metrics["segments"] == 3 and metrics["unknown_motions"] == 3
 
 
 @pytest.mark.parametrize("known", [True, False])
