@@ -143,10 +143,10 @@ def check_frame(
         return _refused(status), history
     thumbnail = grey[::ROW_STEP, :: ROW_STEP**2].astype(int)
     before = np.array(history.thumbnail)
-    history = history._replace(thumbnail=tuple(thumbnail.ravel().tolist()))
     near = before.size == thumbnail.size and np.abs(thumbnail.ravel() - before).max() <= MAX_DUPLICATE_DIFFERENCE
-    if checksum == repeated or near:
+    if checksum == repeated or near:  # the next one is compared with what this one repeats: small changes add up
         return _refused(AlignmentStatus.FROZEN), history
+    history = history._replace(thumbnail=tuple(thumbnail.ravel().tolist()))
     if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
         return _doubt(_refused(AlignmentStatus.BLANK), history)
     part_frozen = before.size == thumbnail.size and _is_part_frozen(grey, thumbnail, before.reshape(thumbnail.shape))
@@ -252,13 +252,11 @@ def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray)
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
-    """Whether depth is the last frame's once more, though it claims to be of another moment."""
-    checksum, stamp = (
-        zlib.crc32(np.asarray(frame.depth)[:: ROW_STEP**2].tobytes()),
-        frame.depth_timestamp,
-    )
+    """Whether depth is the last frame's once more, though it claims to be of another moment; none at all is not."""
+    rows, stamp = np.asarray(frame.depth)[:: ROW_STEP**2], frame.depth_timestamp
+    checksum = zlib.crc32(rows.tobytes())
     repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
-    return repeated, history._replace(depth_checksum=checksum, depth_timestamp=stamp)
+    return repeated and bool(np.any(rows > 0)), history._replace(depth_checksum=checksum, depth_timestamp=stamp)
 
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:

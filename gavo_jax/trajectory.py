@@ -106,9 +106,9 @@ class Trajectory:
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
         Where a comment names the columns with qw before qx, as EuRoC's does, quaternions are read so.
-        After a comment of `segment_comment` rows are of that segment. Rows come back in the order of their stamps; of rows with
-        equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of a zero
-        quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
+        After a comment of `segment_comment` rows are of that segment. Rows come back in the order of their stamps; of
+        rows with equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of
+        a zero quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
 
         Raises:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed or absurdly large; no

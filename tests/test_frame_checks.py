@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -211,3 +212,25 @@ def test_no_part_of_a_real_image_stands_still(data_dir: Path, clip: str) -> None
         finding, history = check_frame(frame, frame.timestamp, sequence.camera, history)
         findings.append(finding.status)
     assert Status.MOVING_BODY not in findings
+
+
+def test_a_slow_camera_without_noise_is_not_frozen_for_ever() -> None:
+    """Each frame was compared with the one before it, refused or not: the camera could move on unseen by a hair."""
+    y, x = np.mgrid[:240, :400]
+    texture = (128 + 60 * np.sin(x / 9) * np.cos(y / 7)).astype(np.float32)
+    depth = np.full((240, 320), 10000, np.uint16)
+    columns = np.arange(320, dtype=np.float32)
+    history, findings = History(), []
+    for index in range(200):
+        shifted = cv2.remap(texture, *np.meshgrid(columns + 0.04 * index, np.float32(y[:, 0])), cv2.INTER_LINEAR)
+        frame = Frame(np.rint(shifted).astype(np.uint8), depth + (index % 7), index / 30)
+        finding, history = check_frame(frame, frame.timestamp, CAMERA, history)
+        findings.append(finding.status)
+    usable = [place for place, status in enumerate(findings) if status is not Status.FROZEN]
+    assert len(usable) > 30 and max(np.diff(usable)) < 20
+
+
+def test_depth_that_is_missing_throughout_is_missing_not_frozen(frames: list[Frame]) -> None:
+    empty = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames[:3]]
+    findings, _ = look(History(), *empty)
+    assert [finding.status for finding in findings] == [Status.NO_DEPTH] * 3

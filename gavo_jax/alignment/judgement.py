@@ -217,6 +217,13 @@ UNDETERMINED = 0.5
 """Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
 UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
 """Covariance of a motion that images do not tell."""
+
+
+def is_unknown(result: Alignment) -> bool:
+    """Whether a result, on the host, has the covariance of a motion that images do not tell."""
+    return bool(np.all(np.diagonal(result.covariance) >= UNDETERMINED**2))
+
+
 LARGEST_STEP = 0.01
 """Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
 images leave open; it is not taken."""

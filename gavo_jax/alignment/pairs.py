@@ -117,16 +117,10 @@ def starts_of(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
-MOST_DELAY = 0.1
-"""Seconds: depth that is further from its colour image has a stamp that tells nothing."""
-
-
 def depth_delays(side: Any, count: int) -> list[float]:
     """Seconds from each frame's colour image to its depth image; 0 where that is not known."""
-    frames = side if isinstance(side, list) else [None] * count
-    stamps = [(f.depth_timestamp, f.timestamp) if isinstance(f, Frame) else (None, 0.0) for f in frames]
-    delays = [0.0 if depth is None else depth - grey for depth, grey in stamps]
-    return [delay if abs(delay) <= MOST_DELAY else 0.0 for delay in delays]
+    frames = list(side) if len(side) == count else [None] * count  # else both kinds of images, each of all frames
+    return [frame.depth_delay if isinstance(frame, Frame) else 0.0 for frame in frames]
 
 
 def moving_rows(

@@ -69,7 +69,7 @@ class Body:
 def in_world(
     seen: Seen,
     world_T_camera: Float64[np.ndarray, "4 4"],
-    world_T_reference: Float64[np.ndarray, "4 4"],
+    world_T_reference: Float64[np.ndarray, "4 4"] | None,
     size: tuple[int, int],
 ) -> Body:
     """A body where the camera's poses say that it is.
@@ -77,12 +77,12 @@ def in_world(
     Args:
         seen: By the camera.
         world_T_camera: Of the frame.
-        world_T_reference: Of the frame that its motion is from.
+        world_T_reference: Of the frame that its motion is from; None where the camera's own motion since is unknown.
         size: Height and width of the image.
     """
     centroid = world_T_camera[:3, :3] @ seen.centroid + world_T_camera[:3, 3]
     displacement = rotation = np.full(3, np.nan)
-    if seen.alignment is not None:
+    if seen.alignment is not None and world_T_reference is not None:
         motion = world_T_camera @ np.asarray(seen.alignment.target_T_reference) @ inverse(world_T_reference)
         before = inverse(motion)
         displacement = centroid - (before[:3, :3] @ centroid + before[:3, 3])

@@ -1,7 +1,7 @@
 """What every source of frames offers: `Frame` and the `Sequence` protocol."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, overload
 
 import numpy as np
@@ -46,6 +46,12 @@ class TimestampError(FrameError):
     """A frame whose time is in doubt."""
 
 
+MOST_DELAY = 0.1
+"""Seconds: depth that is further from its colour image has a stamp that tells nothing."""
+SAME_STAMP = 1e-6
+"""Seconds by which a stamp changes as it is written."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One RGB-D image, its arrays of any numbers: bytes and 16 bits are those that `Odometry.warm_up` compiles for.
@@ -74,8 +80,16 @@ class Frame:
 
     @property
     def depth_delay(self) -> float:
-        """From the colour image to the depth image, seconds; 0 where that is not known."""
-        return 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
+        """From the colour image to the depth image, seconds; 0 where that is not known, or beyond `MOST_DELAY`."""
+        delay = 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
+        return delay if abs(delay) <= MOST_DELAY else 0.0
+
+    def at(self, timestamp: float) -> "Frame":
+        """The same images with another stamp, depth as long after it as before."""
+        if abs(timestamp - self.timestamp) < SAME_STAMP:
+            return self
+        depth = None if self.depth_timestamp is None else timestamp + self.depth_delay
+        return replace(self, timestamp=timestamp, depth_timestamp=depth)
 
 
 class Sequence(Protocol):

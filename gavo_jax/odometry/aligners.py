@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment.judgement import UNDETERMINED
+from gavo_jax.alignment.judgement import is_unknown
 from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
@@ -24,6 +24,7 @@ from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.settings import OdometryOptions, Settings
@@ -54,7 +55,7 @@ class Attempt(NamedTuple):
     @property
     def is_found(self) -> bool:
         """Whether the motion can be used and the images tell of it: a guess fits any depth and any time."""
-        return self.usable and not np.all(np.diagonal(self.result.covariance) >= UNDETERMINED**2)
+        return self.usable and not is_unknown(self.result)
 
 
 class Aligner(Protocol):
@@ -165,11 +166,17 @@ class Search:
         if not is_open:
             return attempt
         attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
-        return attempt if is_known else attempt._replace(state=after._replace(motion=jnp.zeros(6)))
+        return attempt if is_known else attempt._replace(state=at_rest(after))
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """By the twist of the last motion."""
         return exp(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
+
+
+def at_rest(state: TrackerState) -> TrackerState:
+    """A state in which nothing is known of the camera's motion, as after a first frame."""
+    still = jnp.zeros(6)
+    return state._replace(motion=still, guess=still, passing=still, seconds=jnp.float32(1.0))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:
@@ -329,9 +336,11 @@ def wide_search(search: Search) -> Search:
     """The wide search on the points that a search's references hold, against the previous frame alone."""
     settings, wide = search.settings, presets.preset("ga", "wide")
     genetic: Any = wide.solver
-    iterations = tuple(n if k in settings.solver.levels else 0 for k, n in enumerate(genetic.iterations))
+    places = [max(level, genetic.levels[-1]) for level in range(LEVELS)]  # of a level that it leaves out the next one's
+    iterations, population = ([schedule[k] for k in places] for schedule in (genetic.iterations, genetic.population))
+    iterations = tuple(count if k in settings.solver.levels else 0 for k, count in enumerate(iterations))
     wide = Settings(
-        replace(genetic, iterations=iterations),
+        replace(genetic, iterations=iterations, population=tuple(population)),
         replace(wide.alignment, points=settings.alignment.points),
         replace(settings.odometry, reference="previous"),
     )

@@ -88,7 +88,9 @@ MAX_HELD = 3
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
 POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
-"""Of frames that have a motion, but become the reference only where the old one is out of reach."""
+"""Of frames that have a motion, but become the reference only where the old one is out of reach,"""
+DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
+"""and of those that never do."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 
@@ -189,7 +191,8 @@ class Odometry:
 
         Args:
             frame: The next frame; for one that could not be read the error, or None: it is lost, and the run goes on.
-            timestamp: Its colour stamp, seconds; later than the last one's, or the frame is lost.
+            timestamp: Its colour stamp, seconds; later than the last one's, or the frame is lost. The frame's own
+                stamp gives way to it.
 
         Returns:
             The step, or None for the first frame, which is the world's origin.
@@ -208,6 +211,8 @@ class Odometry:
         require_seconds("timestamp", timestamp)
         if self.progress.last_index < 0 and not isinstance(frame, Frame):
             raise frame or FrameError("the first frame could not be read")
+        if isinstance(frame, Frame):
+            frame = frame.at(timestamp)
         start = time.perf_counter()
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
@@ -274,7 +279,8 @@ class Odometry:
         after, result, lost = self._advance(before, frame, finding, attempt)
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
-        bodies = tuple(in_world(seen, after.world_T_camera, before.world_T_reference, size) for seen in attempt.bodies)
+        since = None if lost else before.world_T_reference
+        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in attempt.bodies)
         revises = attempt.revises
         if not lost:
             shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
@@ -336,7 +342,8 @@ class Odometry:
             after = after._replace(unknown=0)
             if before.unknown >= MAX_HELD:  # too many to go on in the same world
                 after = _in_new_segment(after)
-        overdue = after.held >= MAX_HELD and not POOR.isdisjoint(result.statuses) and (attempt.fit or not doubted)
+        may_be = not POOR.isdisjoint(result.statuses) and DEPTHLESS.isdisjoint(result.statuses)
+        overdue = after.held >= MAX_HELD and may_be and (attempt.fit or not doubted)
         if overdue or (attempt.fit and finding.use is Use.ALL):
             after = after._replace(
                 tracker=attempt.state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0

@@ -9,7 +9,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment.judgement import UNKNOWN
+from gavo_jax.alignment.judgement import UNKNOWN, is_unknown
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.mapping.motions import between, log
 from gavo_jax.odometry.driver import Step
@@ -29,6 +29,8 @@ def revised(steps: Iterable[Step]) -> list[Step]:
     """
     whole = list(steps)
     for place, status in taken_back(whole).items():
+        if is_unknown(whole[place].alignment):  # and says why
+            continue
         result = with_finding(whole[place].alignment, status)
         whole[place] = replace(whole[place], alignment=result._replace(covariance=UNKNOWN))
     return whole

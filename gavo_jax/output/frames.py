@@ -56,16 +56,23 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
                 place = by_stamp[row["timestamp"]]
                 stamp = float(poses.timestamps[place])
             now = found_at.get(row["timestamp"], now)
+            reference = float(row["reference_timestamp"])
             before = found_at.get(row["reference_timestamp"], now)
+            if row["reference_timestamp"] in found_at:  # with all its digits, by which steps are told to follow others
+                reference = float(found.timestamps[before])
             target_T_reference = inverse(found.world_T_camera[now]) @ found.world_T_camera[before]
-            steps.append(_read_step(row, stamp, poses.world_T_camera[place], target_T_reference))
+            steps.append(_read_step(row, reference, stamp, poses.world_T_camera[place], target_T_reference))
         except (KeyError, TypeError, ValueError):
             raise GavoError(f"{folder / FRAMES}:{number}: not a row of a run") from None
     return steps
 
 
 def _read_step(
-    row: Mapping[str, str], timestamp: float, world_T_camera: np.ndarray, target_T_reference: np.ndarray
+    row: Mapping[str, str],
+    reference_timestamp: float,
+    timestamp: float,
+    world_T_camera: np.ndarray,
+    target_T_reference: np.ndarray,
 ) -> Step:
     deviations = np.array([float(row[name]) for name in DEVIATIONS])
     statuses = (row.get("statuses") or row["status"]).upper().split()
@@ -78,7 +85,7 @@ def _read_step(
     )
     return Step(
         int(row["index"]),
-        float(row["reference_timestamp"]),
+        reference_timestamp,
         timestamp,
         alignment,
         world_T_camera,

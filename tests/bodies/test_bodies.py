@@ -165,6 +165,8 @@ def test_a_motion_in_the_camera_is_one_in_the_world() -> None:
     assert body.centroid == pytest.approx([1, 2, 5])
     assert body.mask.shape == (120, 160) and body.mask[40, 40] and not body.mask[100, 100]
     still = in_world(seen._replace(alignment=None), turned, turned, (120, 160))
+    of_lost = in_world(seen, turned, None, (120, 160))
+    assert np.isnan([of_lost.displacement, of_lost.rotation]).all(), "the camera's own part is not known"
     pose, status = np.eye(4), no_alignment(AlignmentStatus.OK)
     rows = body_rows(Step(1, 0.0, 0.1, status, pose, 1.0, False, bodies=(body, still)))
     assert all(len(row) == len(BODY_COLUMNS) for row in rows)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +13,15 @@ from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
+from gavo_jax.output.frames import read_run
+from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 
 def ran(*statuses: AlignmentStatus) -> list[Step]:
     """A run with a pair of each status."""
-    exact = np.eye(6, dtype=np.float32)
+    exact = 1e-6 * np.eye(6, dtype=np.float32)
     return [
         Step(i, i - 1.0, float(i), no_alignment(status)._replace(covariance=exact), np.eye(4), 1.0, False)
         for i, status in enumerate(statuses, start=1)
@@ -83,7 +86,7 @@ def test_a_correction_of_the_path_says_nothing_of_images() -> None:
 def turning(moments: Sequence[float]) -> list[Step]:
     """A run of pairs that are ok, over images of a turn by 2 degrees per moment."""
     poses = [exp(np.array([0.0, 0.0, 0.0, 0.0, moment * 0.035, 0.0])) for moment in moments]
-    ok = no_alignment(AlignmentStatus.OK)
+    ok = no_alignment(AlignmentStatus.OK)._replace(covariance=np.eye(6, dtype=np.float32) * 1e-6)
     return [
         Step(i, (i - 1) / 15, i / 15, ok._replace(target_T_reference=inverse(new) @ old), new, 1.0, False)
         for i, (old, new) in enumerate(pairwise(poses), start=1)
@@ -120,3 +123,30 @@ def test_images_that_break_a_smooth_path(moments: list[float], wrong: set[int]) 
     steps = turning(moments)
     flagged = {step.index for step in revised(steps) if step.alignment.status is AlignmentStatus.IMPLAUSIBLE_MOTION}
     assert flagged == wrong
+
+
+def test_a_step_that_is_revised_for_another_reason_says_the_same_of_others() -> None:
+    """Revised a second time, the first pair was of another moment, too."""
+    ok, body, implausible = AlignmentStatus.OK, AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION
+    steps = ran(ok, ok, implausible)
+    steps[1], steps[2] = replace(steps[1], revises=1), replace(steps[2], revises=1)
+    for after in (revised(steps), revised(revised(steps))):
+        assert [step.alignment.statuses for step in after] == [(body,), (implausible,), (implausible,)]
+
+
+@pytest.mark.parametrize("rate", [15, 30, 29.97])
+def test_a_run_that_is_read_back_is_revised_as_it_was(rate: float, tmp_path: Path) -> None:
+    """The reference's stamp came back in microseconds, the frame's in full: no pair seemed to follow another."""
+    steps = [
+        replace(step, reference_timestamp=(step.index - 1) / rate, timestamp=step.index / rate)
+        for step in turning(range(13))
+    ]
+    steps[-1] = replace(steps[-1], revises=1)
+    with RunFolder(tmp_path / "run") as folder:
+        folder.start({}, 0.0)
+        for step in steps:
+            folder.add(step)
+    (tmp_path / "run" / "config.json").write_text("{}")
+    read = read_run(tmp_path / "run").steps
+    wrong = [step.index for step in read if step.alignment.status is not AlignmentStatus.OK]
+    assert wrong == [step.index for step in revised(steps) if step.alignment.status is not AlignmentStatus.OK] == [11]
