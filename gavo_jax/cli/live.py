@@ -13,7 +13,7 @@ from gavo_jax.cli.map_file import check_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_seed, choose_settings
+from gavo_jax.cli.selection import check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
@@ -34,6 +34,8 @@ from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
+NOT_LIVE = "not with the live source '{}': record it and run over that"
+
 
 def run_live(options: Run) -> int:
     """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
@@ -42,7 +44,9 @@ def run_live(options: Run) -> int:
     trajectory_formats = formats(options.trajectory_format)
     shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
-    options = replace(options, method=method, preset=preset)
+    options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
+    if settings.odometry.loops:
+        raise GavoError(f"--loops: {NOT_LIVE.format(options.sequence)}")
     device = open_device(options.sequence)
     camera = device.camera if options.camera == "auto" else load_camera(options.camera)
     name = f"{device.name}-{method}-{preset}"
@@ -125,7 +129,7 @@ def _refuse_what_cannot_be(options: Run) -> None:
         ("--stride", options.stride != 1),
     ):
         if is_given:
-            raise GavoError(f"{option}: not with the live source {options.sequence!r}: record it and run over that")
+            raise GavoError(f"{option}: {NOT_LIVE.format(options.sequence)}")
     if options.frames is not None and options.frames < 2:
         raise GavoError(f"--frames: must be at least 2, not {options.frames}")
 

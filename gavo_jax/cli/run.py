@@ -10,7 +10,14 @@ import jax
 from gavo_jax.cli.map_file import check_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_seed, choose_settings, open_sequence, settings_line, with_whole_paths
+from gavo_jax.cli.selection import (
+    check_seed,
+    choose_settings,
+    open_sequence,
+    settings_line,
+    with_shortcuts,
+    with_whole_paths,
+)
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
@@ -55,7 +62,7 @@ def run(options: Run) -> int:
     trajectory_formats = formats(options.trajectory_format)
     shape = check_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
-    options, settings = replace(options, method=method, preset=preset), _with_shortcuts(settings, options)
+    options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     sequence = open_sequence(options, color=options.map is not None or options.viewer != "none")
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
@@ -169,18 +176,6 @@ def _track(
     with waiting("drawing figures …"):
         interruptible(draw_figures)
     return metrics, tracked.interrupted
-
-
-def _with_shortcuts(settings: Settings, options: Run) -> Settings:
-    """The settings with those that have an option of their own."""
-    odometry = settings.odometry
-    if options.reference is not None:
-        odometry = replace(odometry, reference=options.reference)
-    if options.on_lost is not None:
-        odometry = replace(odometry, on_lost=options.on_lost)
-    if options.bodies is not None:
-        odometry = replace(odometry, bodies=options.bodies)
-    return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
 
 
 def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError
 from gavo_jax.output.files import describe, read_json
+from gavo_jax.settings import Settings
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
 MAX_SEED = 2**32 - 1
@@ -77,6 +78,18 @@ def choose_settings(search: Search) -> NamedSettings:
 
 FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_scale", "rate", "moving", "seed")
 """Options of a run that are no settings."""
+
+
+def with_shortcuts(settings: Settings, options: Run) -> Settings:
+    """The settings with those that have an option of their own."""
+    odometry = settings.odometry
+    if options.reference is not None:
+        odometry = replace(odometry, reference=options.reference)
+    if options.on_lost is not None:
+        odometry = replace(odometry, on_lost=options.on_lost)
+    if options.bodies is not None:
+        odometry = replace(odometry, bodies=options.bodies)
+    return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
 
 
 def settings_line(options: Run) -> str | None:

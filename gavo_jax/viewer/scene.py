@@ -315,15 +315,19 @@ class Truth:
 
     def at(self, index: int, world_T_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:
         """Return the true world_T_camera of a frame, None where it is not known."""
-        if not self._known[index]:
+        if not self._is_known(index):
             return None
         if self._world_T_truth is None:
             self._world_T_truth = world_T_camera @ inverse(self._truth_T_camera[index])
         return self._world_T_truth @ self._truth_T_camera[index]
 
+    def _is_known(self, index: int) -> bool:
+        """Of a live source, and of a run whose sequence is not there, nothing is known of the later frames."""
+        return index < len(self._known) and bool(self._known[index])
+
     def motion(self, step: Step) -> Float64[np.ndarray, "4 4"] | None:
         """Return the true reference_T_target of a step, None where it is not known."""
-        reference = min(int(np.searchsorted(self._stamps, step.reference_timestamp)), len(self._stamps) - 1)
-        if not (self._known[reference] and self._known[step.index]):
+        reference = int(np.searchsorted(self._stamps, step.reference_timestamp))
+        if not (self._is_known(reference) and self._is_known(step.index)):
             return None
         return inverse(self._truth_T_camera[reference]) @ self._truth_T_camera[step.index]

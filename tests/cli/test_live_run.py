@@ -65,6 +65,19 @@ def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     assert "0 of 5 frames came while another was tracked" in done.out
 
 
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="Rerun is not installed")
+def test_a_live_run_can_be_watched_and_its_options_count(tmp_path, capsys, monkeypatch):
+    """The viewer ended it, as there are no stamps of what is to come; these options were read and left aside."""
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", Player)
+    options = ("--bodies", "off", "--on-lost", "predict", "--reference", "previous", "--viewer", "save")
+    done = runner(capsys)("run", "player", "--method", "small-newton", "--output", tmp_path / "run", *options)
+    assert done.status == 0, done.err
+    assert (tmp_path / "run" / "run.rrd").stat().st_size > 10_000
+    odometry = json.loads((tmp_path / "run" / "config.json").read_text())["odometry"]
+    assert [odometry[name] for name in ("bodies", "on_lost", "reference")] == ["off", "predict", "previous"]
+
+
 @needs_open3d
 def test_the_map_of_a_live_run_is_that_of_its_frames(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
@@ -100,6 +113,7 @@ class Unhurried:
     ("arguments", "words"),
     [
         (("player", "--resume"), "--resume: not with the live source 'player'"),
+        (("player", "--loops"), "--loops: not with the live source 'player'"),
         (("player", "--map", "a.xyz"), "a.xyz: a map ends in .ply"),
         (("player", "--frames", "1"), "at least 2"),
         (("empty",), "ended after 0 frames"),
