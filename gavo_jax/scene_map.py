@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, UInt8
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
@@ -239,6 +240,7 @@ def build_map(
     Raises:
         GavoError: an absurd voxel, or Open3D cannot be imported.
     """
+    sequence = without_distortion(sequence)
     poses = [(0, np.eye(4), 0), *((s.index, s.world_T_camera, s.segment) for s in steps if not s.lost)]
     corrected = (
         {} if trajectory is None else dict(zip(trajectory.timestamps.tolist(), trajectory.world_T_camera, strict=True))

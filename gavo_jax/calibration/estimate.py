@@ -21,6 +21,7 @@ from gavo_jax.calibration.scan import Least, Score, coarse, refine
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
+from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 
 Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
@@ -165,6 +166,7 @@ def estimate_camera(
     Raises:
         GavoError: too few frames that can be read, or no two of them agree in any way.
     """
+    sequence = without_distortion(sequence)
     wanted, camera = tuple(wanted), sequence.camera
     found: dict[str, Found] = {}
     if "depth_scale" in wanted:

@@ -4,7 +4,7 @@ It checks each frame, has an aligner find its motion, decides what becomes of it
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -15,10 +15,10 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, in_world
 from gavo_jax.camera import Camera, require_camera
-from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds, what_helps
+from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
+from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
-from gavo_jax.image.numbers import as_array
 from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
 from gavo_jax.odometry.depth_watch import DepthWatch, judge_by_depth, watch_from
@@ -375,20 +375,3 @@ def clock_of(before: Progress, frame: Frame) -> Clock:
     """When a frame was taken, for a driver that counts it as its last one already."""
     elapsed = frame.timestamp - before.reference_timestamp
     return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(before.last_index))
-
-
-def rectified(frame: Frame, camera: Camera) -> Frame:
-    """A frame of plain arrays, without the camera's lens distortion.
-
-    Raises:
-        FrameError: An image is not of the camera's size, or not one number per pixel.
-    """
-    size = (camera.height, camera.width)
-    for name, image in (("grey", frame.grey), ("depth", frame.depth)):
-        kind = np.asarray(image).dtype
-        if np.shape(image) != size or kind.kind not in "uif":
-            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
-            raise FrameError(fault + what_helps(name, image))
-    grey, depth = camera.undistort(as_array(frame.grey), as_array(frame.depth))
-    color = None if frame.color is None else camera.undistort_image(frame.color)
-    return replace(frame, grey=grey, depth=depth, color=color)

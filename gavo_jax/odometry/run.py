@@ -11,6 +11,7 @@ from jaxtyping import Bool
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.correction import correct, loop_figures
@@ -98,6 +99,7 @@ def run_odometry(
     if len(sequence) < 2:
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
+    sequence = without_distortion(sequence)
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
     mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
     odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.odometry.driver import Odometry, Step, rectified
+from gavo_jax.datasets.rectified import rectified
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Solver
 

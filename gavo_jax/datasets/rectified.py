@@ -1,0 +1,87 @@
+"""Frames and sequences as all that follows takes them: plain arrays, without the camera's lens distortion."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, overload
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
+from gavo_jax.image.numbers import as_array
+from gavo_jax.trajectory import Trajectory
+
+
+def rectified(frame: Frame, camera: Camera) -> Frame:
+    """A frame of plain arrays, without the camera's lens distortion.
+
+    Raises:
+        FrameError: An image is not of the camera's size, or not one number per pixel.
+    """
+    size = (camera.height, camera.width)
+    for name, image in (("grey", frame.grey), ("depth", frame.depth)):
+        kind = np.asarray(image).dtype
+        if np.shape(image) != size or kind.kind not in "uif":
+            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
+            raise FrameError(fault + what_helps(name, image))
+    grey, depth = camera.undistort(as_array(frame.grey), as_array(frame.depth))
+    color = None if frame.color is None else camera.undistort_image(frame.color)
+    return replace(frame, grey=grey, depth=depth, color=color)
+
+
+def without_distortion(sequence: Sequence) -> Sequence:
+    """A sequence whose frames have no lens distortion: itself, where they have none."""
+    return Rectified(sequence) if sequence.camera.is_distorted else sequence
+
+
+class Rectified:
+    """A sequence without its lens distortion; what else it has is as it was."""
+
+    def __init__(self, recorded: Sequence) -> None:
+        self._recorded = recorded
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recorded, name)
+
+    @property
+    def name(self) -> str:
+        """As recorded."""
+        return self._recorded.name
+
+    @property
+    def camera(self) -> Camera:
+        """Without distortion."""
+        return self._recorded.camera.rectified()
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """As recorded."""
+        return self._recorded.ground_truth
+
+    @property
+    def timestamps(self) -> Float[np.ndarray, " frames"]:
+        """As recorded."""
+        return self._recorded.timestamps
+
+    def __len__(self) -> int:
+        """As recorded."""
+        return len(self._recorded)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Rectified": ...
+    def __getitem__(self, index: int | slice) -> "Frame | Rectified":
+        """Decode a frame and take the distortion out, or choose some frames."""
+        if isinstance(index, slice):
+            return Rectified(self._recorded[index])
+        return rectified(self._recorded[index], self._recorded.camera)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frame after frame."""
+        return (self[index] for index in range(len(self)))
+
+    def check(self) -> None:
+        """As recorded."""
+        self._recorded.check()
