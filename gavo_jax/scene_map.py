@@ -6,6 +6,7 @@ Nießner et al. 2013), into which frames go one by one, so that memory grows wit
 
 import contextlib
 import warnings
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
 from gavo_jax.odometry.driver import Step
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
 
 Shape = Literal["cloud", "mesh"]
@@ -193,27 +195,36 @@ class LiveMap:
 
     def __init__(self, builder: MapBuilder) -> None:
         self._builder = builder
-        self._lost, self._elsewhere = 0, 0
+        self._reasons: Counter[str] = Counter()
 
     def watch(self, frame: Frame, step: Step | None) -> None:
         """Take one more frame; no step: it is the first."""
-        if step is not None and step.lost:
-            self._lost += 1
-        elif step is not None and step.segment:
-            self._elsewhere += 1
-        else:
+        why = None if step is None else _why_not(step)
+        if why is None and step is not None and step.segment:
+            why = ELSEWHERE
+        if why is None:
             self._builder.add(frame, np.eye(4) if step is None else step.world_T_camera)
+        else:
+            self._reasons[why] += 1
 
     def finish(self, shape: Shape) -> SceneMap:
         """The map."""
-        return self._builder.extract(shape, _left_out((self._lost, LOST), (self._elsewhere, ELSEWHERE)))
+        return self._builder.extract(shape, _left_out(self._reasons))
 
 
-LOST, ELSEWHERE, UNREADABLE = "lost", "of another segment", "unreadable"
+LOST, GUESSED, DOUBTED = "lost", "of a pose that was guessed", "of doubtful depth"
+ELSEWHERE, UNREADABLE = "of another segment", "unreadable"
 
 
-def _left_out(*reasons: tuple[int, str]) -> list[str]:
-    return [f"{count} frames: {why}" for count, why in reasons if count > 0]
+def _why_not(step: Step) -> str | None:
+    """Why a step's frame is no part of a map of its segment; None: it is."""
+    if step.lost:
+        return LOST
+    return GUESSED if step.origin == "guessed" else None if step.depth_is_trusted else DOUBTED
+
+
+def _left_out(reasons: Counter[str]) -> list[str]:
+    return [f"{count} frame{'s' * (count != 1)}: {why}" for why, count in reasons.items()]
 
 
 def build_map(
@@ -227,7 +238,8 @@ def build_map(
     """Fuse the frames of a run, read once more, one at a time.
 
     Between two segments of a run the motion is unknown, so that they are no part of one map: that of most frames is
-    returned. A frame that was lost, or cannot be read, is left out.
+    returned. A frame that was lost, whose pose is a guess, whose depth is in doubt, or that cannot be read, is left
+    out.
 
     Args:
         sequence: the run's; with `Reading(color=True)` the map has colours, else it is grey.
@@ -240,24 +252,33 @@ def build_map(
     Raises:
         GavoError: an absurd voxel, or Open3D cannot be imported.
     """
-    sequence = without_distortion(sequence)
-    poses = [(0, np.eye(4), 0), *((s.index, s.world_T_camera, s.segment) for s in steps if not s.lost)]
-    corrected = (
-        {} if trajectory is None else dict(zip(trajectory.timestamps.tolist(), trajectory.world_T_camera, strict=True))
-    )
-    segments = np.array([segment for *_, segment in poses])
-    chosen = int(np.bincount(segments).argmax())
-    builder, unreadable = MapBuilder(sequence.camera, voxel, farthest), 0
-    for index, world_T_camera, segment in poses:
-        if segment == chosen:
-            try:
-                frame = sequence[index]
-            except FrameError:
-                unreadable += 1
-                continue
-            builder.add(frame, corrected.get(float(sequence.timestamps[index]), world_T_camera))
-    lost, elsewhere = len(sequence) - len(poses), int(np.sum(segments != chosen))
-    return builder.extract(shape, _left_out((lost, LOST), (elsewhere, ELSEWHERE), (unreadable, UNREADABLE)))
+    sequence, steps = without_distortion(sequence), list(steps)
+    corrected: dict[float, tuple[np.ndarray, int]] = {}
+    if trajectory is not None:
+        rows = zip(trajectory.world_T_camera, trajectory.segments.tolist(), strict=True)
+        corrected = dict(zip(trajectory.timestamps.tolist(), rows, strict=True))
+    places: list[tuple[int, np.ndarray, int]] = [(0, np.eye(4), 0)]
+    reasons: Counter[str] = Counter()
+    for step in steps:
+        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
+            reasons[LOST] += len(places)
+            places.clear()
+        if (why := _why_not(step)) is not None:
+            reasons[why] += 1
+        else:
+            places.append((step.index, *corrected.get(step.timestamp, (step.world_T_camera, step.segment))))
+    segments = [segment for *_, segment in places]
+    chosen = max(set(segments), key=lambda segment: (segments.count(segment), -segment), default=0)
+    builder = MapBuilder(sequence.camera, voxel, farthest)
+    for index, world_T_camera, segment in places:
+        if segment != chosen:
+            reasons[ELSEWHERE] += 1
+            continue
+        try:
+            builder.add(sequence[index], world_T_camera)
+        except FrameError:
+            reasons[UNREADABLE] += 1
+    return builder.extract(shape, _left_out(reasons))
 
 
 def check_map(path: str | Path, shape: Shape | None = None) -> Shape:

@@ -2,15 +2,21 @@
 
 import importlib.util
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 from small import CAMERA
 
+from gavo_jax.alignment.result import no_alignment, with_finding
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
 from gavo_jax.scene_map import MapBuilder, build_map, check_map, check_voxel, import_open3d
+from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import Trajectory
 
 needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
@@ -51,6 +57,66 @@ def test_without_open3d_one_line_says_what_to_install(monkeypatch):
 def test_a_run_without_its_sequence_has_no_map():
     with pytest.raises(GavoError, match="does not hold the sequence"):
         OdometryRun(None, [], None).map()  # pyright: ignore
+
+
+class Fused:
+    """In place of what fuses frames: which ones it was given, and where they were."""
+
+    def __init__(self, *_: object) -> None:
+        self.frames: list[float] = []
+        self.x: list[float] = []
+
+    def add(self, frame: Frame, world_T_camera: np.ndarray) -> None:
+        self.frames.append(frame.timestamp)
+        self.x.append(float(world_T_camera[0, 3]))
+
+    def extract(self, _: str, left_out: list[str]) -> tuple[list[float], list[float], list[str]]:
+        return self.frames, self.x, left_out
+
+
+WALK = SyntheticSequence(8, noise=NONE, camera=CAMERA)
+
+
+def stepped(index: int, *findings: AlignmentStatus, segment: int = 0, **values: Any) -> Step:
+    """A step to a frame of the walk."""
+    result = no_alignment(AlignmentStatus.OK)
+    for finding in findings:
+        result = with_finding(result, finding)
+    stamps = WALK.timestamps
+    pose = np.eye(4)
+    pose[0, 3] = index
+    lost = values.pop("lost", False)
+    return Step(index, stamps[index - 1], stamps[index], result, pose, 1.0, lost, "", segment, **values)
+
+
+def test_a_map_is_made_of_frames_that_can_be_trusted(monkeypatch):
+    """Of frozen or foreign depth, and of guessed poses, the map was made, too."""
+    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    doubts = (AlignmentStatus.FROZEN, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.NO_DEPTH)
+    steps = [stepped(1), *(stepped(2 + i, doubt) for i, doubt in enumerate(doubts)), stepped(5, origin="guessed")]
+    steps += [stepped(6, lost=True, origin="guessed"), stepped(7, AlignmentStatus.PARTIAL_DEPTH)]
+    frames, x, left_out = build_map(WALK, steps)
+    assert frames == [WALK.timestamps[i] for i in (0, 1, 7)] and x == [0, 1, 7]
+    assert left_out == ["3 frames: of doubtful depth", "1 frame: of a pose that was guessed", "1 frame: lost"]
+
+
+def test_a_map_goes_through_segments_that_loops_have_joined(monkeypatch):
+    """They were left out by the steps' segments, although the trajectory said that they lie in one world."""
+    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    steps = [stepped(i, segment=int(i > 4)) for i in range(1, 8)]
+    poses = np.stack([np.eye(4)] * 8)
+    poses[:, 0, 3] = 10 * np.arange(8)
+    trajectory = Trajectory(WALK.timestamps, poses)
+    assert build_map(WALK, steps)[1] == [0, 1, 2, 3, 4]
+    assert build_map(WALK, steps, trajectory=trajectory)[1] == list(range(0, 80, 10))
+
+
+def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
+    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    steps = [stepped(1, AlignmentStatus.NO_REFERENCE, segment=1, lost=True)]
+    steps += [stepped(i, segment=1) for i in (2, 3)]
+    frames, _, left_out = build_map(WALK, steps)
+    assert frames == [WALK.timestamps[i] for i in (2, 3)] and left_out == ["2 frames: lost"]
 
 
 @needs_open3d

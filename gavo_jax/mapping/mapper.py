@@ -16,6 +16,7 @@ from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
 from gavo_jax.odometry.driver import Found, Step
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 STEP_FLOOR = 5e-4
@@ -76,6 +77,8 @@ class Mapper:
         if step is None:
             self._first = frame
             return
+        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
+            self._first = None
         if step.lost:
             return
         seconds = step.timestamp - step.reference_timestamp
@@ -96,7 +99,7 @@ class Mapper:
             if is_found:
                 self._tie(keyframe)
             self._newest = None
-        elif frame is not None and step.origin == "tracked":
+        elif frame is not None and step.origin == "tracked" and step.depth_is_trusted:
             self._newest = frame, step, twist
 
     def find(self, frame: Frame) -> Found | None:
@@ -113,7 +116,7 @@ class Mapper:
         """Whether a step's frame will become a keyframe."""
         if step.origin != "tracked":  # a guess ties nothing to the rest
             return step.origin == "relocalised"
-        return self.keyframes.is_due(step.world_T_camera, step.segment)
+        return step.depth_is_trusted and self.keyframes.is_due(step.world_T_camera, step.segment)
 
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded."""

@@ -62,6 +62,11 @@ class Step:
     """So many of the pairs before are wrong, as is seen now: they followed a body, or led to an image that is
     not of its stamp's moment; see `odometry.hindsight`."""
 
+    @property
+    def depth_is_trusted(self) -> bool:
+        """Whether nothing speaks against the frame's own depth: maps are made of such frames."""
+        return DOUBTED_DEPTH.isdisjoint(self.alignment.statuses)
+
 
 class Found(NamedTuple):
     """Where a frame was found in a map."""
@@ -91,6 +96,8 @@ POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
 """Of frames that have a motion, but become the reference only where the old one is out of reach,"""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
 """and of those that never do."""
+DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
+"""Of frames that have a motion, but no depth of their own that could be trusted."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 

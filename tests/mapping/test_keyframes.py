@@ -212,6 +212,23 @@ def test_a_covered_lens_is_followed_by_the_map(known):
     assert guessed(steps).sum() == (5 if known else 6) and len(guessed(steps)) == len(trajectory)
 
 
+def test_keyframes_are_frames_whose_depth_can_be_trusted():
+    """Frozen depth, depth that did not agree and a first frame that was refused made keyframes of their own."""
+    pytest.importorskip("gtsam")
+    mapper, poses = Mapper(CAMERA), WALK.ground_truth.world_T_camera
+    black = replace(WALK[0], grey=np.zeros_like(WALK[0].grey))
+    mapper.watch(black, None)
+    status = {1: AlignmentStatus.NO_REFERENCE, 6: AlignmentStatus.FROZEN, 12: AlignmentStatus.DEPTH_MISMATCH}
+    for i in range(1, 25):
+        result = no_alignment(status.get(i - i % 6, AlignmentStatus.OK) if i > 1 else status[1])
+        motion = inverse(poses[i]) @ poses[i - 1]
+        pose = inverse(poses[1]) @ poses[i]
+        result = result._replace(target_T_reference=motion)
+        mapper.watch(WALK[i], Step(i, (i - 1) / RATE, i / RATE, result, pose, 1.0, i == 1, segment=1))
+    made = [keyframe.index for keyframe in mapper.keyframes.all]
+    assert made and min(made) > 1 and not any(6 <= index < 18 for index in made) and max(made) >= 18
+
+
 def test_a_frame_is_found_in_the_map_and_another_room_is_not():
     pytest.importorskip("gtsam")
     mapper = Mapper(CAMERA)
