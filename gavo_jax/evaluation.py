@@ -140,14 +140,20 @@ def absolute_trajectory_error(
     """Return the distances between associated positions after the best rigid alignment of the estimate (no scale).
 
     Association is `associate` by time; the alignment minimises the sum of squared distances (Horn 1987, Umeyama 1991).
-    Each segment of the estimate is aligned by itself, as nothing is known of how they lie to each other.
+    Each segment of the estimate is aligned by itself, as nothing is known of how they lie to each other; one of a
+    single pose says nothing and is left out.
 
     Raises:
-        GavoError: fewer than two poses associate.
+        GavoError: fewer than two poses associate, or no two of one segment.
     """
     estimated, true = _associated(estimate, truth, max_difference, "absolute trajectory error")
+    segments, counts = np.unique(estimated.segments, return_counts=True)
+    told = np.isin(estimated.segments, segments[counts > 1])
+    if not told.any():
+        raise GavoError("absolute trajectory error: no two poses of one segment associate")
+    estimated, true = estimated[told], true[told]
     stamps, distances = estimated.timestamps, np.zeros(len(estimated))
-    for segment in np.unique(estimated.segments):
+    for segment in segments[counts > 1]:
         here = estimated.segments == segment
         positions, true_positions = estimated.world_T_camera[here, :3, 3], true[here, :3, 3]
         rotation, translation = align_rigidly(positions, true_positions)
@@ -169,6 +175,7 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     Raises:
         GavoError: the truth covers no pose of the estimate.
     """
+    estimate = estimate[np.argsort(estimate.timestamps, kind="stable")]
     true, valid = truth.interpolate(estimate.timestamps, max_gap)
     if not valid.any():
         raise GavoError("distance error: the ground truth covers no pose of the estimate")

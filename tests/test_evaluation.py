@@ -1,6 +1,7 @@
 """Errors against TUM's definitions, written out literally, and against evo."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -212,6 +213,26 @@ def test_distance_error_leaves_out_what_the_truth_does_not_cover():
     estimate = perturbed(truth, truth.timestamps[::3], 0)
     error = distance_error(estimate, Trajectory(truth.timestamps[60:], truth.world_T_camera[60:]))
     assert len(error.values) == len(estimate) - 20 and error.values[0] == 0
+
+
+def test_distance_error_follows_the_stamps_whatever_the_order_of_the_poses():
+    truth = smooth_truth()
+    estimate = perturbed(truth, truth.timestamps[50:350:10], 3)
+    expected, found = distance_error(estimate, truth), distance_error(estimate[::-1], truth)
+    np.testing.assert_allclose(found.values, expected.values)
+    assert found.final == pytest.approx(expected.final)
+
+
+def test_a_segment_of_one_pose_says_nothing_of_the_absolute_error():
+    """Aligned by itself it had no error: a trajectory in pieces looked perfect."""
+    truth = smooth_truth()
+    estimate = perturbed(truth, truth.timestamps[50:350:10], 3)
+    whole = absolute_trajectory_error(estimate[:20], truth)
+    pieces = replace(estimate, segments=np.r_[np.zeros(20, int), np.arange(1, 11)])
+    found = absolute_trajectory_error(pieces, truth)
+    assert found.rmse == pytest.approx(whole.rmse) and len(found.values) == 20
+    with pytest.raises(GavoError, match="no two poses of one segment"):
+        absolute_trajectory_error(replace(estimate, segments=np.arange(30)), truth)
 
 
 def test_results_say_what_they_are():

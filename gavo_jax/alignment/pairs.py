@@ -18,7 +18,7 @@ from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
-from gavo_jax.image.numbers import as_array
+from gavo_jax.image.numbers import as_array, as_depth
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
@@ -336,8 +336,10 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
             fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
             raise GavoError(fault + what_helps(name, image))
     require_grey_levels(grey)
+    if not isinstance(depth, jax.Array):
+        depth = as_depth(depth)
     if camera.is_distorted:
-        grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
+        grey, depth = camera.undistort(np.asarray(grey), as_depth(np.asarray(depth)))
     return Images(grey, depth)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
-from gavo_jax.image.numbers import as_array
+from gavo_jax.image.numbers import as_array, as_depth
 from gavo_jax.trajectory import Trajectory
 
 
@@ -25,7 +25,7 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         if np.shape(image) != size or kind.kind not in "uif":
             fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
-    grey, depth = camera.undistort(as_array(frame.grey), as_array(frame.depth))
+    grey, depth = camera.undistort(as_array(frame.grey), as_depth(frame.depth))
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)
 

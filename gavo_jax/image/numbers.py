@@ -23,6 +23,12 @@ def as_array(image: Any) -> np.ndarray:
     return array.astype(np.uint16 if array.dtype == ">u2" else np.float32)
 
 
+def as_depth(image: Any) -> np.ndarray:
+    """The same of a depth image, with 0 where it holds no finite number: there is no reading either."""
+    array = as_array(image)
+    return np.where(np.isfinite(array), array, array.dtype.type(0)) if array.dtype.kind == "f" else array
+
+
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:
     """A grey image as OpenCV's keypoints, corners and colours need it; black where it is no number."""
     image = np.ascontiguousarray(grey)

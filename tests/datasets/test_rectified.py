@@ -52,3 +52,12 @@ def test_a_run_holds_the_sequence_as_it_was_tracked() -> None:
     assert run.sequence is not None and not run.sequence.camera.is_distorted
     steps = list(track(Raw(), NEWTON))  # pyright: ignore[reportArgumentType]
     np.testing.assert_array_equal(run.trajectory.world_T_camera[-1], steps[-1].world_T_camera)
+
+
+def test_depth_that_is_no_finite_number_is_no_reading() -> None:
+    """Infinity is written for "farther than I see"; some of what looks at depth took it for a distance."""
+    depth = np.float32(PLAIN[0].depth)
+    depth[:10], depth[10:20] = np.inf, np.nan
+    plain = rectified(replace(PLAIN[0], depth=depth), CAMERA)
+    assert plain.depth.dtype == np.float32 and not plain.depth[:20].any()
+    np.testing.assert_array_equal(plain.depth[20:], depth[20:])
