@@ -18,6 +18,8 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from gavo_jax.early import is_command
+
 COMPILERS = ("jax", "jaxlib")
 """Packages that decide what numbers a compiled program gives."""
 
@@ -40,11 +42,6 @@ def unfit_compiler() -> str | None:
     found = ", ".join(f"{name} {version(name)}" for name in unfit)
     wanted = " ".join(f"'{requirement}'" for requirement in ours)
     return f"{found} may compute wrong numbers and is ruled out: pip install {wanted}"
-
-
-def is_command() -> bool:
-    """Whether this process is the command `gavo`, or `python -m gavo_jax`, and no other program's."""
-    return Path(sys.argv[0] if sys.argv else "").stem in ("gavo", "-m")
 
 
 def prepare_process() -> None:

@@ -17,7 +17,7 @@ is_ours = False
 def end_at_once() -> None:
     """Let Ctrl-C end the process, if that is the command and heeds Ctrl-C at all."""
     global is_ours
-    if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         is_ours = True
         signal.signal(signal.SIGINT, end)
 
@@ -28,7 +28,7 @@ def end(number: int, frame: object) -> None:
     os._exit(INTERRUPTED)
 
 
-def _is_command() -> bool:
+def is_command() -> bool:
     """Whether this process was started as `gavo` or `python -m gavo_jax`: only names tell at this time."""
     name = os.path.basename(sys.argv[0]) if sys.argv else ""
     if name == "-m":

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from jax._src import compilation_cache
 
 from gavo_jax import compiler
-from gavo_jax.compiler import processor_digest, unfit_compiler
+from gavo_jax.compiler import CompilerWarning, prepare_process, processor_digest, unfit_compiler
 
 
 @pytest.fixture
@@ -40,6 +41,25 @@ def test_other_versions_are_allowed(installed, other):
 
 def test_this_one_is_allowed():
     assert unfit_compiler() is None
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "is_warned"),
+    [
+        (["python", "program.py"], "program.py", True),
+        (["python", "-m", "tool.run"], "-m", True),  # its package imports this one: argv is not the module's yet
+        (["python", "-m", "gavo_jax", "doctor"], "-m", False),
+        (["python", "/usr/bin/gavo", "doctor"], "/usr/bin/gavo", False),
+    ],
+)
+def test_every_program_but_the_command_is_warned_of_wrong_numbers(monkeypatch, words, name, is_warned):
+    monkeypatch.setattr(compiler, "unfit_compiler", lambda: "jax 0.11.0 may compute wrong numbers")
+    monkeypatch.setattr(sys, "orig_argv", words)
+    monkeypatch.setattr(sys, "argv", [name])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        prepare_process()
+    assert [warning.category for warning in told] == [CompilerWarning] * is_warned
 
 
 def test_two_processors_have_two_names(monkeypatch):
