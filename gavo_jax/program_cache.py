@@ -17,6 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, update_wrapper
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, get_args, get_type_hints
 
@@ -33,6 +34,11 @@ R = TypeVar("R")
 OURS = __name__.partition(".")[0]
 TRACED_WITH = ("jax", "jaxlib", "jaxlie", "numpy", "optax")
 """Packages whose code is traced along with ours; their versions tell whether it has changed."""
+
+OPTIONS = tuple(name for name in sorted(jax.config.values) if hasattr(jax.config, name))
+"""JAX's, by name."""
+_configuration = attrgetter(*OPTIONS)
+"""Of `jax.config` their values, as this thread has them."""
 
 _folder: Path | None = None
 _loaded: dict[Any, Callable[..., Any]] = {}
@@ -93,7 +99,7 @@ class CachedProgram(Generic[P, R]):
         if _folder is None or is_traced or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return self._jitted(*args, **kwargs)
         kinds = tuple(map(Kind.of, leaves))
-        signature = (self._function, structure, kinds, tuple(kwargs.items()))
+        signature = self._signature(structure, kinds, kwargs)
         program = _loaded.get(signature)
         if program is None:
             with _lock:
@@ -110,18 +116,22 @@ class CachedProgram(Generic[P, R]):
             return False
         leaves, structure = jax.tree.flatten(args)
         kinds = tuple(map(Kind.of, leaves))
-        if (self._function, structure, kinds, tuple(kwargs.items())) in _loaded:
+        if self._signature(structure, kinds, kwargs) in _loaded:
             return True
         try:
             return _read(self._path(_folder, structure, kinds, kwargs)) is not None
         except Foreign:
             return False
 
+    def _signature(self, structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]) -> Any:
+        """What tells a program from the others of this process."""
+        return self._function, structure, kinds, tuple(static.items()), _configuration(jax.config)
+
     def _path(self, folder: Path, structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]) -> Path:
         """The file of a program; raise Foreign where it has none."""
         settings = identify((jax.tree.unflatten(structure, kinds), static))
         function = self._function
-        configuration = [(name, getattr(jax.config, name, None)) for name in sorted(jax.config.values)]
+        configuration = list(zip(OPTIONS, _configuration(jax.config), strict=True))
         program = (function.__module__, function.__qualname__, settings, configuration, jax.default_backend())
         digest = hashlib.sha256(repr(program).encode()).hexdigest()
         return folder / f"{function.__name__.strip('_')}-{digest[:32]}"

@@ -137,6 +137,21 @@ def test_shapes_static_arguments_and_jax_settings_tell_programs_apart(folder: Pa
     assert traces == 4
 
 
+def test_jax_settings_that_change_within_a_process_tell_programs_apart(folder: Path) -> None:
+    def draw(seed: Any) -> jax.Array:
+        return jax.random.uniform(jax.random.key(seed), (8,))
+
+    drawing: Any = CachedProgram(draw)
+    was = bool(jax.config.values["jax_threefry_partitionable"])
+    found = []
+    for partitionable in (was, not was, was):
+        with jax.threefry_partitionable(partitionable):
+            found.append(drawing(np.uint32(1)))
+            np.testing.assert_array_equal(found[-1], draw(np.uint32(1)))
+            assert drawing.is_kept(np.uint32(1))
+    assert not np.array_equal(found[0], found[1])
+
+
 def test_changed_code_is_traced_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program(NUMBERS, OPTIONS)
     start_anew(folder)
