@@ -68,6 +68,8 @@ LINEARIZED_CHUNK = 4800
 """Points of a view that are linearised at a time; there is only one candidate then."""
 CENTRING_POINTS = 480
 """Points a view that tell a motion's mean residual."""
+MOST_SAMPLED = 46340
+"""Points a view in any sample: two places in it have a product of 32 bits."""
 
 
 @jax.tree_util.register_dataclass
@@ -139,8 +141,10 @@ class Objective:
         if points is None:
             return self
         available = self.reference.grey.shape[-1]
-        size = min(points, available)
-        places = jnp.arange(size) * (available if self.count is None else self.count) // size
+        size = min(points, available, MOST_SAMPLED)
+        apart, rest = divmod(available if self.count is None else self.count, size)
+        places = jnp.arange(size)
+        places = places * apart + places * rest // size  # a place times all points would pass 32 bits
         some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
         return replace(self, reference=some, count=None)
 

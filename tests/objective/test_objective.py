@@ -391,6 +391,19 @@ def test_a_sample_is_spread_over_the_points_that_count() -> None:
     np.testing.assert_array_equal(everything.reference.grey, objective.reference.grey)
 
 
+@pytest.mark.parametrize("is_counted", [False, True])
+@pytest.mark.parametrize("available", [1920 * 1080, 4096 * 3072, 10_007, 1200])
+def test_a_sample_of_a_large_image_is_spread_over_all_of_it(available: int, is_counted: bool) -> None:
+    objective = build(random_pair(5))
+    numbered = jax.tree.map(lambda leaf: jnp.arange(available, dtype=jnp.int32), objective.reference)
+    count = jnp.int32(available) if is_counted else None
+    for points in (1200, 9600, 100_000):
+        drawn = replace(objective, reference=numbered, count=count).sample(points).reference.grey
+        size = drawn.size  # which is capped where the products would not fit any more
+        assert min(points, available, 40_000) <= size <= points
+        np.testing.assert_array_equal(drawn, np.arange(size, dtype=np.int64) * available // size)
+
+
 def test_settled_points_are_where_they_were_in_the_middle_of_the_readout() -> None:
     pair = smooth_pair(rim=1)
     reference = make_reference(PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in pair[1:3])), CAMERA)
