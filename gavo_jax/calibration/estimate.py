@@ -175,7 +175,9 @@ def estimate_camera(
         return CameraEstimate(found, _with_found(camera, found), 0.0, 0)
     on_progress("looking for stretches of motion")
     stretches = [Stretch.of(frames, camera) for frames in _stretches(sequence)]
-    unknowns = Unknowns.of(camera)._replace(readout=0.0)
+    unknowns = Unknowns.of(camera)
+    if "readout" in wanted:  # looked for from an even shutter on, whatever the camera says
+        unknowns = unknowns._replace(readout=0.0)
     stamps = [np.asarray(stretch.stamps, float) for stretch in stretches]
     standing = [Kinematics.unknown(len(times)) for times in stamps]
     trial = _Trial(stretches, stamps, camera, unknowns, standing)

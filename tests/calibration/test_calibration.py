@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from small import CAMERA
 
-from gavo_jax.calibration.estimate import Found, estimate_camera
+from gavo_jax.calibration import estimate as estimate_module
+from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.calibration.pairs import Kinematics, evened
+from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
 from gavo_jax.calibration.scan import coarse, refine
 from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of
@@ -64,6 +65,34 @@ def test_shutter_delay_and_lens_are_found_from_the_images():
     assert readout.value == pytest.approx(READOUT, abs=0.003), readout
     assert delay.value == pytest.approx(DELAY, abs=0.003), delay
     assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
+
+
+@pytest.mark.parametrize(
+    ("wanted", "supposed"), [("readout", 0.0), ("depth_delay", READOUT), ("focal_length", READOUT)]
+)
+def test_a_readout_that_is_not_asked_for_is_what_the_camera_says(
+    monkeypatch: pytest.MonkeyPatch, wanted: Wanted, supposed: float
+) -> None:
+    readouts = []
+
+    def match(stretch: object, kinematics: Kinematics, unknowns: Unknowns, *, camera: object) -> Matched:
+        readouts.append(float(unknowns.readout))
+        pairs = len(kinematics.velocity) - 1
+        ones = np.ones(pairs)
+        return Matched(ones, ones, np.zeros((pairs, 6)), np.tile(np.eye(4), (pairs, 1, 1)), ones)  # pyright: ignore
+
+    monkeypatch.setattr(estimate_module, "match_pairs", match)
+    shape = (CAMERA.height, CAMERA.width)
+
+    class Blank(list[Frame]):
+        name, camera = "blank", replace(CAMERA, readout=READOUT)
+
+    sequence = Blank(Frame(np.zeros(shape, np.uint8), np.zeros(shape, np.uint16), i / 30) for i in range(15))
+    estimate = estimate_camera(sequence, (wanted,), rounds=1)  # pyright: ignore
+    first = readouts[:3] if wanted == "readout" else readouts  # what is asked for varies afterwards
+    np.testing.assert_allclose(first, supposed, rtol=1e-6)
+    if wanted != "readout":
+        assert estimate.camera.readout == READOUT
 
 
 def test_motion_between_frames_further_apart_is_that_of_the_pairs_between():
