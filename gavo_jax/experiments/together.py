@@ -7,11 +7,12 @@ solvers and options, the runs laid out over all local devices; a rate that diffe
 
 import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recovery
-from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of
+from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, rectified
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
@@ -135,15 +136,34 @@ def _track_stack(
     return jax.vmap(one)(states, clocks, keys, settings)
 
 
+class _Made(NamedTuple):
+    """One run's attempt at a frame, made with the others'."""
+
+    state: TrackerState
+    """Before it,"""
+    frame: Frame
+    """the new frame,"""
+    clock: Clock
+    """and when that was taken."""
+    result: Alignment
+    after: Callable[[], TrackerState]
+    """Gives the state after it: a row of the new stack."""
+
+    def answers(self, state: TrackerState, frame: Frame, clock: Clock) -> bool:
+        """Whether it is what a search would find; since it was made, depth may have been left out, or the motion be
+        thought to have taken another time.
+        """
+        is_same_frame = frame.grey is self.frame.grey and frame.depth is self.frame.depth
+        return state is self.state and is_same_frame and clock == self.clock
+
+
 @dataclass
 class _Stacked:
     """The search of one run of a stack: its first attempt at a frame was made with the others'."""
 
     search: Search
-    made: Alignment | None = None
-    """That attempt's result; None where there is none, and the run is on its own."""
-    state: Callable[[], TrackerState] | None = None
-    """Gives the state after that attempt: a row of the new stack."""
+    made: _Made | None = None
+    """That attempt; None where there is none, and the run is on its own."""
 
     def warm_up(self) -> float:
         """The stack's program compiles with its first frame."""
@@ -155,10 +175,10 @@ class _Stacked:
         return first_state(frame.grey, frame.depth, self.search.camera, settings.solver, settings.alignment)
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The attempt that was made."""
-        if self.made is None or self.state is None:
+        """The attempt that was made, if it is the one that is asked for."""
+        if self.made is None or not self.made.answers(state, frame, clock):
             return self.search.align(state, frame, clock)
-        return self.search.judged(state, self.state(), self.made, frame, clock)
+        return self.search.judged(state, self.made.after(), self.made.result, frame, clock)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """As of a single run."""
@@ -169,39 +189,45 @@ class _Stack:
     """R lanes whose states are rows of one stack on the device."""
 
     def __init__(self, camera: Camera, settings: Sequence[Settings], seeds: Sequence[int]) -> None:
+        self._recorded, self._camera = camera, camera.rectified()
         self._searches = [
-            _Stacked(Search(camera, own, jax.random.key(seed))) for own, seed in zip(settings, seeds, strict=True)
+            _Stacked(Search(self._camera, own, jax.random.key(seed))) for own, seed in zip(settings, seeds, strict=True)
         ]
         self.lanes = [
-            Odometry(camera, stacked.search.settings, aligner=with_recovery(stacked, stacked.search))
+            Odometry(self._camera, stacked.search.settings, aligner=with_recovery(stacked, stacked.search))
             for stacked in self._searches
         ]
-        self._camera = camera
         self._sharding = _over_devices(len(settings))
         self._settings = self._rows([_of_program(own) for own in settings])
 
     def register(self, frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
         """Track one more frame by all lanes; each decides by itself what becomes of it."""
-        before = [lane.progress for lane in self.lanes]
-        if isinstance(frame, Frame) and all(progress.tracker is not None for progress in before):
-            self._attempt(frame, before)
+        milliseconds = 0.0
+        if isinstance(frame, Frame):
+            frame = rectified(frame, self._recorded)
+            before = [lane.progress for lane in self.lanes]
+            if all(progress.tracker is not None for progress in before):
+                start = time.perf_counter()
+                self._attempt(frame, before)
+                milliseconds = (time.perf_counter() - start) * 1e3
         steps = [lane.register(frame, timestamp) for lane in self.lanes]
         for stacked in self._searches:
             stacked.made = None
-        return steps
+        # every lane has waited for the whole stack
+        return [step and replace(step, milliseconds=step.milliseconds + milliseconds) for step in steps]
 
     def _attempt(self, frame: Frame, before: Sequence[Progress]) -> None:
         """Align a frame by all lanes in one call; each lane keeps its own result and a way to its state."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
-        clocks = self._rows([clock_of(progress, frame) for progress in numbered])
+        clocks = [clock_of(progress, frame) for progress in numbered]
         keys = jnp.stack([stacked.search.key for stacked in self._searches])
-        states = self._rows([_tracker_of(progress.tracker) for progress in before])
-        images = jnp.asarray(frame.grey), jnp.asarray(frame.depth)
-        after, results = _track_stack(states, *images, clocks, keys, self._camera, self._settings)
+        states = [_tracker_of(progress.tracker) for progress in before]
+        inputs = self._rows(states), jnp.asarray(frame.grey), jnp.asarray(frame.depth), self._rows(clocks), keys
+        after, results = _track_stack(*inputs, self._camera, self._settings)
         host = jax.device_get(results)
         for i, stacked in enumerate(self._searches):
-            stacked.made = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
-            stacked.state = partial(_row, after, i)
+            result = on_host(jax.tree.map(lambda leaf, i=i: leaf[i], host))
+            stacked.made = _Made(states[i], frame, clocks[i], result, partial(_row, after, i))
 
     def _rows(self, values: Sequence[Any]) -> Any:
         """Stack R pytrees of numbers, laid out over the devices."""

@@ -13,18 +13,24 @@ import pytest
 from small import CAMERA, GENETIC
 
 from gavo_jax import presets
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
+from gavo_jax.experiments import together
 from gavo_jax.experiments.executors import LocalExecutor
 from gavo_jax.experiments.plan import Plan, read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
+from gavo_jax.odometry.aligners import without_depth
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
+from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import override
+from gavo_jax.status import AlignmentStatus
 
 FRAMES = 5
 
@@ -127,6 +133,65 @@ def test_stacked_runs_lose_and_find_themselves():
         np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
 
 
+class FrozenDepth(SyntheticSequence):
+    """The depth of frame 3 is that of frame 2 once more."""
+
+    def __getitem__(self, index: Any) -> Any:
+        frame = super().__getitem__(index)
+        return replace(frame, depth=super().__getitem__(2).depth) if index == 3 else frame
+
+
+class Distorted(SyntheticSequence):
+    """Its camera says that its lens distorts."""
+
+    @property
+    def camera(self) -> Camera:
+        return replace(super().camera, distortion=(0.2, -0.1, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", [FrozenDepth, Distorted])
+def test_stacked_runs_see_the_frames_that_single_ones_see(kind: type[SyntheticSequence]):
+    settings = [replace(p, odometry=replace(p.odometry, recover=False)) for p in rates(4)]
+    sequence = kind(FRAMES, camera=CAMERA)
+    for i, (own, steps) in enumerate(zip(settings, track_stacked(sequence, settings, range(4)), strict=True)):
+        alone = list(track(sequence, own, seed=i))
+        assert [step.alignment.statuses for step in steps] == [step.alignment.statuses for step in alone]
+        np.testing.assert_allclose(poses(steps), poses(alone), atol=2e-5)
+
+
+def test_an_attempt_of_the_stack_answers_only_what_was_asked_of_it():
+    class Fake:
+        def align(self, *asked: Any) -> str:
+            return "its own"
+
+        def judged(self, *asked: Any) -> str:
+            return "the stack's"
+
+    state, frame = object(), frames(1)[0]
+    clock = Clock(np.float32(0.03), np.float32(0.0), np.uint32(2))
+    made = together._Made(state, frame, clock, no_alignment(AlignmentStatus.OK), lambda: state)  # pyright: ignore
+    stacked: Any = together._Stacked(Fake(), made)  # pyright: ignore
+    assert stacked.align(state, replace(frame), clock) == "the stack's"
+    others = [
+        (object(), frame, clock),
+        (state, without_depth(frame), clock),
+        (state, frame, clock._replace(elapsed=np.float32(0.06))),
+    ]
+    assert [stacked.align(*other) for other in others] == ["its own"] * 3
+
+
+def test_the_time_of_a_step_holds_that_of_the_stack(monkeypatch: pytest.MonkeyPatch):
+    tracked = together._track_stack
+
+    def slowly(*inputs: Any) -> Any:
+        time.sleep(0.3)
+        return tracked(*inputs)
+
+    monkeypatch.setattr(together, "_track_stack", slowly)
+    found = track_stacked(frames(3), rates(4), range(4))
+    assert all(step.milliseconds > 300 for steps in found for step in steps)
+
+
 def test_other_rates_compile_nothing_more_stacked():
     with compilations() as events:
         track_stacked(frames(2), rates(4), range(4))
@@ -170,7 +235,7 @@ def ratio_of_together(plan: Plan, *, seeds_differ: bool) -> list[float]:
     with compilations() as events:
         start = clocks()
         assert run_experiment(plan, Table(plan.folder), LocalExecutor()) == (64, [])
-        together = clocks() - start
+        joint = clocks() - start
         assert events == []
     rows = {row["run"]: row for row in Table(plan.folder).read()}
     start = clocks()
@@ -183,7 +248,7 @@ def ratio_of_together(plan: Plan, *, seeds_differ: bool) -> list[float]:
     single = (clocks() - start) * len(plan.runs) / len(some)
     if seeds_differ:
         assert len({row["ate_translation_rmse_m"] for row in rows.values()}) > 32, "seeds and rates change nothing"
-    return list(together / single)
+    return list(joint / single)
 
 
 @pytest.mark.parametrize("method", SWEPT)
