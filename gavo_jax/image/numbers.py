@@ -26,7 +26,9 @@ def as_array(image: Any) -> np.ndarray:
 def as_depth(image: Any) -> np.ndarray:
     """The same of a depth image, with 0 where it holds no finite number: there is no reading either."""
     array = as_array(image)
-    return np.where(np.isfinite(array), array, array.dtype.type(0)) if array.dtype.kind == "f" else array
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return array
+    return np.where(np.isfinite(array), array, array.dtype.type(0))
 
 
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:

@@ -173,6 +173,19 @@ class Search:
         return exp(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
 
 
+def expecting(state: Any, xi: Float64[np.ndarray, " 6"], seconds: float) -> Any:
+    """The state of a search, however it is wrapped, if the camera moves so far in so many seconds; anybody else's state
+    as it is.
+    """
+    for name in ("tracker", "first"):
+        if name in getattr(state, "_fields", ()):
+            return state._replace(**{name: expecting(getattr(state, name), xi, seconds)})
+    if not isinstance(state, TrackerState):
+        return state
+    motion = jnp.asarray(xi * (float(state.seconds) / seconds), jnp.float32)
+    return state._replace(motion=motion, guess=motion)
+
+
 def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)

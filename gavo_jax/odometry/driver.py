@@ -19,12 +19,13 @@ from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, requi
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
-from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
+from gavo_jax.odometry.aligners import Aligner, Attempt, expecting, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
 from gavo_jax.odometry.depth_watch import DepthWatch, judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import Leap, align_leaping
 from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
 from gavo_jax.odometry.tracking import Clock
+from gavo_jax.odometry.way import Way
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -114,7 +115,9 @@ class Progress(NamedTuple):
     world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
     """As recorded last."""
     held: int = 0
-    """Frames since the reference was renewed."""
+    """Frames since the reference was renewed,"""
+    way: Way = Way()
+    """and where the camera was found meanwhile."""
     history: History = History()
     segment: int = 0
     """Of the reference;"""
@@ -134,6 +137,12 @@ class Progress(NamedTuple):
     """Of the track, as long as it may have followed a body."""
     depth: DepthWatch | None = None
     """Of the reference, and how depth has changed; None before the first reference."""
+
+    def tracker_at(self, timestamp: float) -> Any:
+        """The aligner's state for a frame of that stamp, with the motion that the way since the reference foretells."""
+        seconds = timestamp - self.reference_timestamp
+        xi = self.way.at(seconds)
+        return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
 
 
 class Outcome(NamedTuple):
@@ -280,8 +289,9 @@ class Odometry:
     def _align(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
         """Of a frame that is aligned."""
         clock = clock_of(before, frame)
-        attempt, leap = align_leaping(self.aligner, before.tracker, frame, clock, before.leap)
-        renewed = arrival_of(self.aligner, before.tracker, clock, attempt)
+        state = before.tracker_at(frame.timestamp)
+        attempt, leap = align_leaping(self.aligner, state, frame, clock, before.leap)
+        renewed = arrival_of(self.aligner, state, clock, attempt)
         attempt, kept = doubt_reference(before.arrival, clock, attempt)
         after, result, lost = self._advance(before, frame, finding, attempt)
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
@@ -319,6 +329,7 @@ class Odometry:
             reference_timestamp=frame.timestamp,
             world_T_reference=before.world_T_camera,
             held=0,
+            way=Way(),
             doubted=False,
             unknown=0,
             beginning=begun(before.beginning, frame.timestamp),
@@ -353,8 +364,15 @@ class Odometry:
         overdue = after.held >= MAX_HELD and may_be and (attempt.fit or not doubted)
         if overdue or (attempt.fit and finding.use is Use.ALL):
             after = after._replace(
-                tracker=attempt.state, reference_timestamp=frame.timestamp, world_T_reference=world_T_camera, held=0
+                tracker=attempt.state,
+                reference_timestamp=frame.timestamp,
+                world_T_reference=world_T_camera,
+                held=0,
+                way=Way(),
             )
+        elif not attempt.unknown:
+            since = frame.timestamp - before.reference_timestamp
+            after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False
 
     def _lose(self, before: Progress, frame: Frame | None, timestamp: float) -> Progress:
@@ -367,7 +385,7 @@ class Odometry:
         """
         after = before._replace(held=before.held + 1)
         if self.settings.odometry.on_lost == "predict" and timestamp > before.reference_timestamp:
-            motion = self.aligner.predict(before.tracker, timestamp - before.reference_timestamp)
+            motion = self.aligner.predict(before.tracker_at(timestamp), timestamp - before.reference_timestamp)
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
 

@@ -22,6 +22,7 @@ from gavo_jax.odometry.depth_watch import DepthWatch
 from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.way import Fix, Way
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
@@ -62,6 +63,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "last_index": progress.last_index,
         "reference_timestamp": progress.reference_timestamp,
         "held": progress.held,
+        "way": progress.way.fixes,
         "segment": progress.segment,
         "last_segment": progress.last_segment,
         "adrift": progress.adrift,
@@ -115,6 +117,7 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
         numbers |= {"history": History(**history), "leap": leap and Leap(np.array(leap[0]), *leap[1:])}
         numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
+        numbers["way"] = Way(tuple(Fix(seconds, tuple(xi)) for seconds, xi in numbers["way"]))
         beginning = numbers.get("beginning")
         numbers["beginning"] = beginning and Beginning(*beginning)
         if depth := numbers.get("depth"):
