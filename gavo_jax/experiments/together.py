@@ -24,9 +24,11 @@ from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.rectified import rectified
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part, with_recovery
-from gavo_jax.odometry.driver import Odometry, Progress, Step, clock_of, rectified
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.settings import Settings
@@ -219,7 +221,7 @@ class _Stack:
     def _attempt(self, frame: Frame, before: Sequence[Progress]) -> None:
         """Align a frame by all lanes in one call; each lane keeps its own result and a way to its state."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
-        clocks = [clock_of(progress, frame) for progress in numbered]
+        clocks = [progress.clock(frame) for progress in numbered]
         keys = jnp.stack([stacked.search.key for stacked in self._searches])
         states = [_tracker_of(progress.tracker) for progress in before]
         inputs = self._rows(states), jnp.asarray(frame.grey), jnp.asarray(frame.depth), self._rows(clocks), keys

@@ -5,7 +5,7 @@ It checks each frame, has an aligner find its motion, decides what becomes of it
 
 import time
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -18,13 +18,13 @@ from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
-from gavo_jax.frame_checks import Finding, History, Use, check_frame, doubts_last_stamp
-from gavo_jax.odometry.aligners import Aligner, Attempt, expecting, make_aligner, without_depth
-from gavo_jax.odometry.beginnings import Beginning, begun, followed, revised_by
-from gavo_jax.odometry.depth_watch import DepthWatch, judge_by_depth, watch_from
-from gavo_jax.odometry.leaps import Leap, align_leaping
-from gavo_jax.odometry.misplaced import Arrival, arrival_of, doubt_reference
-from gavo_jax.odometry.tracking import Clock
+from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
+from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
+from gavo_jax.odometry.beginnings import begun, followed, revised_by
+from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
+from gavo_jax.odometry.leaps import align_leaping
+from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.way import Way
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -101,48 +101,6 @@ DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
 """Of frames that have a motion, but no depth of their own that could be trusted."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
-
-
-class Progress(NamedTuple):
-    """Where a driver stands between two frames: all that decides what it makes of the next ones."""
-
-    tracker: Any = None
-    """The aligner's state; None while no usable frame was seen."""
-    last_index: int = -1
-    """Of the last frame."""
-    reference_timestamp: float = 0.0
-    world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
-    world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
-    """As recorded last."""
-    held: int = 0
-    """Frames since the reference was renewed,"""
-    way: Way = Way()
-    """and where the camera was found meanwhile."""
-    history: History = History()
-    segment: int = 0
-    """Of the reference;"""
-    last_segment: int = 0
-    """and the largest number that one was given."""
-    adrift: int = 0
-    """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
-    doubted: bool = False
-    """Whether the last frame's depth did not agree with its image."""
-    unknown: int = 0
-    """So many of the last motions are guesses that frames have been chained by."""
-    leap: Leap | None = None
-    """What the last frame may have been; it is lost until the next one confirms that."""
-    arrival: Arrival | None = None
-    """How the reference was reached, where its image may be of another moment."""
-    beginning: Beginning | None = None
-    """Of the track, as long as it may have followed a body."""
-    depth: DepthWatch | None = None
-    """Of the reference, and how depth has changed; None before the first reference."""
-
-    def tracker_at(self, timestamp: float) -> Any:
-        """The aligner's state for a frame of that stamp, with the motion that the way since the reference foretells."""
-        seconds = timestamp - self.reference_timestamp
-        xi = self.way.at(seconds)
-        return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
 
 
 class Outcome(NamedTuple):
@@ -288,7 +246,7 @@ class Odometry:
 
     def _align(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
         """Of a frame that is aligned."""
-        clock = clock_of(before, frame)
+        clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
         attempt, leap = align_leaping(self.aligner, state, frame, clock, before.leap)
         renewed = arrival_of(self.aligner, state, clock, attempt)
@@ -323,7 +281,7 @@ class Odometry:
         """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new
         segment.
         """
-        here = before if before.last_index == 0 else _in_new_segment(before)
+        here = before if before.last_index == 0 else before.in_new_segment()
         return here._replace(
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
@@ -359,7 +317,7 @@ class Odometry:
         elif before.unknown:
             after = after._replace(unknown=0)
             if before.unknown >= MAX_HELD:  # too many to go on in the same world
-                after = _in_new_segment(after)
+                after = after.in_new_segment()
         may_be = not POOR.isdisjoint(result.statuses) and DEPTHLESS.isdisjoint(result.statuses)
         overdue = after.held >= MAX_HELD and may_be and (attempt.fit or not doubted)
         if overdue or (attempt.fit and finding.use is Use.ALL):
@@ -388,15 +346,3 @@ class Odometry:
             motion = self.aligner.predict(before.tracker_at(timestamp), timestamp - before.reference_timestamp)
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)
-
-
-def _in_new_segment(progress: Progress) -> Progress:
-    """Where the driver stands in a segment that nothing ties to those before; its number was given to no other one."""
-    number = progress.last_segment + 1
-    return progress._replace(segment=number, last_segment=number, adrift=1)
-
-
-def clock_of(before: Progress, frame: Frame) -> Clock:
-    """When a frame was taken, for a driver that counts it as its last one already."""
-    elapsed = frame.timestamp - before.reference_timestamp
-    return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(before.last_index))

@@ -19,9 +19,9 @@ from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_change import DepthChange
 from gavo_jax.odometry.depth_watch import DepthWatch
-from gavo_jax.odometry.driver import Progress
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.way import Fix, Way
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")

@@ -15,7 +15,8 @@ import numpy as np
 
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.locks import hold
-from gavo_jax.odometry.driver import Progress, Step
+from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
 from gavo_jax.output.files import (

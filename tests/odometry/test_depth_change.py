@@ -17,8 +17,9 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.depth_change import MIN_REMEMBERED, REMEMBERED, depth_on_grid, left_unexplained
 from gavo_jax.odometry.depth_watch import DepthWatch
-from gavo_jax.odometry.driver import Odometry, Progress, Step
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from gavo_jax.status import AlignmentStatus

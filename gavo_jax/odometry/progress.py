@@ -1,0 +1,68 @@
+"""Where a driver stands between two frames."""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float64
+
+from gavo_jax.datasets.base import Frame
+from gavo_jax.frame_checks import History
+from gavo_jax.odometry.aligners import expecting
+from gavo_jax.odometry.beginnings import Beginning
+from gavo_jax.odometry.depth_watch import DepthWatch
+from gavo_jax.odometry.leaps import Leap
+from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.odometry.way import Way
+
+
+class Progress(NamedTuple):
+    """Where a driver stands between two frames: all that decides what it makes of the next ones."""
+
+    tracker: Any = None
+    """The aligner's state; None while no usable frame was seen."""
+    last_index: int = -1
+    """Of the last frame."""
+    reference_timestamp: float = 0.0
+    world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
+    world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
+    """As recorded last."""
+    held: int = 0
+    """Frames since the reference was renewed,"""
+    way: Way = Way()
+    """and where the camera was found meanwhile."""
+    history: History = History()
+    segment: int = 0
+    """Of the reference;"""
+    last_segment: int = 0
+    """and the largest number that one was given."""
+    adrift: int = 0
+    """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
+    doubted: bool = False
+    """Whether the last frame's depth did not agree with its image."""
+    unknown: int = 0
+    """So many of the last motions are guesses that frames have been chained by."""
+    leap: Leap | None = None
+    """What the last frame may have been; it is lost until the next one confirms that."""
+    arrival: Arrival | None = None
+    """How the reference was reached, where its image may be of another moment."""
+    beginning: Beginning | None = None
+    """Of the track, as long as it may have followed a body."""
+    depth: DepthWatch | None = None
+    """Of the reference, and how depth has changed; None before the first reference."""
+
+    def tracker_at(self, timestamp: float) -> Any:
+        """The aligner's state for a frame of that stamp, with the motion that the way since the reference foretells."""
+        seconds = timestamp - self.reference_timestamp
+        xi = self.way.at(seconds)
+        return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
+
+    def in_new_segment(self) -> Self:
+        """In a segment that nothing ties to those before; its number was given to no other one."""
+        number = self.last_segment + 1
+        return self._replace(segment=number, last_segment=number, adrift=1)
+
+    def clock(self, frame: Frame) -> Clock:
+        """When a frame was taken, which is counted as the last one already."""
+        elapsed = frame.timestamp - self.reference_timestamp
+        return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(self.last_index))
