@@ -21,9 +21,10 @@ from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
-from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.run import run_odometry, trajectory_of
 from gavo_jax.output.files import environment
 from gavo_jax.peers import make_peer
+from gavo_jax.settings import Settings
 
 Row = dict[str, Any]
 
@@ -146,6 +147,9 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
     """
     try:
         sequence = batch.part.open()
+        settings = batch.runs[0].settings
+        if settings is not None and settings.odometry.loops:
+            return Outcome(batch, (_mapped(experiment, batch, sequence, settings, on_pairs),))
         tracker = _Tracker(batch, sequence)
         compile_seconds = tracker.warm_up()
         start = time.perf_counter()
@@ -160,6 +164,21 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
     except GavoError as error:
         return Outcome(batch, (), str(error))
     return Outcome(batch, tuple(rows))
+
+
+def _mapped(
+    experiment: str, batch: Batch, sequence: FrameSequence, settings: Settings, on_pairs: Callable[[int], None] | None
+) -> Row:
+    """The row of a run that keeps a map, alone in its batch: its figures are those of the corrected trajectory."""
+    (run,) = batch.runs
+
+    def on_step(_: Step) -> None:
+        if on_pairs is not None:
+            on_pairs(1)
+
+    metrics = run_odometry(sequence, settings, seed=run.seed or 0, on_step=on_step).metrics
+    own: Any = {name: metrics[name] for name in Metrics.__annotations__}
+    return _row(experiment, batch, run, sequence, own)
 
 
 class _Tracker:

@@ -29,6 +29,7 @@ from gavo_jax.experiments.values import (
     text_of,
     whole_of,
 )
+from gavo_jax.mapping.pose_graph import require_gtsam
 from gavo_jax.output.files import describe
 from gavo_jax.peers import PEERS
 from gavo_jax.presets import PRESETS
@@ -193,10 +194,12 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
 
 
 def batches(runs: Iterable[Run], size: int) -> list[Batch]:
-    """Put runs of one part and one program together, at most `size` of them; peers go one by one."""
+    """Put runs of one part and one program together, at most `size` of them; peers go one by one, and so do runs with a
+    map.
+    """
     groups: dict[Any, list[Run]] = {}
     for run in runs:
-        together = run.id if run.settings is None else program_of(run.settings)
+        together = run.id if run.settings is None or run.settings.odometry.loops else program_of(run.settings)
         groups.setdefault((run.part, run.method, together), []).append(run)
     return [
         Batch(group[0].part, tuple(group[first : first + size]))
@@ -356,9 +359,18 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
         for choice in itertools.product(*swept.values()):
             values = fixed | dict(zip(swept, choice, strict=True))
             settings = override(presets.preset(method, preset), values, place)
+            if settings.odometry.loops:
+                _require_loops(place)
             text = ", ".join(f"{name.partition('.')[2]}={_short(value)}" for name, value in values.items())
             variants.append(_Variant(method, preset, text, settings, seeds, printed))
     return variants
+
+
+def _require_loops(place: str) -> None:
+    try:
+        require_gtsam()
+    except GavoError as error:
+        raise GavoError(f"{place}: {error}") from None
 
 
 def _runs(part: Part, sequence: FrameSequence, variant: _Variant) -> list[Run]:

@@ -1,6 +1,7 @@
 """An experiment's file: what it comes to, and what is refused."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,17 @@ def test_a_grid(write_experiment, tmp_path):
     assert sorted(len(batch.runs) for batch in batches(plan.runs, 100)) == [1, 1, 6, 6, 6, 6]
     assert max(len(batch.runs) for batch in batches(plan.runs, 4)) == 4
     assert len(fitted_batches(plan.runs, 100, slots=13)) == 14
+
+
+def test_runs_with_loops_are_alone_with_their_maps(write_experiment, monkeypatch):
+    loops = '[[methods]]\nname = "ga"\nsweep.odometry.loops = [true, false]\n'
+    plan = read_plan(write_experiment("seeds = 3", loops))
+    assert [len(batch.runs) for batch in batches(plan.runs, 100)] == [1, 1, 1, 3]
+    assert plan.programs == 1
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(GavoError, match=r"methods\[1\]: loops need GTSAM: pip install") as refused:
+        read_plan(write_experiment("seeds = 3", loops))
+    assert "\n" not in str(refused.value)
 
 
 def test_a_run_is_known_by_what_it_does_not_by_where(write_experiment, tmp_path):

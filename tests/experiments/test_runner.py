@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,14 @@ from gavo_jax import presets
 from gavo_jax.cli import main
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments import tuning
+from gavo_jax.experiments import executors, tuning
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state
 from gavo_jax.experiments.plan import read_plan
 from gavo_jax.experiments.runner import estimate_seconds, missing, run_experiment
 from gavo_jax.experiments.table import COLUMNS, Table
 from gavo_jax.experiments.tuning import measure, read_tuning, tune
+from gavo_jax.odometry.run import OdometryRun, run_odometry
+from gavo_jax.settings import Settings
 from gavo_jax.settings_file import override
 
 METHODS = """
@@ -54,6 +57,24 @@ def test_an_interrupted_command_says_what_is_kept(small, tmp_path, capsys, monke
     monkeypatch.setattr("gavo_jax.cli.experiment.LocalExecutor", Interrupted)
     assert main(["experiment", str(small), "--output", str(tmp_path / "out")]) == 130
     assert "gavo: interrupted: 2 of 4 runs are in" in capsys.readouterr().err
+
+
+def test_a_run_with_loops_is_that_of_run_odometry(write_experiment, tmp_path, monkeypatch):
+    """Here without its map, which takes long to compile: what matters is that it was asked for."""
+    asked, done = [], []
+
+    def run(sequence: Any, settings: Settings, **options: Any) -> OdometryRun:
+        asked.append((settings.odometry.loops, options["seed"]))
+        found = run_odometry(sequence, override(settings, {"odometry.loops": False}), **options)
+        return replace(found, metrics={**found.metrics, "ate_translation_rmse_m": 0.25, "keyframes": 2})  # pyright: ignore
+
+    monkeypatch.setattr(executors, "run_odometry", run)
+    methods = METHODS.partition("printed")[0] + "odometry.loops = true\n"
+    plan = read_plan(write_experiment("seeds = 2", methods, frames=4), tmp_path / "out")
+    assert run_experiment(plan, Table(plan.folder), LocalExecutor(), done.append) == (2, [])
+    assert asked == [(True, 0), (True, 1)] and sum(done) == 6
+    rows = Table(plan.folder).read()
+    assert [(row["pairs"], row["runs_together"], row["ate_translation_rmse_m"]) for row in rows] == [(3, 1, 0.25)] * 2
 
 
 def test_interrupted_and_resumed(small, tmp_path):
