@@ -22,7 +22,7 @@ class AlignmentOptions:
     """What is minimised and where, apart from the solver.
 
     Attributes:
-        loss: ρ of the squared normalised residual (static); see `objective.LOSSES`, or any callable.
+        loss: ρ of the squared normalised residual (static); see `objective.losses.LOSSES`, or any callable.
         depth: Whether the depth residual joins the grey one (static).
         brightness: Whether a gain and a bias between the frames are estimated (static).
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
@@ -34,7 +34,7 @@ class AlignmentOptions:
         features: What finds the features of two images whose motion competes with what the search finds, where `refine`
             is set (static). Of single pairs alone (`align`), not of a sequence's frames.
         robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
-        precondition: Search in the coordinates of `objective.preconditioner` instead of in ξ (static).
+        precondition: Search in the coordinates of `objective.preconditioning.preconditioner` instead of in ξ (static).
         points: Largest number of reference points per level, one per square block of pixels, or an entry per level
             (static); None takes every pixel.
         estimation_points: Largest number of points per view from which brightness, scales and curvature are estimated
@@ -45,7 +45,7 @@ class AlignmentOptions:
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry per
             level.
         doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
-            err by whole surfaces (static); see `objective.depth_trust`.
+            err by whole surfaces (static); see `objective.estimates.depth_trust`.
         last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
             curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
             only evaluated end scattered about the minimum; this centres them. Not where the error is `symmetric`: slope

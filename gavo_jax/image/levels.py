@@ -91,7 +91,7 @@ class Levels:
 
     @property
     def most_points(self) -> int:
-        """Points of the level that has the most, N of `objective.make_references`."""
+        """Points of the level that has the most, N of `objective.points.make_references`."""
         return max(rows * columns for rows, columns in self.grids)
 
     def planes(self, camera: Camera) -> ImagePlane:
