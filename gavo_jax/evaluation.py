@@ -124,7 +124,7 @@ def relative_pose_error(
             (for frames: not a whole number).
     """
     if not np.isfinite(delta) or delta <= 0:
-        raise GavoError(f"relative pose error: delta must be positive, not {delta}")
+        raise GavoError(f"relative pose error: delta must be positive and finite, not {delta}")
     if unit == "s":
         return _relative_pose_error_seconds(estimate, truth, delta)
     if unit == "frames":
@@ -225,8 +225,11 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     if len(estimate) < 2 or len(truth) < 2:
         raise GavoError("relative pose error: estimate and ground truth need at least two poses each")
     end = _closest_index(estimate.timestamps, estimate.timestamps + delta)
-    start = np.flatnonzero(end != len(estimate) - 1)
+    start = np.flatnonzero((end != len(estimate) - 1) & (end != np.arange(len(estimate))))  # a pose is no pair
     end = end[start]
+    apart = float(np.median(np.diff(estimate.timestamps)))
+    if len(start) == 0 and apart > delta:
+        raise GavoError(f"relative pose error: no two poses about {delta:g} s apart: the estimate's are {apart:.3g} s")
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
     far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
     covered = ~far[start] & ~far[end] & (estimate.segments[start] == estimate.segments[end])

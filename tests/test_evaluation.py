@@ -124,6 +124,18 @@ def test_drift_equals_tums_tool_with_gaps_and_ties(rate):
     np.testing.assert_allclose(error.rotation.values, angles, atol=1e-5)
 
 
+@pytest.mark.parametrize("apart", [2.1, 2.5, 30.0])
+def test_poses_that_lie_far_apart_have_no_drift_a_second(apart):
+    """The pose nearest to one second later was the same one: the drift was 0."""
+    truth = smooth_truth(seconds=100)
+    estimate = perturbed(truth, np.arange(1000.2, 1090.0, apart), 3, degree=10)
+    with pytest.raises(GavoError, match=f"no two poses about 1 s apart: the estimate's are {apart:g} s"):
+        relative_pose_error(estimate, truth)
+    joined = np.concatenate([estimate.timestamps, estimate.timestamps[-1] + 0.1 * np.arange(1, 30)])
+    some = relative_pose_error(perturbed(truth, joined, 3, degree=10), truth).translation
+    assert np.all(some.values > 0) and some.timestamps[0] >= estimate.timestamps[-1]
+
+
 def evo_pair(tmp_path, estimate, truth):
     estimate.write_tum(tmp_path / "estimate.txt")
     truth.write_tum(tmp_path / "truth.txt")

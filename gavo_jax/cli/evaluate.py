@@ -21,7 +21,7 @@ from gavo_jax.evaluation import (
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import prepare_folder
-from gavo_jax.output.screen import number, print_table, say, waiting
+from gavo_jax.output.screen import number, print_table, say, tell, waiting
 from gavo_jax.trajectory import Trajectory, associate
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
@@ -56,11 +56,12 @@ def evaluate(options: Evaluate) -> int:
         print(json.dumps({**span, **{name: errors.summary() for name, errors in series.items()}}, indent=2))
     else:
         _print(options, series)
-        for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
-            if unit in UNITS:
-                say(f"{path}: its stamps are taken for {UNITS[unit]}")
-            if is_w_first(one, other):
-                say(f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w")
+    note = tell if options.json else say  # beside the JSON, not in it
+    for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
+        if unit in UNITS:
+            note(f"{path}: its stamps are taken for {UNITS[unit]}")
+        if is_w_first(one, other):
+            note(f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w")
     if options.plot is not None:
         folder = prepare_folder(options.plot)
         with waiting("drawing figures …"):
@@ -103,13 +104,15 @@ def _meet(stamps: np.ndarray, others: np.ndarray) -> bool:
 def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
     """Why the stamps may lead to no error, and what would help."""
     stamps = estimate.timestamps, truth.timestamps
-    if min(map(len, stamps)) == 0:
+    if min(map(len, stamps)) < 2 or not 0 < options.delta < np.inf:
         return ""
     (first, last), (start, end) = ((some.min(), some.max()) for some in stamps)
     if first > end or last < start:
         return f": the estimate goes from {first:.3f} to {last:.3f} s, the truth from {start:.3f} to {end:.3f} s"
     if options.unit == "s" and last - first <= options.delta:
         return f": the estimate lasts {last - first:.2f} s: set --delta, or --unit frames"
+    if options.unit == "s" and np.median(np.diff(np.sort(stamps[0]))) > options.delta:
+        return ": set --delta, or --unit frames"
     return ""
 
 
