@@ -81,7 +81,7 @@ class CameraEstimate:
     """What was found, by name, and the camera with it.
 
     Attributes:
-        found: readout, depth_delay, depth_scale and, on wish, fx, fy, cx and cy.
+        found: readout, depth_delay, depth_scale (of the files) and, on wish, fx, fy, cx and cy.
         camera: of the frames as they were given, with what was determined.
         depth_delay: seconds; what the frames' own stamps say is not counted. 0 where it was not determined.
         pairs: that told.
@@ -172,7 +172,7 @@ def estimate_camera(
     if "depth_scale" in wanted:
         found["depth_scale"] = _depth_scale(sequence)
     if found.keys() == set(wanted):
-        return CameraEstimate(found, _with_found(camera, found), 0.0, 0)
+        return CameraEstimate(found, _with_found(sequence, found), 0.0, 0)
     on_progress("looking for stretches of motion")
     stretches = [Stretch.of(frames, camera) for frames in _stretches(sequence)]
     unknowns = Unknowns.of(camera)
@@ -197,7 +197,7 @@ def estimate_camera(
                 trial.settle()
     found |= _judged(leasts, trial)
     delay = found["depth_delay"].value if "depth_delay" in found else None
-    return CameraEstimate(found, _with_found(camera, found), delay or 0.0, pairs)
+    return CameraEstimate(found, _with_found(sequence, found), delay or 0.0, pairs)
 
 
 def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
@@ -302,10 +302,15 @@ def _depth_scale(sequence: Sequence) -> Found:
     return Found(scale, STEPS_DEVIATION * scale, unit, "steps of depth, as of a first Kinect")
 
 
-def _with_found(camera: Camera, found: dict[str, Found]) -> Camera:
+def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
+    """The camera of the frames; a depth scale is found in units of the files, which frames may not have."""
+    camera, unit = sequence.camera, getattr(sequence, "depth_unit", None)
     names = ("readout", "depth_scale", "fx", "fy", "cx", "cy")
-    values: dict[str, Any] = {name: found[name].value for name in names if name in found}
-    return replace(camera, **{name: value for name, value in values.items() if value is not None})
+    values = {name: found[name].value for name in names if name in found}
+    known: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    if "depth_scale" in known and unit is not None:
+        known["depth_scale"] *= unit.frame / unit.file
+    return replace(camera, **known)
 
 
 def _stretches(sequence: Sequence) -> list[list[Frame]]:

@@ -54,9 +54,7 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     """The cameras as they record, with what was found; a delay that they had already counts on."""
     before = getattr(sequence, "calibration", None) or Calibration(sequence.camera)
     values = {
-        name: getattr(estimate.camera, name)
-        for name, found in estimate.found.items()
-        if name != "depth_delay" and found.value is not None
+        name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
     }
     delay = before.depth_delay + estimate.depth_delay
     return replace(before, color=replace(before.color, **values), depth_delay=delay)

@@ -1,6 +1,7 @@
 """What is found of a small rendered camera, how a least is found, even clocks, and the camera file."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from gavo_jax.camera_files import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.depth_unit import KINECT_STEP
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.se3 import exp
@@ -111,6 +113,36 @@ def test_depth_scale_is_not_made_up():
     found = estimate.found["depth_scale"]
     assert found.value is None and "do not tell" in found.why
     assert estimate.camera.depth_scale == CAMERA.depth_scale
+
+
+class Floats:
+    """A first Kinect's depth in files of floats."""
+
+    name, ground_truth = "floats", None
+
+    def __init__(self, file: float, stated: float):
+        """Files of so many units per metre, stated or taken to be of others; frames have 5000."""
+        self.camera, self.depth_unit = replace(CAMERA, depth_scale=5000.0), DepthUnit(stated, 5000.0)
+        self.calibration = Calibration(replace(CAMERA, depth_scale=stated))
+        steps = np.round(1 / np.linspace(0.8, 4.0, CAMERA.width * CAMERA.height) / KINECT_STEP)
+        self.raw = (file / (steps * KINECT_STEP)).astype(np.float32).reshape(CAMERA.height, CAMERA.width)
+
+    def __len__(self) -> int:
+        return 3
+
+    def raw_depth(self, index: int) -> np.ndarray:
+        return self.raw
+
+
+@pytest.mark.parametrize(("file", "stated", "of_frames"), [(1.0, 1.0, 5000.0), (5000.0, 1000.0, 25000.0)])
+def test_a_depth_scale_is_of_the_file_in_the_file_and_of_the_frames_in_their_camera(
+    file: float, stated: float, of_frames: float
+) -> None:
+    sequence: Any = Floats(file, stated)
+    estimate = estimate_camera(sequence, ("depth_scale",))
+    assert estimate.found["depth_scale"].value == file
+    assert estimate.camera.depth_scale == of_frames
+    assert calibration_of(sequence, estimate).color.depth_scale == file
 
 
 def test_a_least_comes_with_how_sure_it_is():
