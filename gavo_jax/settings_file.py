@@ -200,6 +200,13 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
     return settings
 
 
+def takes_whole(settings: Settings, name: str) -> bool:
+    """Whether a setting, by its dotted name, takes whole numbers."""
+    room, field, *_ = name.split(".")
+    part = getattr(settings, room)
+    return is_whole(getattr(part, field)) or int in alternatives(kind_of(type(part), field))
+
+
 def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
     """Raise GavoError for a name that begins with no part of the settings; a field of that name is of one of them."""
     parts = {room: [field.name for field in dataclasses.fields(getattr(settings, room))] for room in ROOMS}

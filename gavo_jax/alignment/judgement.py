@@ -29,7 +29,8 @@ MIN_CONTRAST = 2.0
 MIN_FINAL_OVERLAP = 0.3
 """Overlap of the result below which a pair is `LOW_OVERLAP`."""
 MIN_EXPLAINED_GREY = 0.45
-"""Share of the grey residuals that must not be large (`objective.explained_share`); below, a pair is `HIGH_ERROR`."""
+"""Share of the grey residuals that must not be large (`objective.estimates.explained_share`); below, a pair is
+`HIGH_ERROR`."""
 MIN_EXPLAINED_DEPTH = 0.9
 """The same of the depth residuals, for a motion of which the images leave a standard deviation above"""
 DOUBTFUL_DEVIATION = 0.005

@@ -1,5 +1,7 @@
 """`gavo tune`: settings of small drift and little time, as a Pareto front."""
 
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"
+TRIAL = re.compile(r"trial-\d+\.toml")
+"""The settings of a trial on the front."""
 
 
 def tune(options: Tune) -> int:
@@ -23,6 +27,8 @@ def tune(options: Tune) -> int:
     trials = tuning.trials if options.trials is None else options.trials
     if trials < 1:
         raise GavoError(f"--trials: must be at least 1, not {trials}")
+    if TRIAL.fullmatch(options.file.name) and options.file.resolve().parent == tuning.folder.resolve():
+        raise GavoError(f"{options.file}: files of that name are written to {tuning.folder}: choose another --output")
     folder = prepare_folder(tuning.folder)
     with hold(folder):
         return _search(tuning, options, trials, folder)
@@ -40,14 +46,13 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     names = list(tuning.space)
     rows = [_row(choice, names) for choice in front]
     print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)
-    for path in folder.glob("trial-*.toml"):
-        remove_files(folder, path.name)
+    remove_files(folder, *(path.name for path in folder.iterdir() if TRIAL.fullmatch(path.name)))
     write_json(folder / FRONT, [choice._asdict() for choice in front])
     for choice in front:
         values = override(presets.preset(tuning.method, tuning.preset), choice.settings)
         save_settings(folder / f"trial-{choice.trial}.toml", values, tuning.method, tuning.preset)
     say(f"front in {folder / FRONT}; to use its settings:")
-    say(f"gavo run --settings {folder}/trial-{front[0].trial}.toml")
+    say(f"gavo run --settings {shlex.quote(str(folder / f'trial-{front[0].trial}.toml'))}")
     return 0
 
 

@@ -1,6 +1,7 @@
 """Settings searched by Optuna for small drift and little time at once."""
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -22,7 +23,7 @@ from gavo_jax.odometry.run import run_odometry
 from gavo_jax.output.files import describe, differences
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
-from gavo_jax.settings_file import flatten, override, refuse_unknown, refuse_unknown_method
+from gavo_jax.settings_file import flatten, override, refuse_unknown, refuse_unknown_method, takes_whole
 
 KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "space")
 RANGE_KEYS = ("low", "high", "step", "log")
@@ -89,6 +90,8 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
         place = f"{path}: space.{key}"
         for bound in _bounds(place, spec):
             override(start, {key: bound}, place)
+        if isinstance(spec, Mapping) and takes_whole(start, key) and not isinstance(spec.get("step", 1), int):
+            raise GavoError(f"{place}: step: must be a whole number, not {shown(spec['step'])}")
     return Tuning(
         name,
         Path(output or text_of(f"{path}: output", table.get("output", f"runs/{name}"))),
@@ -139,7 +142,9 @@ def tune(
             trial = study.ask()
         try:
             with _storage_faults(told):
-                values = {key: _suggest(trial, key, spec) for key, spec in tuning.space.items()}
+                values = {
+                    key: _suggest(trial, key, spec, takes_whole(start, key)) for key, spec in tuning.space.items()
+                }
             settings = override(start, values, f"trial {trial.number}")
             drift, milliseconds = interruptible(partial(measure, sequences, settings, tuning.seeds))
         except BaseException:
@@ -252,10 +257,12 @@ def _bounds(place: str, spec: Any) -> list[Any]:
     return ends
 
 
-def _suggest(trial: Any, key: str, spec: Any) -> Any:
+def _suggest(trial: Any, key: str, spec: Any, whole: bool) -> Any:
     if isinstance(spec, list):
         return trial.suggest_categorical(key, spec)
     low, high, step, log = spec["low"], spec["high"], spec.get("step"), spec.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
+    if step is not None:  # the last value that a step leads to
+        high = low + step * math.floor((high - low) / step + 1e-9)
+    if whole:
         return trial.suggest_int(key, low, high, step=step or 1, log=log)
     return trial.suggest_float(key, low, high, step=step, log=log)

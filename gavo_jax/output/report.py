@@ -67,7 +67,7 @@ def write_report(
         title: its heading.
         tables: in their order.
         figures: in their order; their files are read now.
-        configuration: what it takes to repeat the work, as `results.describe` takes it.
+        configuration: what it takes to repeat the work, as `output.files.describe` takes it.
         versions: of the software behind it, by name.
         introduction: a paragraph below the title.
 

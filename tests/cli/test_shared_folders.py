@@ -155,8 +155,12 @@ def test_a_study_of_something_else_is_not_gone_on_with(gavo, tmp_path, monkeypat
     other = write("t.toml", TUNING.replace('name = "clip"', 'name = "hall"'), **first)
     assert "is of clip, not of hall: give" in gavo("tune", other, "--output", "out").err
     (tmp_path / "out" / "trial-99.toml").write_text("of an earlier front")
-    assert gavo("tune", write("t.toml", TUNING, **first | {"trials": 2}), "--output", "out").status == 0
+    own = write("out/trial-desk.toml", TUNING, **first | {"trials": 2})
+    assert gavo("tune", own, "--output", "out").status == 0
     assert not (tmp_path / "out" / "trial-99.toml").exists()
+    assert (tmp_path / own).exists(), "what the study does not write it does not remove"
+    taken = write("out/trial-1.toml", TUNING, **first)
+    assert "choose another --output" in gavo("tune", taken, "--output", "out").err
 
 
 def tables(study: Path) -> list[str]:

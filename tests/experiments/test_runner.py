@@ -194,6 +194,22 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
     assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
 
 
+def test_the_setting_says_whether_a_range_is_of_whole_numbers(tuned, tmp_path, monkeypatch):
+    """Of a weight from 0 to 1 a study tried 0 and 1."""
+    tried = []
+    monkeypatch.setattr(tuning, "measure", lambda _, settings, seeds: (tried.append(settings.alignment) or 0.1, 1.0))
+    weight = "alignment.depth_weight = { low = 0, high = 1 }"
+    points = "alignment.points = { low = 600, high = 1250, step = 100 }"
+    tuned.write_text(tuned.read_text().replace(TUNED, f"\n[space]\n{weight}\n{points}\n"))
+    tune(read_tuning(tuned), f"sqlite:///{tmp_path / 's.db'}", 8)
+    weights = [one.depth_weight[0] for one in tried]
+    assert any(weight not in (0.0, 1.0) for weight in weights) and len(set(weights)) > 2
+    assert {one.points for one in tried} <= {600, 700, 800, 900, 1000, 1100, 1200}
+    tuned.write_text(tuned.read_text().replace("step = 100", "step = 0.5"))
+    with pytest.raises(GavoError, match="space.alignment.points: step: must be a whole number, not 0.5"):
+        read_tuning(tuned)
+
+
 @pytest.mark.parametrize("truth", [True, False])
 def test_frames_without_a_drift_are_refused_before_a_study_is_made(tuned, tmp_path, truth, capsys, monkeypatch):
     tuned.write_text(tuned.read_text().replace("frames = 34", "frames = 4" if truth else "frames = 34"))
