@@ -27,6 +27,8 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 }
 """optax's optimisers that need nothing but a learning rate."""
+CONFIG_KEYS = ("options", "sequence", *ROOMS, "device", "versions")
+"""Of a run's config.json."""
 MAX_FILE_BYTES = 2**20
 
 
@@ -54,6 +56,9 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
     path = Path(path)
     table = _read_table(path)
     if path.suffix == ".json":
+        if not any(room in table for room in ROOMS):
+            raise GavoError(f"{path}: no settings: a run's config.json holds {', '.join(ROOMS)}")
+        refuse_unknown(str(path), table, CONFIG_KEYS)
         options = table.get("options")
         names = options if isinstance(options, dict) else {}
         table = {key: names[key] for key in ("method", "preset") if key in names} | {

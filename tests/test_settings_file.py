@@ -1,6 +1,7 @@
 """Hyperparameters by name."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,6 +103,21 @@ def test_every_preset_comes_back_from_its_file(method, name, tmp_path):
     config = {"options": {"method": method, "preset": name, "seed": 3}, "device": "cpu", **described}
     (tmp_path / "config.json").write_text(json.dumps(config))
     assert load_settings(tmp_path / "config.json") == (method, name, settings)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({}, "no settings: a run's config.json holds solver, alignment, odometry"),
+        ({"method": "gauss-newton", "preset": "fast", "segments": 1}, "no settings"),
+        ({"alignment": {}, "odometri": {}}, "unknown key 'odometri'; did you mean 'odometry'?"),
+    ],
+)
+def test_json_that_holds_no_settings_is_refused(table, words, tmp_path):
+    """Of a metrics.json nothing was taken, and the default was run without a word."""
+    (tmp_path / "metrics.json").write_text(json.dumps(table))
+    with pytest.raises(GavoError, match=re.escape(words)):
+        load_settings(tmp_path / "metrics.json")
 
 
 def test_a_run_says_what_it_takes_of_an_earlier_one(tmp_path: Path) -> None:

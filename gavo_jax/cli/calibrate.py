@@ -38,6 +38,7 @@ def calibrate(options: Calibrate) -> int:
     with waiting("looking at the frames …"):
         estimate = interruptible(lambda: estimate_camera(sequence, wanted))
     calibration = calibration_of(sequence, estimate)
+    estimate = replace(estimate, found=in_all(estimate.found, calibration.depth_delay))
     write_camera_file(output, calibration, ("found from the images alone by gavo calibrate", *_comments(estimate)))
     if options.json:
         print(json_text(_facts(estimate)))
@@ -60,6 +61,15 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     return replace(before, color=replace(before.color, **values), depth_delay=delay)
 
 
+def in_all(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:
+    """What was found, with the delay that the camera has in all: it is found beyond the one that was known."""
+    beyond = found.get("depth_delay")
+    if beyond is None or beyond.value is None or beyond.value == depth_delay:
+        return found
+    why = f"{beyond.why}; {beyond.value:+.4f} s of it was found now"
+    return found | {"depth_delay": beyond._replace(value=depth_delay, why=why)}
+
+
 def _cells(found: Found) -> tuple[str, str, str]:
     if found.value is None:
         return "not determined", "", ""
@@ -69,7 +79,12 @@ def _cells(found: Found) -> tuple[str, str, str]:
 
 
 def _comments(estimate: CameraEstimate) -> list[str]:
-    return [" ".join((f"{name}:", *filter(None, _cells(f)), f"({f.why})")) for name, f in estimate.found.items()]
+    return [f"{name}: {_in_words(found)} ({found.why})" for name, found in estimate.found.items()]
+
+
+def _in_words(found: Found) -> str:
+    value, deviation, unit = _cells(found)
+    return " ".join(filter(None, (value, deviation and f"± {deviation}", unit)))
 
 
 def _facts(estimate: CameraEstimate) -> dict[str, object]:
