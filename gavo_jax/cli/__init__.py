@@ -28,7 +28,7 @@ from gavo_jax.cli.options import (
 )
 from gavo_jax.cli.usage import fault_of_usage
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError, GavoWarning, printable
+from gavo_jax.errors import GavoError, GavoWarning, printable, shown
 from gavo_jax.version import __version__
 
 BAD_INPUT, BROKEN_PIPE = 2, 141
@@ -36,6 +36,8 @@ BAD_INPUT, BROKEN_PIPE = 2, 141
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""
+BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+"""Errors of a name that no file can have, or that leads in a circle."""
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
@@ -85,6 +87,8 @@ def _run(arguments: list[str]) -> int:
         _silence_output()
         return BROKEN_PIPE
     except OSError as error:
+        if error.errno in BAD_NAMES:
+            return _refuse(f"{shown(str(error.filename or ''))}: {error.strerror}")
         if error.errno not in NO_SPACE:
             raise
         _silence_output()

@@ -30,14 +30,21 @@ from gavo_jax.odometry.metrics import (
 )
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
-from gavo_jax.output.files import environment, prepare_folder, remove_figures, remove_files, write_json
+from gavo_jax.output.files import (
+    COMPARISON,
+    FRAMES,
+    environment,
+    prepare_folder,
+    refuse_foreign,
+    remove_figures,
+    remove_files,
+    write_json,
+)
 from gavo_jax.output.report import REPORT, Picture, Table, write_report
-from gavo_jax.output.screen import known_columns, number, print_table, say, waiting
+from gavo_jax.output.screen import known_columns, number, print_table, say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
-
-COMPARISON = "comparison.json"
 
 COLUMNS = (
     ("m/s", DRIFT, 4),
@@ -87,13 +94,18 @@ def compare(options: Compare) -> int:
     peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):
+        refuse_foreign(folder, FRAMES, "a run")
         if (folder / COMPARISON).exists():
             say(f"the earlier comparison in {folder} is replaced")
         remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
         remove_figures(folder)
         say(summary(sequence))
         entries, status = _run_methods(options, methods, sequence, peers, folder)
-        _write(options, sequence, entries, folder)
+        planned = sum(1 if method in PEERS else options.seeds for method in methods)
+        cut_short = f"interrupted: {len(entries)} of {planned} runs were done" if status == INTERRUPTED else ""
+        _write(options, sequence, entries, folder, cut_short)
+        if cut_short:
+            tell(cut_short)
     say(f"files in {folder}")
     return status
 
@@ -127,8 +139,8 @@ def _run_methods(
     return entries, 0
 
 
-def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: Path) -> None:
-    """Write comparison.json, then print the table, then write figures and report."""
+def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: Path, cut_short: str) -> None:
+    """Write comparison.json, then print the table, then write figures and report; that says if runs are missing."""
     typical = _typical_runs(entries)
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
     title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
@@ -148,7 +160,7 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
         {"options": options, "camera": sequence.camera},
         _versions(entries),
         f"First frame at {sequence.timestamps[0]:.6f} s, last at {sequence.timestamps[-1]:.6f} s; "
-        f"device {entries[0].metrics['device']}.",
+        f"device {entries[0].metrics['device']}." + f" The comparison was {cut_short}." * bool(cut_short),
     )
 
 

@@ -20,7 +20,7 @@ from gavo_jax.evaluation import (
 )
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
-from gavo_jax.output.files import prepare_folder
+from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
 from gavo_jax.output.screen import number, print_table, say, tell, waiting
 from gavo_jax.trajectory import Trajectory, associate
 
@@ -33,8 +33,11 @@ ALIKE = 0.1
 
 def evaluate(options: Evaluate) -> int:
     """Print relative pose error, absolute trajectory error and distance error with their definitions, or as JSON."""
-    if options.plot is not None and not plots.available():
-        raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
+    if options.plot is not None:
+        if not plots.available():
+            raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
+        for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
+            refuse_foreign(options.plot, file, what)
     paths = options.estimate, options.groundtruth
     (estimate, *_), (truth, *_) = read = _read(*paths)
     try:

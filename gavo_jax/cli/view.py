@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, require_camera
 from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -114,9 +114,14 @@ def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:
     entry: Any = run.config.get("sequence")
     try:
         values = {name: value for name, value in entry["camera"].items() if name != "type"}
-        return Camera(**{**values, "distortion": tuple(values["distortion"])})
-    except (AttributeError, KeyError, TypeError) as error:
-        raise GavoError(f"{folder / CONFIG}: does not tell the camera: {error}") from None
+        camera = Camera(**{**values, "distortion": tuple(values["distortion"])})
+    except (AttributeError, KeyError, TypeError):
+        raise GavoError(f"{folder / CONFIG}: does not tell the camera") from None
+    try:
+        require_camera(camera)
+    except GavoError as error:
+        raise GavoError(f"{folder / CONFIG}: {error}") from None
+    return camera
 
 
 def _read(sequence: Sequence | None, index: int) -> Frame | None:

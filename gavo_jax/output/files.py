@@ -28,6 +28,8 @@ ODOMETRY, LOOPS = "odometry.txt", "loops.csv"
 BODIES = "bodies.csv"
 MOTIONS = "motions.csv"
 CHECKPOINT = "checkpoint.npz"
+COMPARISON = "comparison.json"
+"""Of `gavo compare`."""
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""
 VIEW = "view.rrd"
@@ -117,6 +119,21 @@ def prepare_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise GavoError(f"{folder}: output folder cannot be written to: {error.strerror or error}") from None
     return folder
+
+
+def refuse_foreign(folder: Path, file: str, what: str) -> None:
+    """Refuse a folder that holds results of another kind: figures of both have the same names.
+
+    Args:
+        folder: The folder.
+        file: That tells.
+        what: It is of.
+
+    Raises:
+        GavoError: The file is there.
+    """
+    if (folder / file).exists():
+        raise GavoError(f"{folder}: holds {what} ({file}): name another folder")
 
 
 def remove_files(folder: Path, *names: str) -> None:

@@ -22,6 +22,7 @@ from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_c
 from gavo_jax.output.files import (
     BODIES,
     CHECKPOINT,
+    COMPARISON,
     CONFIG,
     FRAMES,
     LOOPS,
@@ -35,6 +36,7 @@ from gavo_jax.output.files import (
     differences,
     prepare_folder,
     read_json,
+    refuse_foreign,
     remove_figures,
     remove_files,
     write_json,
@@ -147,6 +149,7 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
+        refuse_foreign(self.path, COMPARISON, "a comparison")
         growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
         remove_files(self.path, METRICS, CHECKPOINT, CONFIG, LOOPS, RECORDING, VIEW, *growing)
         remove_figures(self.path)

@@ -16,7 +16,7 @@ from small import CAMERA
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
-from gavo_jax.cli import options
+from gavo_jax.cli import compare, options
 from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.cli.usage import COMMANDS
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence, write_tum
@@ -532,6 +532,46 @@ def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
     why = "no output folder of `gavo run`" if fault == "config.json" else "no such file"
     assert is_refused(gavo("view", "out", "--viewer", "save"), fault, why)
     assert not (tmp_path / "out" / "view.rrd").exists()
+
+
+def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch):
+    """It printed its table and `files in`, as if it were whole."""
+    run_method = compare._run_method
+
+    def interrupted(sequence, method, *rest):
+        if method == "opencv-rgb":
+            raise KeyboardInterrupt
+        return run_method(sequence, method, *rest)
+
+    monkeypatch.setattr(compare, "_run_method", interrupted)
+    names = "opencv-rgbd,opencv-rgb,sift-pnp"
+    arguments = ("compare", pristine, "--camera", pristine / "camera.toml", "--frames", 5, "--methods", names)
+    done = gavo(*arguments, "--output", tmp_path / "out")
+    assert done.status == 130 and "interrupted: 1 of 3 runs were done" in done.err
+    assert "interrupted: 1 of 3 runs were done" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_results_of_two_kinds_do_not_share_a_folder(gavo, pristine, tmp_path):
+    """Figures have the same names: a comparison replaced a finished run's, and a run a comparison's."""
+    for name, file in (("run", "frames.csv"), ("both", "comparison.json")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).write_text("")
+    source = (pristine, "--camera", pristine / "camera.toml", "--frames", 5)
+    truth = pristine / "groundtruth.txt"
+    for arguments, word in (
+        (("compare", *source, "--methods", "opencv-rgb", "--output", tmp_path / "run"), "run"),
+        (("evaluate", truth, truth, "--plot", tmp_path / "run"), "run"),
+        (("evaluate", truth, truth, "--plot", tmp_path / "both"), "comparison"),
+        (("run", *source, "--method", "gauss-newton", "--output", tmp_path / "both"), "comparison"),
+    ):
+        assert is_refused(gavo(*arguments), f"holds a {word}", "name another folder")
+
+
+@pytest.mark.parametrize(
+    "arguments", [("view", "a" * 300), ("align", "a" * 300, "b", "c", "d"), ("inspect", "a" * 300)]
+)
+def test_a_name_that_no_file_can_have_is_one_line(gavo, arguments):
+    assert is_refused(gavo(*arguments), "aaaa")
 
 
 @pytest.mark.parametrize("methods", ["nonsense", "", "ga,,pso", "ga,ga"])
