@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.camera_files import load_camera
+from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError, read_toml
@@ -227,9 +229,20 @@ def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
     )
 
 
+@lru_cache(maxsize=64)  # of a sequence there are many runs
 def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
-    """Which frames a sequence has, and by which camera, without where they lie."""
+    """Which frames a sequence has, by which camera, and what is true of them, without where they lie.
+
+    Of the images the first, the middle and the last tell: two recordings may have the same name, stamps and camera.
+    """
     stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
+    images, truth = hashlib.sha256(), sequence.ground_truth
+    for index in sorted({0, len(sequence) // 2, len(sequence) - 1}):
+        try:
+            frame = sequence[index]
+            images.update(np.asarray(frame.grey).tobytes() + np.asarray(frame.depth).tobytes())
+        except FrameError:
+            images.update(b"unreadable")
     return {
         "name": name,
         "frames": len(sequence),
@@ -237,6 +250,8 @@ def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
         "last_timestamp": float(stamps[-1]),
         "timestamps_sha256": hashlib.sha256(stamps.tobytes()).hexdigest(),
         "camera": sequence.camera,
+        "images_sha256": images.hexdigest(),
+        "truth_sha256": None if truth is None else hashlib.sha256(truth.world_T_camera.tobytes()).hexdigest(),
     }
 
 

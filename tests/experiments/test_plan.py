@@ -9,7 +9,7 @@ from small import CAMERA
 
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches, read_plan
+from gavo_jax.experiments.plan import batches, frames_of, read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
 GRID = """
@@ -62,6 +62,15 @@ def test_a_run_is_known_by_what_it_does_not_by_where(write_experiment, tmp_path)
     assert [run.id for run in again.runs] == [run.id for run in first.runs]
     longer = read_plan(write_experiment("seeds = 2", GRID, frames=5))
     assert not {run.id for run in longer.runs} & {run.id for run in first.runs}
+
+
+def test_other_images_or_another_truth_are_another_sequence():
+    """Two recordings of one name, of the same stamps and camera, had one another's results."""
+    one, other = (SyntheticSequence(4, seed=seed, camera=CAMERA) for seed in (0, 1))
+    same = SyntheticSequence(4, seed=0, camera=CAMERA)
+    kinds = [frames_of("room", sequence) for sequence in (one, same, other)]
+    assert kinds[0] == kinds[1] and kinds[0]["timestamps_sha256"] == kinds[2]["timestamps_sha256"]
+    assert kinds[0]["images_sha256"] != kinds[2]["images_sha256"] and frames_of("hall", one) != kinds[0]
 
 
 def test_globs_parts_and_missing_sequences(tmp_path, monkeypatch):
