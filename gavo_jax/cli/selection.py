@@ -8,6 +8,7 @@ from gavo_jax import presets
 from gavo_jax.cli.options import Run, Search, Source
 from gavo_jax.datasets.actors import MOST_BODIES
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError
@@ -29,6 +30,8 @@ def open_sequence(source: Source, force: bool = False, color: bool = False) -> S
     Raises:
         GavoError: what is wrong with the options, the sequence or its camera; fewer than two frames.
     """
+    if is_live(source.sequence):
+        raise GavoError(f"{source.sequence}: a live source, which `gavo run` alone takes")
     _check_at_least("--start", source.start, 0)
     _check_at_least("--stride", source.stride, 1)
     if source.frames is not None:
@@ -73,6 +76,10 @@ def choose_settings(search: Search) -> NamedSettings:
         named = NamedSettings(search.method, search.preset, presets.preset(search.method, search.preset))
     else:
         named = load_settings(search.settings, search.method, search.preset)
+        for name in ("method", "preset"):
+            asked, said = getattr(search, name), getattr(named, name)
+            if asked not in (said, getattr(Search, name)):
+                raise GavoError(f"--{name} {asked}: {search.settings} says {said}: leave one of the two out")
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
 

@@ -534,6 +534,16 @@ def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
     assert not (tmp_path / "out" / "view.rrd").exists()
 
 
+def test_a_method_that_the_settings_contradict_is_told(gavo, pristine, tmp_path):
+    """What the file names counts, and the option was left aside without a word."""
+    (tmp_path / "own.toml").write_text('method = "gauss-newton"\npreset = "fast"\n')
+    source = ("run", pristine, "--camera", pristine / "camera.toml", "--settings", tmp_path / "own.toml")
+    assert is_refused(
+        gavo(*source, "--method", "pso"), "--method pso: ", "says gauss-newton", "leave one of the two out"
+    )
+    assert is_refused(gavo(*source, "--preset", "wide"), "--preset wide: ", "says fast")
+
+
 def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch):
     """It printed its table and `files in`, as if it were whole."""
     run_method = compare._run_method

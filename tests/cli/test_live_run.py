@@ -128,3 +128,11 @@ def test_what_cannot_be_is_one_line(arguments, words, tmp_path, capsys, monkeypa
     done = runner(capsys)("run", *arguments, "--method", "small-newton")
     assert done.status == 2
     assert words in done.err and done.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [("compare", "player"), ("inspect", "player"), ("calibrate", "player")])
+def test_other_commands_say_that_live_frames_are_not_for_them(command, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    register_device("player", Player)
+    done = runner(capsys)(*command)
+    assert done.status == 2 and "player: a live source, which `gavo run` alone takes" in done.err
