@@ -74,6 +74,11 @@ class Fused:
         return self.frames, self.x, left_out
 
 
+def fused(steps: list[Step], trajectory: Trajectory | None = None) -> Any:
+    """What a map is made of: stamps and places of its frames, and what it lacks."""
+    return build_map(WALK, steps, trajectory=trajectory)
+
+
 WALK = SyntheticSequence(8, noise=NONE, camera=CAMERA)
 
 
@@ -95,7 +100,7 @@ def test_a_map_is_made_of_frames_that_can_be_trusted(monkeypatch):
     doubts = (AlignmentStatus.FROZEN, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.NO_DEPTH)
     steps = [stepped(1), *(stepped(2 + i, doubt) for i, doubt in enumerate(doubts)), stepped(5, origin="guessed")]
     steps += [stepped(6, lost=True, origin="guessed"), stepped(7, AlignmentStatus.PARTIAL_DEPTH)]
-    frames, x, left_out = build_map(WALK, steps)
+    frames, x, left_out = fused(steps)
     assert frames == [WALK.timestamps[i] for i in (0, 1, 7)] and x == [0, 1, 7]
     assert left_out == ["3 frames: of doubtful depth", "1 frame: of a pose that was guessed", "1 frame: lost"]
 
@@ -107,15 +112,15 @@ def test_a_map_goes_through_segments_that_loops_have_joined(monkeypatch):
     poses = np.stack([np.eye(4)] * 8)
     poses[:, 0, 3] = 10 * np.arange(8)
     trajectory = Trajectory(WALK.timestamps, poses)
-    assert build_map(WALK, steps)[1] == [0, 1, 2, 3, 4]
-    assert build_map(WALK, steps, trajectory=trajectory)[1] == list(range(0, 80, 10))
+    assert fused(steps)[1] == [0, 1, 2, 3, 4]
+    assert fused(steps, trajectory)[1] == list(range(0, 80, 10))
 
 
 def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
     monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
     steps = [stepped(1, AlignmentStatus.NO_REFERENCE, segment=1, lost=True)]
     steps += [stepped(i, segment=1) for i in (2, 3)]
-    frames, _, left_out = build_map(WALK, steps)
+    frames, _, left_out = fused(steps)
     assert frames == [WALK.timestamps[i] for i in (2, 3)] and left_out == ["2 frames: lost"]
 
 

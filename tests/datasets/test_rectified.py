@@ -56,8 +56,8 @@ def test_a_run_holds_the_sequence_as_it_was_tracked() -> None:
 
 def test_depth_that_is_no_finite_number_is_no_reading() -> None:
     """Infinity is written for "farther than I see"; some of what looks at depth took it for a distance."""
-    depth = np.float32(PLAIN[0].depth)
+    depth = PLAIN[0].depth.astype(np.float32)
     depth[:10], depth[10:20] = np.inf, np.nan
-    plain = rectified(replace(PLAIN[0], depth=depth), CAMERA)
+    plain = rectified(replace(PLAIN[0], depth=depth), CAMERA)  # pyright: ignore[reportArgumentType]
     assert plain.depth.dtype == np.float32 and not plain.depth[:20].any()
     np.testing.assert_array_equal(plain.depth[20:], depth[20:])
