@@ -46,6 +46,8 @@ def judge_by_depth(
 ) -> tuple[Alignment, DepthWatch]:
     """A pair's result, with wrong depth among its findings where that is known, and what is known then.
 
+    A pair whose depth is in doubt by itself says nothing of the run's: it became wrong, and that was told.
+
     Args:
         watch: What was known before.
         frame: The target.
@@ -54,6 +56,8 @@ def judge_by_depth(
         result: Of the pair.
         camera: Of both.
     """
+    if AlignmentStatus.DEPTH_MISMATCH in result.statuses:
+        return result, watch
     change = watch.change.after(_without(frame, bodies), elapsed, result.target_T_reference, camera)
     watch = watch._replace(change=change)
     watch = watch._replace(told=watch.is_wrong)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small import CAMERA, Rendered, StandIn
 
-from gavo_jax.alignment.result import no_alignment
+from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.bodies.records import Seen
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
@@ -94,6 +94,25 @@ def test_depth_that_was_never_right_is_told_of_every_pair(
     before = MIN_REMEMBERED - 1 + silent
     assert flagged(steps) == [False] * before + [True] * (FRAMES - 1 - before)
     assert all(flagged(revised(steps))) and all(flagged(revised(revised(steps))))
+
+
+def test_depth_that_became_wrong_and_was_told_says_nothing_of_the_run() -> None:
+    """Ten frames of doubled depth had all pairs of a run flagged, those before and those after them too."""
+
+    class Doubting(Knowing):
+        def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+            attempt = super().align(state, frame, clock)
+            if frame.timestamp not in doubled:
+                return attempt
+            return attempt._replace(result=with_finding(attempt.result, AlignmentStatus.DEPTH_MISMATCH), fit=False)
+
+    frames = list(room()[0])
+    frames[4:14] = [replace(frame, depth=2 * frame.depth) for frame in frames[4:14]]
+    doubled = {frame.timestamp for frame in frames[4:14]}
+    odometry = Odometry(CAMERA, aligner=Doubting())
+    steps = [step for frame in frames if (step := odometry.register(frame, frame.timestamp)) is not None]
+    told = [step.index for step, is_flagged in zip(steps, flagged(revised(steps)), strict=True) if is_flagged]
+    assert told == list(range(4, 14))
 
 
 def test_depth_of_another_moment_is_right_where_its_stamp_says_so() -> None:
