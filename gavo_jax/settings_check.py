@@ -123,7 +123,7 @@ def _is_number(value: Any, whole: bool) -> bool:
     """Whether a value is one number that the device can hold; what is being traced has no value yet."""
     if isinstance(value, Tracer):
         return not whole
-    if isinstance(value, bool | np.bool_) or np.ndim(value) != 0:
+    if isinstance(value, bool | np.bool_ | list | tuple | dict) or np.ndim(value) != 0:
         return False
     kind = getattr(np.asarray(value).dtype, "kind", "")
     return kind in ("iu" if whole else "iuf") and bool(abs(value) <= (MAX_WHOLE if whole else MAX_REAL))

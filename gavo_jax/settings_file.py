@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+import jax
+import numpy as np
 import optax
 import tomli_w
 
@@ -136,7 +138,9 @@ def _as_toml(place: str, value: Any) -> Any:
     if value is None:
         return "none"
     if isinstance(value, tuple):
-        return list(value)
+        return [_as_toml(place, entry) for entry in value]
+    if isinstance(value, np.generic | jax.Array):
+        return np.asarray(value).item()
     if callable(value):
         name = name_of(value)
         if name is None:
@@ -193,7 +197,7 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
             raise GavoError(f"{place}: {room}: not a table of settings")
         part = getattr(settings, room)
         field, _, level = rest.partition(".")
-        refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part)])
+        refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part) if f.repr])
         current = getattr(part, field)
         where = f"{place}: {name}"
         if level:

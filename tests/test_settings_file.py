@@ -4,7 +4,10 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 import optax
 import pytest
 
@@ -14,6 +17,7 @@ from gavo_jax.cli.selection import settings_line
 from gavo_jax.errors import GavoError
 from gavo_jax.objective.losses import huber
 from gavo_jax.output.files import describe
+from gavo_jax.settings import Settings
 from gavo_jax.settings_file import assignments, flatten, load_settings, override, save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.solvers.genetic import GeneticAlgorithm
@@ -78,6 +82,8 @@ def test_values_of_every_kind():
         ("odometry.keyframe_overlap", -0.1, ["keyframe_overlap", "at least 0"]),
         ("odometry.on_lost", "panic", ["on_lost", "hold, predict, stop"]),
         ("odometry.prior", 1, ["prior", "true or false"]),
+        ("solver.mutants", [[1], [1, 2]], ["mutants", "must be a number"]),
+        ("solver.population.4", [1], ["population", "whole number"]),
     ],
 )
 def test_what_is_refused(name, value, words):
@@ -188,3 +194,11 @@ def test_assignments_are_toml_or_words():
     for wrong in ("alignment.points", "=3", "a="):
         with pytest.raises(GavoError, match="NAME=VALUE"):
             assignments([wrong])
+
+
+def test_numbers_of_arrays_are_written_as_numbers(tmp_path):
+    numbers: dict[str, Any] = {"mutants": np.float32(0.25), "patience": np.int64(5), "spread": (jnp.float32(0.5),) * 5}
+    solver = GeneticAlgorithm(**numbers)
+    save_settings(tmp_path / "s.toml", Settings(solver))
+    again = load_settings(tmp_path / "s.toml").settings.solver
+    assert again == GeneticAlgorithm(mutants=0.25, patience=5, spread=(0.5,) * 5)

@@ -10,6 +10,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.images import without_invalid
 from gavo_jax.errors import GavoError
 from gavo_jax.image.numbers import as_array
 
@@ -85,6 +86,7 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
         raw = depth * np.float32(camera.depth_scale)
         raw = np.where(np.isfinite(raw) & (raw > 0) & (raw < 65535), raw, np.float32(0))
         depth = raw if camera.depth_scale < LEAST_UNITS else (raw + np.float32(0.5)).astype(np.uint16)
+    depth = without_invalid(depth)
     image, depth = camera.undistort(np.ascontiguousarray(image), np.ascontiguousarray(depth))
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     rgb = None

@@ -84,12 +84,25 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
             raise FrameError(
                 f"{name}: a film ({message.format[:40]!r}), of which one image needs others: record JPEG or PNG"
             )
-        return decode_color(bytes(message.data), name)
+        image = decode_color(bytes(message.data), name)
+        taken = message.format.partition(";")[0].strip()
+        if not taken.startswith("bayer_") or taken not in LAYOUTS:
+            return image
+        return _converted(np.ascontiguousarray(image[..., 0]), taken, name)  # the mosaic is compressed as it is
     pixels = _pixels(message, name)
-    conversion = LAYOUTS[message.encoding][2]
     if pixels.dtype.kind == "f":
         raise FrameError(f"{name}: encoding {message.encoding} is no colour")
-    return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+    return _converted(pixels, message.encoding, name)
+
+
+def _converted(pixels: np.ndarray, encoding: str, name: str) -> np.ndarray:
+    """Pixels as they stand in a message as BGR."""
+    conversion = LAYOUTS[encoding][2]
+    try:
+        return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+    except cv2.error:
+        size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise FrameError(f"{name}: {size} pixels cannot be of encoding {encoding}") from None
 
 
 def depth_of(kind: str, message: Any, name: str) -> np.ndarray:

@@ -35,7 +35,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
     Raises:
         GavoError: no JSON, or a pose that is none.
     """
-    frames = [(at, frame) for at, frame in enumerate(_frames(path)) if "transform_matrix" in frame]
+    frames = [(at, frame) for at, frame in enumerate(_frames(path)) if frame.get("transform_matrix") is not None]
     if any(key in frame for _, frame in frames for key in WITHOUT_SCALE):
         return None, [f"{path.name}: its poses are of structure from motion, whose unit is open"]
     poses: dict[float, np.ndarray] = {}

@@ -42,6 +42,8 @@ class Rectified:
         self._recorded = recorded
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # a copy asks for some before it has anything
+            raise AttributeError(name)
         return getattr(self._recorded, name)
 
     @property

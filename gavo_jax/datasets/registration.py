@@ -22,6 +22,10 @@ NEVER = np.uint16(65535)
 """Deeper than any reading."""
 
 
+TO_THE_END = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
+"""Of the inversion of a lens: by its usual five iterations rays of a wide view are off by pixels."""
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Moves depth images to the colour camera; where surfaces hide each other, the nearest is seen.
@@ -103,8 +107,10 @@ class Registration:
         camera = self.depth
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         pixels, distortion = np.stack([u.ravel(), v.ravel()], -1)[:, None], np.array(camera.distortion)
-        undistort = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
-        ends = undistort(pixels, camera.matrix, distortion)[:, 0]
+        if camera.model == "fisheye":
+            ends = cv2.fisheye.undistortPoints(pixels, camera.matrix, distortion)[:, 0]
+        else:
+            ends = cv2.undistortPoints(pixels, camera.matrix, distortion, criteria=TO_THE_END)[:, 0]
         rays = np.concatenate([ends, np.ones((len(ends), 1))], axis=1)
         return (self.color_T_depth[:3, :3] @ rays.T).astype(np.float32)
 

@@ -417,7 +417,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     folder left half written is not taken for a sequence.
 
     Raises:
-        GavoError: the folder holds a sequence already, or something cannot be written.
+        GavoError: the folder holds a sequence already, something cannot be written, or images are not of 8 and 16 bits.
         FrameError: a frame of the sequence cannot be read.
     """
     folder = Path(folder)
@@ -426,17 +426,22 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        stamps, rows = [], []
+        stamps, depth_stamps, rows = [], [], []
         bodies = getattr(sequence, "bodies_truth", ())
         if bodies:
             (folder / MASKS).mkdir(exist_ok=True)
         for index, frame in enumerate(sequence):
-            stamps.append(np.format_float_positional(frame.timestamp, unique=True, min_digits=6))
+            for name, pixels in (("grey", frame.grey), ("depth", frame.depth)):
+                if pixels.dtype != (np.uint8 if name == "grey" else np.uint16):
+                    raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
+            delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
+            for written, stamp in ((stamps, frame.timestamp), (depth_stamps, delayed)):
+                written.append(np.format_float_positional(stamp, unique=True, min_digits=6))
             image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
             if frame.color is not None:
                 image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
             _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
-            _write_png(folder / "depth" / f"{stamps[-1]}.png", frame.depth)
+            _write_png(folder / "depth" / f"{depth_stamps[-1]}.png", frame.depth)
             if bodies:
                 rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamps[-1], folder)
         (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
@@ -444,8 +449,8 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
             sequence.ground_truth.write_tum(folder / "groundtruth.txt")
         if bodies:
             write_truth(rows, folder)
-        for part in ("depth", "rgb"):
-            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in stamps)]
+        for part, own in (("depth", depth_stamps), ("rgb", stamps)):
+            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in own)]
             (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     except OSError as error:
         raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
@@ -460,5 +465,5 @@ def _camera_toml(camera: Camera) -> str:
     lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
     lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
     lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
-    lines += [f"readout = {float(camera.readout)!r}"]
+    lines += [f"readout = {float(camera.readout)!r}", f'model = "{camera.model}"']
     return "\n".join(lines) + "\n"

@@ -186,10 +186,10 @@ def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row
         color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
     else:
         color, depth = _read_pairs(root, both)
-    stamps = [row.stamp for row in color], [row.stamp for row in depth]
-    if rate and not _are_whole(*stamps):
+    are_whole = all(WHOLE.fullmatch(row.written) for row in (*color, *depth))
+    if rate and not are_whole:
         raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
-    unit = _unit(*stamps, rate)
+    unit = _unit([row.stamp for row in color], rate) if are_whole else 1.0
     for row in (*color, *depth):
         if not abs(unit * row.stamp) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
@@ -197,15 +197,13 @@ def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row
     return color, depth, unit
 
 
-def _unit(color: list[float], depth: list[float], rate: float | None) -> float:
-    """Seconds of what stamps count: one, or of whole numbers what they seem to; numbers of frames go by the rate."""
-    if not _are_whole(color, depth):
-        return 1.0
+WHOLE = re.compile(r"-?\d+")
+"""A stamp that counts something; 2.000000 is in seconds."""
+
+
+def _unit(color: list[float], rate: float | None) -> float:
+    """Seconds of what whole numbers seem to count; numbers of frames go by the rate."""
     return 1 / rate if rate else unit_of(color) or 1 / INDEX_RATE
-
-
-def _are_whole(*lists: list[float]) -> bool:
-    return all(stamp == round(stamp) for stamps in lists for stamp in stamps)
 
 
 def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:

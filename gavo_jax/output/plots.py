@@ -96,7 +96,12 @@ def plot_distance_error(errors: Mapping[str, ErrorSeries], ours: Collection[str]
     for (name, series), style in zip(errors.items(), _styles(errors, ours), strict=True):
         seconds = series.timestamps - series.timestamps[0] + stamps[0]
         axes.plot(
-            seconds, scale * series.values, label=name, clip_on=False, **style, markevery=_marks(len(series.values))
+            seconds,
+            scale * series.values,
+            label=_words(name),
+            clip_on=False,
+            **style,
+            markevery=_marks(len(series.values)),
         )
     axes.set(xlabel="time (s)", ylabel=f"distance error ({unit})", ylim=(0, None))
     axes.margins(x=0)
@@ -135,7 +140,7 @@ def plot_trajectories(
         if true_path is not None:
             axes.plot(*(scale * UPWARDS * true_path).T[[i, j]], **TRUTH_STYLE)
         for (name, path), style in zip(paths.items(), _styles(paths, ours), strict=True):
-            axes.plot(*(scale * UPWARDS * path).T[[i, j]], label=name, **style, markevery=_marks(len(path)))
+            axes.plot(*(scale * UPWARDS * path).T[[i, j]], label=_words(name), **style, markevery=_marks(len(path)))
         axes.scatter([0], [0], marker="s", color="black", s=30, zorder=3)
         axes.annotate("start", (0, 0), (0, -14), bbox=HALO, textcoords="offset points", ha="center", fontsize="small")
         middle = scale * (low + high)[[i, j]] / 2
@@ -214,7 +219,15 @@ def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> 
         rmse = np.sqrt(np.where(np.isfinite(error), error, np.nan))
         iterations = np.arange(1, len(rmse) + 1)
         _draw_band(axes, iterations, rmse.T, "median", "middle 80 %")
-        axes.plot(iterations, np.nanmin(rmse, axis=1), color=COLORS[1], linestyle="--", marker="s", label="best")
+        best = np.min(np.where(np.isnan(rmse), np.inf, rmse), axis=1)
+        axes.plot(
+            iterations,
+            np.where(np.isfinite(best), best, np.nan),
+            color=COLORS[1],
+            linestyle="--",
+            marker="s",
+            label="best",
+        )
         axes.set_title(f"level {level}, {error.shape[1]} candidates", fontsize="medium")
         axes.set(xlabel="iteration")
     figure.axes[0].set_ylabel("√E (grey levels)")
@@ -266,7 +279,7 @@ def plot_basin(
     order = np.argsort(motion)
     for (name, rates), style in zip(success.items(), _styles(success, ours), strict=True):
         tried = [i for i in order if np.isfinite(rates[i])]
-        axes.plot(motion[tried], rates[tried], label=name, **style)
+        axes.plot(motion[tried], rates[tried], label=_words(name), **style)
     axes.set(xlabel="median rotation of the pairs (deg)", ylabel="share of pairs found", title=title)
     axes.set(ylim=(-0.03, 1.03), xlim=(0, 1.02 * float(np.max(motion))))
     axes.grid(alpha=0.3)
@@ -397,7 +410,7 @@ def _label_ends(axes: Any) -> None:
     places = dict(zip(curves, _apart(wanted, LABEL_HEIGHT, (0.0, 1.0)).tolist(), strict=True))
     for line, place in places.items():
         axes.annotate(
-            _words(line.get_label()),
+            line.get_label(),
             (1.0, place),
             (1.06, place),
             xycoords="axes fraction",
@@ -464,7 +477,9 @@ def _panels(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
 
 
 def _draw_band(axes: Any, x: Any, samples: Float[np.ndarray, "samples n"], middle: str, range_: str) -> None:
-    """Draw the median of samples with the range of their middle 80 %."""
+    """Draw the median of samples with the range of their middle 80 %, where there is any."""
+    if not np.isfinite(samples).any():
+        return
     low, median, high = np.nanquantile(samples, [0.1, 0.5, 0.9], axis=0)
     axes.plot(x, median, color=COLORS[0], marker="o", markersize=3, label=middle)
     axes.fill_between(x, low, high, facecolor=COLORS[5], alpha=0.35, edgecolor=COLORS[0], linewidth=0.5, label=range_)

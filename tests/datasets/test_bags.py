@@ -617,6 +617,19 @@ def test_every_encoding_of_colour_becomes_bgr(encoding):
     assert np.abs(found[2:-2, 2:-2].astype(int) - expected[2:-2, 2:-2]).max() <= 2
 
 
+def test_a_mosaic_that_was_compressed_as_it_is_becomes_bgr():
+    """It was taken for grey: a chequerboard."""
+    blue, green, red = 30, 90, 200
+    tile = np.array([[green, red], [blue, green]], np.uint8)
+    data = cv2.imencode(".png", np.tile(tile, (4, 6)))[1].tobytes()
+    for words in ("bayer_grbg8; png compressed ", "bayer_grbg8; jpeg compressed "):
+        found = color_of(COMPRESSED, SimpleNamespace(format=words, data=data), "x")
+        assert np.abs(found[2:-2, 2:-2].astype(int) - (blue, green, red)).max() <= 2
+    plain = cv2.imencode(".png", PLAIN)[1].tobytes()
+    for words in ("bgr8; png compressed bgr8", "png", ""):
+        np.testing.assert_array_equal(color_of(COMPRESSED, SimpleNamespace(format=words, data=plain), "x"), PLAIN)
+
+
 def test_rows_may_be_padded_and_numbers_of_either_end():
     depth = np.arange(96, dtype=np.uint16).reshape(8, 12) * 300
     wide = np.zeros((8, 20), np.uint16)
@@ -641,6 +654,7 @@ def test_rows_may_be_padded_and_numbers_of_either_end():
         (color_of, IMAGE, message(np.zeros((12, 12), np.uint8), "nv12", height=9)),
         (color_of, IMAGE, message(np.zeros((12, 12), np.uint8), "nv12", height=10)),
         (color_of, IMAGE, message(np.zeros((4, 4), np.float32), "32FC1")),
+        (color_of, IMAGE, message(np.zeros((8, 11, 2), np.uint8), "yuv422")),
         (depth_of, IMAGE, message(PLAIN, "bgr8")),
         (color_of, COMPRESSED, SimpleNamespace(format="jpeg", data=b"\xff\xd8\xff")),
         (depth_of, COMPRESSED, SimpleNamespace(format="16UC1; compressedDepth rvl", data=bytes(40))),

@@ -1,5 +1,6 @@
 """Sequences of one's own whose camera has lens distortion."""
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -44,6 +45,7 @@ def test_frames_come_without_distortion_whoever_takes_them() -> None:
         np.testing.assert_array_equal(frame.depth, expected.depth)
         np.testing.assert_array_equal(frame.color, expected.color)
     assert without_distortion(PLAIN) is PLAIN
+    assert copy.copy(sequence).name == "raw"
 
 
 def test_a_run_holds_the_sequence_as_it_was_tracked() -> None:

@@ -358,6 +358,37 @@ def test_a_written_folder_reads_back_identically(tmp_path, color: bool):
     )
 
 
+class Kinect:
+    """Frames whose depth is read out later, of a camera with another lens."""
+
+    name, ground_truth = "kinect", None
+    camera = replace(SMALL, distortion=(0.05, -0.01, 0.002, 0.0), model="fisheye")
+
+    def __init__(self, depth: type = np.uint16) -> None:
+        self.depth = depth
+
+    def __iter__(self):
+        for frame in SyntheticSequence(frames=2, camera=SMALL):
+            late = frame.timestamp + 0.015
+            yield replace(frame, depth=frame.depth.astype(self.depth), depth_timestamp=late)
+
+
+def test_stamps_of_depth_and_the_lens_come_back(tmp_path):
+    write_tum(Kinect(), tmp_path / "k")  # pyright: ignore[reportArgumentType]
+    back = TumSequence(tmp_path / "k", camera=str(tmp_path / "k" / "camera.toml"), undistort=False)
+    assert back.camera == Kinect.camera
+    assert [frame.depth_delay for frame in back] == pytest.approx([0.015] * 2)
+    with pytest.raises(GavoError, match="depth of float32 does not come back from PNG"):
+        write_tum(Kinect(np.float32), tmp_path / "f")  # pyright: ignore[reportArgumentType]
+
+
+def test_stamps_of_a_frame_a_second_are_seconds(tmp_path):
+    """Their decimals are zeros: they were taken for numbers of frames."""
+    write_tum(SyntheticSequence(frames=3, rate=1.0, camera=SMALL), tmp_path / "slow")
+    back = TumSequence(tmp_path / "slow", camera=str(tmp_path / "slow" / "camera.toml"))
+    assert back.timestamps.tolist() == [0.0, 1.0, 2.0]
+
+
 def test_writing_over_a_sequence_or_a_file_is_refused(tmp_path):
     sequence = SyntheticSequence(frames=1, camera=SMALL)
     write_tum(sequence, tmp_path / "room")

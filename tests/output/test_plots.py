@@ -212,6 +212,22 @@ def test_population_shows_best_median_and_spread_of_what_was_searched():
     assert labels(figure) == ["median", "middle 80 %", "best"]
 
 
+@pytest.mark.filterwarnings("error")
+def test_searches_that_leave_nothing_to_draw_are_drawn_without_it():
+    """A level of one iteration ended a finished run in a traceback."""
+    plots.plot_convergence({4: np.array([[4.0]]), 3: np.array([[9.0, 2.0]])})
+    plots.plot_population({4: np.full((2, 3), np.nan), 3: np.full((2, 3), np.inf)})
+
+
+def test_names_are_no_formulas(tmp_path):
+    estimates = {"run$a_$": straight(1.0), "price$1$x": straight(2.0)}
+    figure = plots.plot_trajectories(estimates, None)
+    plots.save(figure, tmp_path, "trajectory")
+    errors = {name: distance_error(estimate, straight(1.0)) for name, estimate in estimates.items()}
+    plots.save(plots.plot_distance_error(errors), tmp_path, "errors")
+    assert [line.get_label() for line in figure.axes[0].get_lines()] == [r"run\$a_\$", r"price\$1\$x"]
+
+
 def test_landscape_leaves_gaps_where_a_motion_is_worthless():
     errors = {4: np.array([[np.inf, 4.0, 9.0], [1.0, 4.0, np.inf]])}
     worst, best = plots.plot_landscape(Landscape(np.array([-0.1, 0.0, 0.1]), np.eye(6)[:2], errors)).axes
