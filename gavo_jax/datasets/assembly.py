@@ -1,7 +1,8 @@
 """From decoded images to a `Frame`: intensities to 8 bits, depth to the frame's units and to the colour camera."""
 
+import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,13 +15,16 @@ from gavo_jax.camera_files import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.images import NO_READING, to_8_bits, white_of, without_invalid
 from gavo_jax.datasets.registration import Registration
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 
 FINE, COARSE = 5000.0, 1000.0
 """Units per metre of frames whose files hold floats: the finer as long as it reaches far enough."""
 
 FARTHEST_FINE = 12.0
 """Metres: where the farthest readings lie beyond, 16 bits of the finer unit do not hold them."""
+
+MUCH = 0.02
+"""Share of an image that may lie beyond its scale without a word."""
 
 METRES, MILLIMETRES = 1.0, 1000.0
 
@@ -105,6 +109,7 @@ class FrameAssembler:
     white: int = 255
     color: bool = False
     undistort: bool = True
+    _told: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @cached_property
     def recorded(self) -> Camera:
@@ -141,6 +146,8 @@ class FrameAssembler:
             stamped = timestamp if depth_timestamp is None else depth_timestamp
             depth_timestamp = stamped + self.calibration.depth_delay
         _check_size(bgr, camera, name, "camera")
+        if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MUCH:
+            self._tell_once("is brighter", name, f"what exceeds {self.white} is white, in others too")
         image = to_8_bits(bgr, self.white)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if self.color else None
@@ -153,11 +160,24 @@ class FrameAssembler:
         camera = self.calibration.depth
         if camera is None:
             _check_registered(depth, self.recorded)
-            raw = in_frame_units(depth.raw, self.unit)
+            raw = self._in_frame_units(depth)
             return self.recorded.undistort_depth(raw) if self.undistort else raw
         _check_size(depth.raw, camera, depth.name, "depth camera")
-        moved = self._registration(in_frame_units(depth.raw, self.unit), self.unit.frame)
+        moved = self._registration(self._in_frame_units(depth), self.unit.frame)
         return np.where(self._with_grey, moved, np.uint16(0)) if self.undistort else moved
+
+    def _in_frame_units(self, depth: DepthImage) -> UInt16[np.ndarray, "h w"]:
+        farthest = NO_READING / self.unit.frame
+        is_far = np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)
+        if depth.raw.dtype != np.uint16 and np.mean(is_far) > MUCH:
+            self._tell_once("reaches further", depth.name, f"depth beyond {farthest:.3g} m is left out, of others too")
+        return in_frame_units(depth.raw, self.unit)
+
+    def _tell_once(self, what: str, name: str, so: str) -> None:
+        """Warn of the first image that is not as those were by which the whole source is scaled."""
+        if what not in self._told:
+            self._told.add(what)
+            warnings.warn(f"{name}: {what} than the images that were looked at first: {so}", GavoWarning, stacklevel=4)
 
     @cached_property
     def _registration(self) -> Registration:

@@ -19,7 +19,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
 from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid
 from gavo_jax.datasets.quiet import without_words_on
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 PORTRAIT = Camera(50.0, 50.0, 23.5, 31.5, 48, 64)
@@ -119,6 +119,22 @@ def test_sixteen_bits_are_scaled_alike_in_all_frames_of_a_sequence(tmp_path, dep
         np.testing.assert_array_equal(whole.grey, part.grey)
     assert np.abs(sequence[1].grey - GREY.astype(float) * 3 / 16).max() <= 1
     assert [white_of(image) for image in (images[0], GREY.astype(np.uint16))] == [4095, 255]
+
+
+def test_images_beyond_the_scale_of_those_that_were_looked_at_first_are_told_once(tmp_path):
+    """Depth of a street behind a door was left out, and a bright room white, without a word."""
+    files = [write(tmp_path / f"{i}.png", GREY.astype(np.uint16) * (16 if i == 1 else 1)) for i in range(5)]
+    depths = [write(tmp_path / f"{i}.npy", METRES * np.float32(4 if i == 1 else 1)) for i in range(5)]
+    sequence = FileSequence(
+        "far", [Entry(float(i), *both) for i, both in enumerate(zip(files, depths, strict=True))], Calibration(CAMERA)
+    )
+    with pytest.warns(GavoWarning) as told:
+        frame = sequence[1]
+    words = [str(warning.message) for warning in told]
+    assert len(words) == 2 and all("1." in line for line in words)
+    assert "what exceeds 255 is white" in words[0] and "depth beyond 13.1 m is left out" in words[1]
+    assert not frame.depth[METRES * 4 > 13.2].any()
+    _ = sequence[1], sequence[2]
 
 
 @pytest.mark.parametrize("ending", [".png", ".tiff", ".npy", ".pgm"])
