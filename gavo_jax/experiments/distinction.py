@@ -14,7 +14,7 @@ Row = Mapping[str, Any]
 
 FRAMES, SETTINGS = ("sequence",), ("method", "preset", "settings")
 """Parts of a row's configuration: which frames it is of, and what is done with them by any seed."""
-TOLD_BY_OTHERS = ("first_timestamp", "last_timestamp", "timestamps_sha256")
+TOLD_BY_OTHERS = ("first_timestamp", "last_timestamp", "timestamps_sha256", "images_sha256", "truth_sha256")
 """Differ where the frames do, and say little."""
 MOST_SHOWN = 3
 

@@ -30,8 +30,8 @@ def tables_of(place: str, value: Any) -> list[dict[str, Any]]:
 
 
 def text_of(place: str, value: Any) -> str:
-    """Return a text that is not empty and can be shown, or raise GavoError."""
-    if not isinstance(value, str) or not value or not value.isprintable():
+    """Return a text that is not empty and can be a name, or raise GavoError."""
+    if not isinstance(value, str) or not value or "\0" in value:
         raise GavoError(f"{place}: must be text, not {shown(value)}")
     return value
 

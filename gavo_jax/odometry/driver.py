@@ -328,7 +328,7 @@ class Odometry:
                 held=0,
                 way=Way(),
             )
-        elif not attempt.unknown:
+        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # whose place is a rough one
             since = frame.timestamp - before.reference_timestamp
             after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False
