@@ -14,7 +14,8 @@ Row = Mapping[str, Any]
 
 FRAMES, SETTINGS = ("sequence",), ("method", "preset", "settings")
 """Parts of a row's configuration: which frames it is of, and what is done with them by any seed."""
-TOLD_BY_OTHERS = ("first_timestamp", "last_timestamp", "timestamps_sha256", "images_sha256", "truth_sha256")
+DIGESTS = {"timestamps_sha256": "stamps", "images_sha256": "images", "truth_sha256": "truth"}
+TOLD_BY_OTHERS = ("first_timestamp", "last_timestamp", *DIGESTS)
 """Differ where the frames do, and say little."""
 MOST_SHOWN = 3
 
@@ -60,6 +61,7 @@ def _names(entries: Sequence[tuple[str, str, dict[str, Any]]]) -> dict[str, str]
 
 def _what_differs(first: dict[str, Any], other: dict[str, Any]) -> str:
     found = {name.partition(".")[2] or name: after for name, _, after in differences(first, other)}
-    telling = {name: value for name, value in found.items() if name not in TOLD_BY_OTHERS} or {"stamps": "other"}
+    what = next((word for name, word in DIGESTS.items() if name in found), "stamps")
+    telling = {name: value for name, value in found.items() if name not in TOLD_BY_OTHERS} or {what: "other"}
     words = [f"{name}={value}" for name, value in list(telling.items())[:MOST_SHOWN]]
     return ", ".join([*words, "…"] if len(telling) > MOST_SHOWN else words)
