@@ -213,7 +213,11 @@ def takes_whole(settings: Settings, name: str) -> bool:
     """Whether a setting, by its dotted name, takes whole numbers."""
     room, field, *_ = name.split(".")
     part = getattr(settings, room)
-    return is_whole(getattr(part, field)) or int in alternatives(kind_of(type(part), field))
+    return _takes_whole(type(part), field, getattr(part, field))
+
+
+def _takes_whole(owner: type, field: str, current: Any) -> bool:
+    return is_whole(current) or int in alternatives(kind_of(owner, field))
 
 
 def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
@@ -260,7 +264,7 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
         return None
     if callable(current):
         return _callable(where, field, value)
-    whole = is_whole(current) or int in kinds
+    whole = _takes_whole(owner, field, current)
     if isinstance(value, list):
         return tuple(_plain(entry, whole) for entry in value)
     if isinstance(current, tuple) and not whole:

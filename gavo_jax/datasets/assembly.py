@@ -167,10 +167,11 @@ class FrameAssembler:
         return np.where(self._with_grey, moved, np.uint16(0)) if self.undistort else moved
 
     def _in_frame_units(self, depth: DepthImage) -> UInt16[np.ndarray, "h w"]:
-        farthest = NO_READING / self.unit.frame
-        is_far = np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)
-        if depth.raw.dtype != np.uint16 and np.mean(is_far) > MUCH:
-            self._tell_once("reaches further", depth.name, f"depth beyond {farthest:.3g} m is left out, of others too")
+        if depth.raw.dtype != np.uint16:
+            farthest = NO_READING / self.unit.frame
+            if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MUCH:
+                so = f"depth beyond {farthest:.3g} m is left out, of others too"
+                self._tell_once("reaches further", depth.name, so)
         return in_frame_units(depth.raw, self.unit)
 
     def _tell_once(self, what: str, name: str, so: str) -> None:
