@@ -24,7 +24,7 @@ from gavo_jax.camera_files import Calibration, Size, camera_from_table
 from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
-from gavo_jax.datasets.files import SAMPLED, Reading
+from gavo_jax.datasets.files import Reading, places_of_a_few
 from gavo_jax.datasets.messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -237,7 +237,7 @@ class _Shared:
     def assembler(self) -> FrameAssembler:
         sequence, reading = self._sequence, self._reading
         colors, depths = [], []
-        for at in range(min(SAMPLED, len(sequence))):
+        for at in places_of_a_few(len(sequence)):
             with contextlib.suppress(FrameError):
                 bgr, depth, _ = sequence._decoded(at)
                 colors.append(bgr)

@@ -96,7 +96,7 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
     """The unit, per metre, that depth is probably counted in, if that is not `scale`; None where nothing speaks for it.
 
     Args:
-        sample: of the first frames.
+        sample: of a few frames.
         scale: units per metre as the camera says.
         camera: of the images.
         is_kinect: whether the camera is known to be one of those.

@@ -279,7 +279,7 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
     """
     fault: FrameError | None = None
     sizes: Counter[Size] = Counter()
-    for at in _samples(len(entries)):
+    for at in places_of_a_few(len(entries)):
         try:
             height, width = read_color(entries[at].color).shape[:2]
             sizes[width, height] += 1
@@ -290,8 +290,8 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
     return sizes.most_common(1)[0][0]
 
 
-def _samples(count: int) -> list[int]:
-    """Places of a few frames, from the first to the last."""
+def places_of_a_few(count: int) -> list[int]:
+    """Numbers of a few frames of a sequence, from the first to the last: by them its images are scaled."""
     return sorted({round(share * (count - 1)) for share in np.linspace(0, 1, SAMPLED)}) if count else []
 
 
@@ -327,7 +327,7 @@ class _Images:
     @cached_property
     def assembler(self) -> FrameAssembler:
         colors, depths = [], []
-        for at in _samples(len(self._entries)):
+        for at in places_of_a_few(len(self._entries)):
             entry = self._entries[at]
             try:
                 colors.append(read_color(entry.color))
