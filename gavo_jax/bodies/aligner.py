@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Integer
 
 from gavo_jax.alignment.judgement import UNKNOWN
+from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.evidence import inverse_depth_of
@@ -323,10 +324,7 @@ def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
 
 def mistrusted(attempt: Attempt) -> Attempt:
     """The attempt with the word that its motion may be a body's."""
-    result = attempt.result
-    findings = int(result.findings) | bit(AlignmentStatus.MOVING_BODY)
-    status = AlignmentStatus.MOVING_BODY if result.status == AlignmentStatus.OK else result.status
-    return attempt._replace(result=result._replace(status=status, findings=findings))
+    return attempt._replace(result=with_finding(attempt.result, AlignmentStatus.MOVING_BODY))
 
 
 def deviation(attempt: Attempt) -> float:

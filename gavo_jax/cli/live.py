@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from gavo_jax.camera_files import load_camera
@@ -16,15 +15,13 @@ from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.devices import open_device
-from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
+from gavo_jax.datasets.live import LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
-from gavo_jax.odometry.hindsight import revised
-from gavo_jax.odometry.metrics import compute_metrics
-from gavo_jax.odometry.run import trajectory_of
-from gavo_jax.output.files import RECORDING, TRAJECTORY, environment
+from gavo_jax.odometry.run import conclude
+from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
@@ -62,13 +59,11 @@ def run_live(options: Run) -> int:
         seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
         if odometry.progress.last_index < 1:
             raise GavoError(f"{device.name}: ended after {newest.received} frames: at least two are needed")
-        steps = revised(folder.steps())
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
+        first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
             **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed, "complete": True},
-            **compute_metrics(
-                trajectory_of(float(trajectory.timestamps[0]), steps), None, steps, seconds, compile_seconds
-            ),
+            **conclude(first, folder.steps(), None, None, seconds, compile_seconds).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
@@ -99,7 +94,14 @@ def _track(
         for images in newest:
             frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
             if count == 0:
-                folder.start(_config(options, newest.device, camera, settings), frame.timestamp)
+                folder.start(
+                    {
+                        "options": options,
+                        "sequence": {"name": newest.device.name, "frames": None, "camera": camera},
+                        **circumstances(settings),
+                    },
+                    frame.timestamp,
+                )
                 viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
                 start = time.perf_counter()
             step = odometry.register(frame, frame.timestamp)
@@ -132,16 +134,3 @@ def _refuse_what_cannot_be(options: Run) -> None:
             raise GavoError(f"{option}: {NOT_LIVE.format(options.sequence)}")
     if options.frames is not None and options.frames < 2:
         raise GavoError(f"--frames: must be at least 2, not {options.frames}")
-
-
-def _config(options: Run, device: LiveDevice, camera: Any, settings: Settings) -> dict[str, Any]:
-    """What config.json says."""
-    return {
-        "options": options,
-        "sequence": {"name": device.name, "frames": None, "camera": camera},
-        "solver": settings.solver,
-        "alignment": settings.alignment,
-        "odometry": settings.odometry,
-        "device": jax.devices()[0].device_kind,
-        "versions": environment(),
-    }

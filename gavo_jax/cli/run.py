@@ -5,8 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from gavo_jax.cli.map_file import check_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
@@ -26,21 +24,17 @@ from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
-from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.hindsight import revised
-from gavo_jax.odometry.metrics import COMPILE_SECONDS, FRAMES_PER_SECOND, compute_metrics, errors_before
-from gavo_jax.odometry.run import guessed, trajectory_of
+from gavo_jax.odometry.run import conclude
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, environment
+from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
-from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
@@ -78,7 +72,18 @@ def run(options: Run) -> int:
             record=viewer.wants_populations,
             relocaliser=mapper,
         )
-        config = _config(options, settings, sequence)
+        config = {
+            "options": with_whole_paths(options),
+            "sequence": {
+                "name": sequence.name,
+                "frames": len(sequence),
+                "first_timestamp": float(sequence.timestamps[0]),
+                "last_timestamp": float(sequence.timestamps[-1]),
+                "camera": sequence.camera,
+                **({"bodies": options.moving} if options.moving else {}),
+            },
+            **circumstances(settings),
+        }
         blank = blank_of(odometry.aligner)
         progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
@@ -142,57 +147,36 @@ def _track(
     tracked = track_visibly(name, sequence, odometry, on_step, viewer, mapper)
     if tracked.interrupted:
         folder.save_checkpoint()
-    steps = revised(folder.steps())
-    causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    speed, of_loops = tracked.metrics[FRAMES_PER_SECOND], {}
-    if mapper is not None:
-        start = time.perf_counter()
-        loops = interruptible(mapper.finish)
-        trajectory = correct(causal, loops, guessed(steps))
-        tracked_seconds = (len(tracked.steps) + 1) / speed if speed else 0.0
-        speed = (len(tracked.steps) + 1) / (tracked_seconds + time.perf_counter() - start)
-        trajectory.write_tum(folder.path / TRAJECTORY)
-        write_loops(folder.path, loops)
-        viewer.conclude(trajectory, loops)
-        before = compute_metrics(causal, sequence.ground_truth, steps, 0.0, 0.0)
-        of_loops = {**errors_before(before), **loop_figures(loops)}
+    outcome = interruptible(
+        lambda: conclude(
+            float(sequence.timestamps[0]),
+            folder.steps(),
+            sequence.ground_truth,
+            mapper,
+            tracked.seconds,
+            tracked.compile_seconds,
+            len(tracked.steps) + 1,
+        )
+    )
+    if outcome.loops is not None:
+        outcome.trajectory.write_tum(folder.path / TRAJECTORY)
+        write_loops(folder.path, outcome.loops)
+        viewer.conclude(outcome.trajectory, outcome.loops)
     metrics = {
         "sequence": sequence.name,
         "method": options.method,
         "preset": options.preset,
         "seed": options.seed,
-        "complete": len(steps) == len(sequence) - 1,
+        "complete": len(outcome.steps) == len(sequence) - 1,
         "left_out": left_out(sequence),
-        **compute_metrics(trajectory, sequence.ground_truth, steps, 0.0, tracked.metrics[COMPILE_SECONDS]),
-        FRAMES_PER_SECOND: speed,
-        **of_loops,
+        **outcome.figures,
     }
     folder.finish(metrics, complete=not tracked.interrupted)
 
     def draw_figures() -> None:
-        draw(folder.path, {options.method: trajectory}, sequence.ground_truth)
+        draw(folder.path, {options.method: outcome.trajectory}, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, tracked.steps)
 
     with waiting("drawing figures …"):
         interruptible(draw_figures)
     return metrics, tracked.interrupted
-
-
-def _config(options: Run, settings: Settings, sequence: Sequence) -> dict[str, Any]:
-    """Return what config.json says: enough to repeat the run, from any folder, and to know what it did."""
-    return {
-        "options": with_whole_paths(options),
-        "sequence": {
-            "name": sequence.name,
-            "frames": len(sequence),
-            "first_timestamp": float(sequence.timestamps[0]),
-            "last_timestamp": float(sequence.timestamps[-1]),
-            "camera": sequence.camera,
-            **({"bodies": options.moving} if options.moving else {}),
-        },
-        "solver": settings.solver,
-        "alignment": settings.alignment,
-        "odometry": settings.odometry,
-        "device": jax.devices()[0].device_kind,
-        "versions": environment(),
-    }

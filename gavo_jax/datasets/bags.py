@@ -222,7 +222,7 @@ class BagSequence:
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
-        is_rectified = bool(RECTIFIED.search(self._topics[0].name))
+        is_rectified = _is_rectified(self._topics[0].name)
         found = reading.calibration(own, self._size, MILLIMETRES, is_rectified)  # units of 16UC1, by REP 118
         return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
 
@@ -400,15 +400,16 @@ class _Bag:
         moved = None if other is None else self._camera(*other, depth)
         if other is None or moved is None:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
-        frames, are_alike = (info.header.frame_id, other[1].header.frame_id), _is_same(moved, camera)
-        one = Calibration(camera, origin=name, states_depth_scale=False)
+        frames = (info.header.frame_id, other[1].header.frame_id)
         says_so = _is_named(depth, DEPTH_NAMES)
-        if are_alike and (frames[0] == frames[1] or not all(frames) or says_so):
-            return one
+        is_one_place = frames[0] == frames[1] or not all(frames) or says_so
         are_placed = any(frames) or says_so  # two that have no name are not for that one frame
         color_T_depth = between(self._transforms(), *frames) if are_placed else None
-        if are_alike and color_T_depth is not None and np.allclose(color_T_depth, np.eye(4)):
-            return one
+        if _is_same(moved, camera):
+            color_T_depth = np.eye(4) if is_one_place else color_T_depth
+            has_one_lens = moved.distortion == camera.distortion or _is_rectified(color) == _is_rectified(depth)
+            if has_one_lens and color_T_depth is not None and np.allclose(color_T_depth, np.eye(4)):
+                return Calibration(camera, origin=name, states_depth_scale=False)
         if color_T_depth is None:
             raise GavoError(
                 f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie: "
@@ -455,7 +456,7 @@ class _Bag:
         if not is_calibrated(info):
             raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
         with blamed(place):
-            return camera_from_table(place, camera_table(info, bool(RECTIFIED.search(topic))), MILLIMETRES)
+            return camera_from_table(place, camera_table(info, _is_rectified(topic)), MILLIMETRES)
 
 
 class _File(io.BufferedReader):
@@ -517,6 +518,11 @@ def _is_same(a: Camera, b: Camera) -> bool:
     """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
     numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
     return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))
+
+
+def _is_rectified(topic: str) -> bool:
+    """Whether a topic's name says that its images are free of distortion."""
+    return bool(RECTIFIED.search(topic))
 
 
 def _is_named(topic: str, words: tuple[str, ...]) -> bool:

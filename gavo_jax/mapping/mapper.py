@@ -21,7 +21,7 @@ from gavo_jax.trajectory import inverse
 
 STEP_FLOOR = 5e-4
 """Metres and radians that a step of the odometry is off by beside what its covariance says."""
-UNKNOWN = 1.0
+UNTIED = 1.0
 """Metres and radians that stand for a motion of which nothing is known."""
 GROWTH = 1.25
 """Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
@@ -219,7 +219,7 @@ class Mapper:
         keyframes = self.keyframes.all
         edges = []
         for a, b in zip(keyframes, keyframes[1:], strict=False):
-            covariance = UNKNOWN**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
+            covariance = UNTIED**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
 

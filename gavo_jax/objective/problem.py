@@ -16,7 +16,7 @@ from gavo_jax.objective.derivatives import (
     weighted_terms,
 )
 from gavo_jax.objective.error import Objective, Residuals, both_directions
-from gavo_jax.se3 import adjoint, exp, log, right_jacobian, rigid_inverse
+from gavo_jax.se3 import adjoint, exp, right_jacobian, rigid_inverse
 
 
 @jax.tree_util.register_dataclass
@@ -45,10 +45,6 @@ class Problem:
     def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
         """target_T_reference of search coordinates."""
         return self.origin @ exp(x @ self.basis.T)
-
-    def coordinates(self, target_T_reference: Float[Array, "4 4"]) -> Float[Array, " 6"]:
-        """Search coordinates of a motion, the inverse of `transform`."""
-        return jnp.linalg.solve(self.basis, log(rigid_inverse(self.origin) @ target_T_reference))
 
     def score(
         self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -18,7 +18,7 @@ from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
-from gavo_jax.odometry.metrics import Metrics, RunMetrics, compute_metrics, errors_before
+from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before
 from gavo_jax.odometry.stream import track, unwatched
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
@@ -110,29 +110,70 @@ def run_odometry(
         steps.append(step)
         if on_step is not None:
             on_step(step)
-    steps = revised(steps)
-    causal = trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    loops = mapper.finish() if mapper else None
-    if loops is not None:
-        trajectory = correct(causal, loops, guessed(steps))
     seconds = time.perf_counter() - start
-
-    def figures(of: Trajectory) -> Metrics:
-        return compute_metrics(of, sequence.ground_truth, steps, seconds, compile_seconds)
-
+    outcome = conclude(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)
-    metrics: RunMetrics = {
+    metrics: Any = {
         "sequence": sequence.name,
         "method": method,
         "preset": preset,
         "seed": seed,
         "complete": len(steps) == len(sequence) - 1,
-        **figures(trajectory),
+        **outcome.figures,
     }
+    return OdometryRun(outcome.trajectory, outcome.steps, metrics, sequence, outcome.odometry, outcome.loops)
+
+
+class Outcome(NamedTuple):
+    """What a run comes to."""
+
+    trajectory: Trajectory
+    steps: list[Step]
+    """As later frames have shown them to be."""
+    figures: dict[str, Any]
+    """As metrics.json names them: `Metrics`, and with loops the errors before them and what the map holds."""
+    odometry: Trajectory | None = None
+    """With loops: the trajectory before they corrected it."""
+    loops: Loops | None = None
+
+
+def conclude(
+    first_timestamp: float,
+    steps: list[Step],
+    ground_truth: Trajectory | None,
+    mapper: BackgroundMapper | None,
+    seconds: float,
+    compile_seconds: float,
+    frames: int | None = None,
+) -> Outcome:
+    """Look back on a run whose last frame was tracked: hindsight, then loops, then figures.
+
+    Args:
+        first_timestamp: Of the first frame, seconds.
+        steps: Of the run, as they came.
+        ground_truth: The truth, or None.
+        mapper: What kept the run's map: it is finished here.
+        seconds: Wall time of the tracking, decoding included.
+        compile_seconds: Time of the compilation.
+        frames: How many were tracked in that time, where it was not all: the run was resumed.
+    """
+    start = time.perf_counter()
+    steps = revised(steps)
+    causal = trajectory = trajectory_of(first_timestamp, steps)
+    loops = mapper.finish() if mapper else None
+    if loops is not None:
+        trajectory = correct(causal, loops, guessed(steps))
+    seconds += time.perf_counter() - start
+    if frames is not None:
+        seconds *= (len(steps) + 1) / frames  # as if all had been tracked at this speed
+
+    def figures(of: Trajectory) -> dict[str, Any]:
+        return {**compute_metrics(of, ground_truth, steps, seconds, compile_seconds)}
+
     if loops is None:
-        return OdometryRun(trajectory, steps, metrics, sequence)
-    metrics.update(errors_before(figures(causal)) | loop_figures(loops))  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return OdometryRun(trajectory, steps, metrics, sequence, causal, loops)
+        return Outcome(trajectory, steps, figures(trajectory))
+    of_loops = {**errors_before(figures(causal)), **loop_figures(loops)}
+    return Outcome(trajectory, steps, figures(trajectory) | of_loops, causal, loops)
 
 
 def guessed(steps: list[Step]) -> Bool[np.ndarray, " poses"]:

@@ -18,6 +18,7 @@ import numpy as np
 from gavo_jax.errors import PARTIAL, GavoError, read_text
 from gavo_jax.output.plots import CAPTIONS as FIGURES
 from gavo_jax.output.plots import FORMATS as FIGURE_FORMATS
+from gavo_jax.settings import Settings
 from gavo_jax.settings_file import name_of
 from gavo_jax.trajectory import write_lines
 from gavo_jax.version import __version__
@@ -61,6 +62,17 @@ def environment() -> dict[str, str]:
         "opencv": cv2.__version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
+    }
+
+
+def circumstances(settings: Settings) -> dict[str, Any]:
+    """Return what config.json says beside the sequence and the options: what decides a result."""
+    return {
+        "solver": settings.solver,
+        "alignment": settings.alignment,
+        "odometry": settings.odometry,
+        "device": jax.devices()[0].device_kind,
+        "versions": environment(),
     }
 
 

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from gavo_jax.errors import printable
 
-UNKNOWN = "–"
+DASH = "–"
 """A cell for what is not known."""
 
 
@@ -94,7 +94,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
 
 def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], list[list[Any]]]:
     """A table without the columns of which nothing is known in any row: those of dashes alone."""
-    kept = [i for i in range(len(columns)) if not rows or any(row[i] != UNKNOWN for row in rows)]
+    kept = [i for i in range(len(columns)) if not rows or any(row[i] != DASH for row in rows)]
     return [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
@@ -139,4 +139,4 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str
 
 def number(value: float | None, digits: int = 4) -> str:
     """Return a number of fixed decimals, or a dash for what is not known."""
-    return UNKNOWN if value is None else f"{value:.{digits}f}"
+    return DASH if value is None else f"{value:.{digits}f}"

@@ -2,15 +2,13 @@
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.hindsight import revised
-from gavo_jax.odometry.metrics import Metrics, compute_metrics
-from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.run import conclude
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import pair_progress, tell
 from gavo_jax.trajectory import Trajectory
@@ -22,8 +20,12 @@ class Tracked(NamedTuple):
 
     trajectory: Trajectory
     steps: list[Step]
-    metrics: Metrics
+    metrics: dict[str, Any]
+    """As `Metrics` names them."""
     interrupted: bool
+    seconds: float
+    """Wall time after compilation, decoding included."""
+    compile_seconds: float
 
 
 def track_visibly(
@@ -66,7 +68,6 @@ def track_visibly(
         seconds = time.perf_counter() - start
     if interrupted:
         tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
-    steps = revised(steps)
-    trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    metrics = compute_metrics(trajectory, sequence.ground_truth, steps, seconds, compile_seconds)
-    return Tracked(trajectory, steps, metrics, interrupted)
+    first, truth = float(sequence.timestamps[0]), sequence.ground_truth
+    outcome = conclude(first, steps, truth, None, seconds, compile_seconds)
+    return Tracked(outcome.trajectory, outcome.steps, outcome.figures, interrupted, seconds, compile_seconds)

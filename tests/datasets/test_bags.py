@@ -680,3 +680,24 @@ def test_a_file_of_ros_1_is_closed_however_it_is_let_go(bags, monkeypatch):
         gc.collect()  # which holds itself
     assert not [one for one in caught if issubclass(one.category, ResourceWarning)]
     assert before is None or set(os.listdir("/proc/self/fd")) <= before
+
+
+@pytest.mark.parametrize(("color", "depth"), [("image_raw", "image_rect"), ("image_rect", "image_raw")])
+@pytest.mark.parametrize("frame", ["camera", ""])
+def test_one_camera_whose_lens_is_out_of_one_image_alone(tmp_path, color, depth, frame):
+    """The depth of its driver is as the sensor saw it, and image_proc rectifies one of the two."""
+    recorder = Recorder(tmp_path / "half", "mcap")
+    for stamp in (1.0, 1.1):
+        for place, name, pixels, kind in (
+            ("rgb", color, BGRS[0], "bgr8"),
+            ("depth_registered", depth, MILLIMETRES[0], "16UC1"),
+        ):
+            recorder.info(f"/camera/{place}/camera_info", stamp, LENS, frame=frame)
+            recorder.image(f"/camera/{place}/{name}", stamp, pixels, kind, frame=frame)
+    recorder.close()
+    sequence = open_source(tmp_path / "half")
+    assert isinstance(sequence, BagSequence)
+    calibration = sequence.calibration
+    assert calibration.depth is not None and calibration.color_T_depth is not None
+    assert calibration.color.is_distorted != calibration.depth.is_distorted
+    np.testing.assert_array_equal(calibration.color_T_depth, np.eye(4))

@@ -579,7 +579,7 @@ def test_hessian_predicts_the_gradient_of_a_good_match() -> None:
         assert np.all(np.abs(found - still.hessian[i]) < 0.1 * size[i] * size)
 
 
-def test_coordinates_undo_transform() -> None:
+def test_transform_goes_from_the_origin_along_the_basis() -> None:
     rng = np.random.default_rng(0)
     origin = oracle.expm(rng.normal(0, 0.3, 6)).astype(np.float32)
     basis = rng.normal(0, 0.1, (6, 6)).astype(np.float32)
@@ -587,7 +587,6 @@ def test_coordinates_undo_transform() -> None:
     x = rng.normal(0, 1, 6).astype(np.float32)
     motion = problem.transform(jnp.asarray(x))
     np.testing.assert_allclose(motion, origin @ oracle.expm(basis @ x), atol=1e-5)
-    np.testing.assert_allclose(problem.coordinates(motion), x, atol=1e-3)
     np.testing.assert_allclose(problem.transform(jnp.stack([jnp.asarray(x)] * 2))[1], motion, atol=1e-6)
 
 
