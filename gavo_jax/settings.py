@@ -33,7 +33,8 @@ class AlignmentOptions:
             solver stops where islands no longer compete. See `alignment.contest`.
         features: What finds the features of two images whose motion competes with what the search finds, where `refine`
             is set (static). Of single pairs alone (`align`), not of a sequence's frames.
-        robust_scale: Whether the losses' scales come from the data; without it σ = 1, the paper's error (static).
+        robust_scale: Whether the losses' scales come from the data; without it σ = 1 and depth has no say: the paper's
+            error (static).
         precondition: Search in the coordinates of `objective.preconditioning.preconditioner` instead of in ξ (static).
         points: Largest number of reference points per level, one per square block of pixels, or an entry per level
             (static); None takes every pixel.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.alignment.evidence import Evidence as Chosen
 from gavo_jax.alignment.evidence import Held, is_held
@@ -14,7 +14,7 @@ from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying, unswayed
-from gavo_jax.alignment.visits import Level, Search
+from gavo_jax.alignment.visits import Level, Search, reach_of
 from gavo_jax.frame_checks import MIN_DEPTH_SHARE
 from gavo_jax.objective.derivatives import Linearization, weighted_terms
 from gavo_jax.objective.error import Objective, Residuals
@@ -40,6 +40,8 @@ MIN_EVIDENCE, MIN_SEEN_EVIDENCE = 0.7, 1.8
 """Evidence, of all readings and of those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
 MAX_RIVAL = 1.1
 """Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
+AT_THE_EDGE = 0.98
+"""Share of the search's reach beyond which a pair is `HIGH_ERROR`: a better motion may lie outside."""
 MAX_DEPARTURE = 1e-4
 """Largest entry of RᵀR − I; rounding alone leaves a hundredth of it. Beyond, a pair is `NOT_RIGID`."""
 SHARED_ERRORS = 9.0
@@ -56,18 +58,22 @@ def conclude(
     centre: Float[Array, "4 4"],
     judge: Objective | None = None,
     swaying: Swaying | None = None,
+    share: Float[Array, ""] | float = 1.0,
 ) -> Alignment:
-    """From what the search, held about a centre, ended with to the result: estimate, refine, judge."""
+    """From what the search, held about a centre, ended with to the result: estimate, refine, judge. Points of a share
+    of the image take part.
+    """
     found = search.islands[0]
     residuals = objective.residuals(found)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
-    reach = jnp.stack([search.box[0], search.box[3]])
+    points = finest.points * finest.views  # arrays may be longer
+    reach = reach_of(options)
     problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
     added = jnp.zeros((6, 6))
     if options.last_step and not options.symmetric:
-        problem, residuals, added = _last_step(problem, residuals, swaying)
+        problem, residuals, added = _last_step(problem, residuals, swaying, points)
         objective = problem.objective
     motion = problem.origin
     evidence = _examine(problem, residuals)
@@ -79,7 +85,11 @@ def conclude(
     if held is not None:
         determined = evidence.information.determined | held.held
         evidence = evidence._replace(information=evidence.information._replace(determined=determined))
-    findings = as_findings(find_against(evidence, covariance, objective, search.rival, chosen_by))
+    against = find_against(evidence, covariance, objective, search.rival, share * points, chosen_by)
+    if options.precondition:
+        edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
+        against[AlignmentStatus.HIGH_ERROR] |= edge.is_out_of_reach(motion)
+    findings = as_findings(against)
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
         motion,
@@ -97,7 +107,7 @@ def conclude(
 
 
 def _last_step(
-    problem: Problem, residuals: Residuals, swaying: Swaying | None
+    problem: Problem, residuals: Residuals, swaying: Swaying | None, points: Integer[Array, ""]
 ) -> tuple[Problem, Residuals, Float[Array, "6 6"]]:
     """The problem about a refined motion, under a rolling shutter with the target's sway; its residuals; and what not
     knowing the sway adds to the covariance.
@@ -111,7 +121,7 @@ def _last_step(
         found = without_sway()
         return replace(problem, origin=found.motion), found.residuals, found.covariance
     rolls = problem.objective.readout != 0.0
-    found = jax.lax.cond(rolls, lambda: refine_swaying(problem, residuals, swaying), without_sway)
+    found = jax.lax.cond(rolls, lambda: refine_swaying(problem, residuals, swaying, points), without_sway)
     return replace(problem.with_sway(found.twist), origin=found.motion), found.residuals, found.covariance
 
 
@@ -190,9 +200,12 @@ def find_against(
     covariance: Float[Array, "6 6"],
     objective: Objective,
     rival: Float[Array, ""],
+    points: Float[Array, ""],
     chosen_by: Chosen | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
-    """All that can be said against a motion, by its status; docs/status.md gives the reasons."""
+    """All that can be said against a motion, for which so many points were asked, by its status; docs/status.md gives
+    the reasons.
+    """
     motion, model, explained = evidence.motion, evidence.model, evidence.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
@@ -209,7 +222,7 @@ def find_against(
         AlignmentStatus.HIGH_ERROR: unexplained,
         AlignmentStatus.LOW_OVERLAP: model.overlap < MIN_FINAL_OVERLAP,
         AlignmentStatus.NOT_FINITE: ~finite,
-        AlignmentStatus.NO_DEPTH: jnp.mean(has_reading) < MIN_DEPTH_SHARE,
+        AlignmentStatus.NO_DEPTH: jnp.sum(has_reading) < MIN_DEPTH_SHARE * points,
         AlignmentStatus.NOT_RIGID: departure_from_rigid(motion) > MAX_DEPARTURE,
     }
 

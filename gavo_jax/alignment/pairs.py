@@ -360,7 +360,7 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         GavoError: They are none, too small, or not of the camera's size.
     """
     require_camera(camera)
-    is_stacked = isinstance(side, tuple) and len(side) == 2 and np.ndim(side[0]) == 3
+    is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
     if not len(side[0] if is_stacked else side):
         raise GavoError("a batch of no frames: at least one pair is needed")
     if is_stacked:

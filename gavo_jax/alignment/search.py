@@ -28,6 +28,7 @@ from gavo_jax.alignment.visits import (
     comparable_objective,
     fit_objective,
     level_objective,
+    reach_of,
     stack_levels,
     unchanged_brightness,
     visited_levels,
@@ -91,6 +92,7 @@ def align_views(
     readout: Float[Array, ""] | None = None,
     hypotheses: Float[Array, "h 4 4"] | None = None,
     swaying: Swaying | None = None,
+    share: Float[Array, ""] | float = 1.0,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -113,6 +115,7 @@ def align_views(
             there is none.
         swaying: Under a rolling shutter what is known of the target's own velocity, which is then refined with the
             motion at the end; None where it is taken for the mean since the anchor.
+        share: Of the image, whose points take part: less where those of bodies are left out.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
@@ -121,7 +124,7 @@ def align_views(
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
     searched = visited_levels(levels.numbers, options)
     keys = jax.random.split(key, (len(searched) + 1, max(options.islands)))
-    box = jnp.repeat(jnp.stack([jnp.float32(half) for half in options.bounds]), 3)
+    box = jnp.repeat(reach_of(options), 3)
     places = np.array([levels.numbers.index(number) for number in searched])
     rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
     frames = Frames(target, options, exchanged)
@@ -163,7 +166,7 @@ def align_views(
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
     objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, centre, judge, swaying), populations
+    return conclude(objective, search, finest, options, history, centre, judge, swaying, share), populations
 
 
 class Frames(NamedTuple):
@@ -275,7 +278,7 @@ def _search_island(
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
     """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
-        problem = replace(problem, origin=origin, reach=jnp.stack([box[0], box[3]]), searched=inhabited)
+        problem = replace(problem, origin=origin, reach=reach_of(options), searched=inhabited)
         reach = jnp.abs(unconditioner(problem.basis)) @ box
         bounds = Bounds(-reach, reach)
         guess = jnp.zeros((1, 6))

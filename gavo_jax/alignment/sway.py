@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Integer
 
 from gavo_jax.image.shutter import row_time
 from gavo_jax.objective.derivatives import weighted_terms
@@ -105,7 +105,7 @@ class At(NamedTuple):
     hessian: Float[Array, "12 12"]
 
 
-def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> Swayed:
+def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying, points: Integer[Array, ""]) -> Swayed:
     """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
     best; the origin without sway where E would rise.
 
@@ -116,7 +116,7 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying) -> 
     assert readout is not None, "only a rolling shutter shows a sway"
     known = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
     prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # of the sway, and of the sum
-    share = problem.objective.readings() / problem.objective.reference.points.q.size
+    share = problem.objective.readings() / points
     factor = share**2 / (problem.objective.scales.grey**2 * DEPENDENT)
 
     def step_on(_: int, at: At) -> At:

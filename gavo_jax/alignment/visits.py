@@ -110,6 +110,11 @@ def stack_levels(
     )
 
 
+def reach_of(options: AlignmentOptions) -> Float[Array, " 2"]:
+    """How far from its centre a search is held on every level: metres and radians."""
+    return jnp.stack([jnp.float32(half) for half in options.bounds])
+
+
 def visited_levels(numbers: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
     """The levels that a solver searches, coarsest first; with `refine` those on which islands compete."""
     competing = tuple(number for number in numbers if options.islands[number] > 1)

@@ -277,10 +277,10 @@ class BodyAware:
         both, weighted by their covariances.
         """
         found = np.asarray(attempt.result.target_T_reference)
-        onward = log(self.predict(state, float(clock.elapsed)) @ inverse(found))
+        onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))
         covariance, prior = np.float64(attempt.result.covariance), np.diag(np.repeat(np.square(GOES_ON), 3))
         share = covariance @ np.linalg.inv(covariance + prior)
-        motion = exp(share @ onward) @ found
+        motion = found @ exp(share @ onward)
         return _moved(state, attempt, motion, share @ prior)
 
     def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:

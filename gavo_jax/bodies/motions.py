@@ -16,6 +16,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.points import Reference, unsettle_reference
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.status import AlignmentStatus
 
 if TYPE_CHECKING:
     from gavo_jax.bodies.aligner import BodyAware
@@ -52,8 +53,8 @@ def find_motions(
         alignment = None
         if aware.tracks and np.any(before.labels == number):
             alignment = _align(aware, state, frame, clock, before, int(number))
-            if np.all(np.isfinite(alignment.xi)):
-                roll.motions[place], roll.seconds[place] = alignment.xi, clock.elapsed
+            is_known = alignment.status == AlignmentStatus.OK
+            roll.motions[place], roll.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
         centroid = _centroid(part, inverse_depth, aware.retina)
         seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))

@@ -24,7 +24,7 @@ from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import log, size
+from gavo_jax.mapping.motions import carried, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
@@ -93,7 +93,7 @@ class Rival(NamedTuple):
     rival_T_anchor: Float[np.ndarray, "4 4"]
     """and by the rival's."""
     vaguest: Float[np.ndarray, "6 6"]
-    """Covariance of the rival's motion where it was known least well since the anchor."""
+    """Covariance of the rival's motion where it was known least well since the anchor; see `_in_target`."""
     age: Span
     """Since the anchor."""
     ahead: Any
@@ -183,8 +183,8 @@ class WithRival:
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = float(rival.age.seconds)
-        vaguest = max(rival.vaguest, other.result.covariance, key=np.trace)
-        contradiction = _distance(first, second, np.asarray(attempt.result.covariance) + vaguest)
+        vaguest = max(rival.vaguest, _in_target(other.result), key=np.trace)
+        contradiction = _distance(first, second, _in_target(attempt.result) + vaguest)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
@@ -286,12 +286,17 @@ def _view(state: AwareState) -> View:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 
+def _in_target(result: Alignment) -> Float64[np.ndarray, "6 6"]:
+    """Covariance of a motion by a step on the target's side: results have it by one on the reference's."""
+    return carried(np.asarray(result.target_T_reference, np.float64), np.asarray(result.covariance, np.float64))
+
+
 def _distance(
-    first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
+    first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
 ) -> float:
-    """Squared Mahalanobis distance of two motions since the anchor."""
+    """Squared Mahalanobis distance of two motions since the anchor, by a step on the target's side."""
     step = log(first @ inverse(second))
-    return float(step @ np.linalg.solve(np.asarray(covariance, np.float64), step))
+    return float(step @ np.linalg.solve(covariance, step))
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:

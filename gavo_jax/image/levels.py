@@ -111,7 +111,7 @@ def image_plane(camera: Camera) -> ImagePlane:
 def cell_of(height: int, width: int, points: int | None) -> int:
     """Side of the blocks that give one point each, so that an image gives at most `points`; None takes every pixel."""
     cell = 1
-    while points is not None and (width // cell) * (height // cell) > points:
+    while points is not None and (width // cell) * (height // cell) > points and cell < min(height, width):
         cell += 1
     return cell
 

@@ -72,6 +72,8 @@ class TrackerState(NamedTuple):
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
     """Time that motion took."""
+    share: Float[Array, ""]
+    """Of the image, whose points take part in the next search: less where those of bodies are left out."""
     exposure: Exposure
     """Of the previous frame; the keyframe's points are as if taken with it."""
     usual: Usual
@@ -124,9 +126,10 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
     finest = jax.tree.map(lambda leaf: leaf[-1], keyframe.points)
     inside = warp(finest, jnp.eye(4), camera).inside
-    in_view = (inside @ dealt) / jnp.maximum((finest.q > 0).astype(jnp.float32) @ dealt, 1.0)
+    readings = (finest.q > 0).astype(jnp.float32) @ dealt
+    in_view = (inside @ dealt) / jnp.maximum(readings, 1.0)
     thresholds = overlap + KEYFRAME_SPREAD * np.linspace(-0.5, 0.5, KEYFRAME_SHARES)
-    renewed = (in_view < thresholds)[share]
+    renewed = ((in_view < thresholds) | (readings == 0))[share]
     return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
 
 
@@ -174,7 +177,19 @@ def track_frame(
     key = jax.random.fold_in(key, clock.frame)
     swaying = Swaying(clock.elapsed, state.unrest) if options.sway else None
     result, populations = align_views(
-        views, packed, camera, levels, solver, alignment, key, guesses, record, exchanged, readout, swaying=swaying
+        views,
+        packed,
+        camera,
+        levels,
+        solver,
+        alignment,
+        key,
+        guesses,
+        record,
+        exchanged,
+        readout,
+        swaying=swaying,
+        share=state.share,
     )
     result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
     motion = jnp.where(is_first, 0.0, result.xi)
@@ -196,7 +211,19 @@ def track_frame(
     was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
     unrest = state.unrest.after(sway / clock.elapsed, change)
     unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
-    after_it = TrackerState(newest, keyframe, packed, motion, motion, passing, unrest, clock.elapsed, exposure, usual)
+    after_it = TrackerState(
+        newest,
+        keyframe,
+        packed,
+        motion,
+        motion,
+        passing,
+        unrest,
+        clock.elapsed,
+        jnp.float32(1.0),
+        exposure,
+        usual,
+    )
     return after_it, result, populations
 
 
@@ -215,6 +242,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         passing=jnp.zeros(6),
         unrest=Unrest.unknown(),
         seconds=jnp.float32(1.0),
+        share=jnp.float32(1.0),
         exposure=Exposure.of(pyramid),
         usual=Usual.unknown(),
     )
@@ -237,6 +265,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         passing=still,
         unrest=Unrest.unknown(),
         seconds=np.float32(1.0),  # pyright: ignore[reportArgumentType]
+        share=np.float32(1.0),  # pyright: ignore[reportArgumentType]
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),
     )

@@ -176,8 +176,17 @@ def test_the_inverse_is_the_cameras_motion(sequence: SyntheticSequence, frames: 
     assert (moved[:3, 3] - world_T_camera[8, :3, 3]) @ step > 0.9 * step @ step
 
 
-@pytest.mark.parametrize(("scale", "status"), [(1.0, AlignmentStatus.OK), (1.001, AlignmentStatus.NOT_RIGID)])
-def test_a_motion_that_is_not_rigid_is_told(scale: float, status: AlignmentStatus) -> None:
+@pytest.mark.parametrize(
+    ("scale", "asked", "status"),
+    [
+        (1.0, 100, AlignmentStatus.OK),
+        (1.001, 100, AlignmentStatus.NOT_RIGID),
+        (1.0, 1900, AlignmentStatus.OK),
+        (1.0, 2100, AlignmentStatus.NO_DEPTH),
+    ],
+)
+def test_what_speaks_against_a_motion_whatever_the_images(scale: float, asked: int, status: AlignmentStatus) -> None:
+    """It is not rigid; or of the points that were asked for too few have a reading."""
     motion = np.diag([scale, scale, scale, 1.0]).astype(np.float32)
     model = Linearization(jnp.float32(20.0), jnp.float32(0.9), jnp.zeros(6), 1e4 * jnp.eye(6))
     points = SimpleNamespace(q=jnp.ones(100))
@@ -189,7 +198,9 @@ def test_a_motion_that_is_not_rigid_is_told(scale: float, status: AlignmentStatu
     @jax.jit
     def judge(motion: jax.Array) -> jax.Array:
         evidence = Evidence(motion, jnp.float32(100.0), model, jnp.eye(6), information, explained)
-        return gravest(as_findings(find_against(evidence, 1e-6 * jnp.eye(6), objective, jnp.float32(np.inf))))
+        return gravest(
+            as_findings(find_against(evidence, 1e-6 * jnp.eye(6), objective, jnp.float32(np.inf), jnp.float32(asked)))
+        )
 
     assert AlignmentStatus(int(judge(motion))) is status
 
@@ -253,6 +264,15 @@ def test_a_batch_of_arrays_is_a_batch_of_frames(
 
     keys = jax.random.split(jax.random.key(5), 2)
     again = align_batch(stacked((0, 8)), stacked((1, 9)), sequence.camera, keys=keys)
+    for a, b in zip(batch, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_batch_of_two_pairs_of_images_is_no_stack_of_them(
+    batch: Alignment, sequence: SyntheticSequence, frames: dict[int, Frame]
+) -> None:
+    references, targets = (tuple((frames[i].grey, frames[i].depth) for i in side) for side in ((0, 8), (1, 9)))
+    again = align_batch(references, targets, sequence.camera, keys=jax.random.split(jax.random.key(5), 2))
     for a, b in zip(batch, again, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -540,3 +560,13 @@ def test_bounds_are_inputs_of_the_program(sequence: SyntheticSequence, frames: d
     true_metres, true_degrees = difference(target_T_reference(sequence, 0, 1), np.eye(4))
     assert true_degrees > 0.3 and true_metres > 0.005
     assert degrees < 0.9 * true_degrees or metres < 0.9 * true_metres
+    assert AlignmentStatus.HIGH_ERROR in result.statuses, "the search ended where it was held"
+
+
+def test_a_box_that_shrinks_is_about_what_was_found(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    """Held about the first guess, a search by the last half-widths would have no candidate left."""
+    options = AlignmentOptions(bounds_factor=0.1)
+    result = align(frames[0], frames[1], sequence.camera, Settings(GaussNewton(), options))
+    metres, degrees = difference(result.target_T_reference, target_T_reference(sequence, 0, 1))
+    assert np.isfinite(result.history).all() and result.status is AlignmentStatus.OK
+    assert metres < 0.003 and degrees < 0.1

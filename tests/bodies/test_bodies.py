@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,7 +16,8 @@ import pytest
 from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.alignment.visits import prepare_target
-from gavo_jax.bodies.aligner import SUSPECTED, Candidate, _judged
+from gavo_jax.bodies import motions
+from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, Candidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
 from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
@@ -29,6 +31,7 @@ from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import Attempt, Search, blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track
+from gavo_jax.odometry.tracking import Clock, blank_state
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
 from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings
@@ -378,6 +381,40 @@ def test_the_largest_part_needs_less_where_depth_disagrees() -> None:
     assert not np.any(parts(both, little, nowhere))
     assert set(np.unique(parts(both, little, nowhere, explains=True))) == {0, 1}
     assert not np.any(parts(both, 0.05 * both, nowhere, explains=True))
+
+
+def test_points_that_are_left_out_are_not_asked_for() -> None:
+    """A body's own search has few points, each with a reading: there is depth enough."""
+    retina = Retina(CAMERA, TRACKED)
+    mask = np.ones(retina.size, bool)
+    mask[: retina.size[0] // 4] = False
+    state = blank_state(CAMERA, TRACKED.solver, TRACKED.alignment)
+    assert float(state.share) == 1 and float(retina.without(state, mask).share) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("status", [AlignmentStatus.OK, AlignmentStatus.LOW_TEXTURE])
+def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
+    status: AlignmentStatus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next motion is judged by it, and its search begins there."""
+    xi = np.full(6, 0.01, np.float32)
+    found = no_alignment(status)._replace(xi=xi)
+    monkeypatch.setattr(motions, "_align", lambda *_: found)
+    search = Search(CAMERA, TRACKED, jax.random.key(0))
+    aware = BodyAware(search, search)
+    blank = aware.blank_state()
+    part = np.zeros(aware.retina.size, bool)
+    part[10:30, 10:30] = True
+    before = identify(part.astype(np.int32), Roll.empty(part.shape))
+    state = blank._replace(scene=blank.scene._replace(roll=before))
+    belief: Any = SimpleNamespace(moving=part.astype(np.float32))
+    frame: Any = None
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    nearness = np.ones(part.shape)
+    roll, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
+    assert seen[0].alignment is found
+    kept = roll.motions[list(roll.numbers).index(seen[0].number)]
+    np.testing.assert_array_equal(kept, xi if status is AlignmentStatus.OK else np.zeros(6))
 
 
 def test_bodies_keep_their_numbers() -> None:

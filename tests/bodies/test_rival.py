@@ -12,14 +12,14 @@ import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival
+from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival, _distance, _in_target
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
-from gavo_jax.mapping.motions import exp
+from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
@@ -331,3 +331,29 @@ def test_what_the_images_do_not_tell_goes_on_as_before() -> None:
     assert aware._go_on(state, clock, blind, covered=0.1) is blind
     guessed = aware._go_on(state, clock, blind, covered=0.9)
     assert guessed.usable and guessed.unknown == 1
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0, 10.0])
+def test_what_goes_on_beside_what_is_known_leaves_that_alone_while_the_camera_turns(degrees: float) -> None:
+    """Along the reference's axis the found motion is 5 cm off, and knows it; along the others it is exact."""
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    blank = aware.blank_state()
+    truth = np.array([0.02, 0.0, 0.0, 0.0, np.radians(degrees), 0.0])
+    elapsed = np.float32(1 / 30)
+    state = blank._replace(tracker=blank.tracker._replace(motion=np.float32(truth), seconds=elapsed))
+    vague = result_of(np.diag([0.3**2] + [1e-3**2] * 5))
+    found = exp(truth) @ exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    attempt = Attempt(blank.tracker, vague._replace(target_T_reference=found), usable=False)
+    clock = Clock(elapsed, np.float32(0), np.uint32(1))
+    result = aware._go_on(state, clock, attempt, covered=0.1).result
+    off = log(inverse(exp(truth)) @ result.target_T_reference)
+    assert np.all(np.abs(off) < 1e-4 + np.sqrt(np.diag(result.covariance)))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0, 10.0])
+def test_two_motions_are_as_far_apart_as_their_covariances_say_while_the_camera_turns(degrees: float) -> None:
+    truth = exp(np.array([0.02, 0.0, 0.0, 0.0, np.radians(degrees), 0.0]))
+    vague = result_of(np.diag([0.05**2] + [1e-3**2] * 5))._replace(target_T_reference=truth)
+    beside = truth @ exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert _distance(beside, truth, 2 * _in_target(vague)) == pytest.approx(0.5, rel=1e-3)

@@ -575,6 +575,14 @@ def test_a_keyframe_is_renewed_share_by_share(turn: float, sequence: SyntheticSe
     np.testing.assert_array_equal(renewed[0], renewed[-1])
 
 
+@pytest.mark.parametrize("overlap", [0.0, 0.7])
+def test_a_keyframe_without_readings_takes_all_of_the_newest(overlap: float) -> None:
+    blank = blank_state(CAMERA, SOLVER, AlignmentOptions()).keyframe
+    newest = blank._replace(points=blank.points._replace(q=np.ones_like(blank.points.q)))
+    renewed = jax.jit(renew_keyframe)(blank, newest, CAMERA.level(1), overlap)
+    assert np.all(renewed.points.q == 1)
+
+
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
     result = run(sequence[:6], FRAME_TO_FRAME)
     assert result.metrics["lost_pairs"] == 0
