@@ -22,6 +22,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.feature_peers import FeaturePeer
 from gavo_jax.features import FeatureKind
 from gavo_jax.image.numbers import grey_bytes
+from gavo_jax.libusb import import_with_libusb
 from gavo_jax.peer import Peer, PeerResult, check_size, failure, result_of
 
 
@@ -262,6 +263,6 @@ def make_peer(name: str, camera: Camera) -> Peer:
 
 def _import_open3d() -> Any:
     try:
-        return importlib.import_module("open3d")
-    except ImportError as error:
+        return import_with_libusb("open3d")
+    except (ImportError, OSError) as error:
         raise GavoError(f"Open3D cannot be imported ({error}): install 'gavo-jax[peers]'") from error

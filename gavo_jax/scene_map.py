@@ -79,10 +79,12 @@ class SceneMap:
         """Write it, whole or not at all: a cloud as `.ply` or `.pcd`, a mesh as `.ply` or `.obj`.
 
         Raises:
-            GavoError: another ending, or the file cannot be written.
+            GavoError: another ending, there is nothing in it, or the file cannot be written.
         """
         path = Path(path)
         check_map(path, self.shape)
+        if len(self.points) == 0:
+            raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
         open3d = import_open3d()
         vector = open3d.utility.Vector3dVector
         partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix.lower()}")
@@ -187,7 +189,8 @@ class MapBuilder:
 
 
 class LiveMap:
-    """A map of frames that come once: those of a run's first segment are fused as they are tracked.
+    """A map of frames that come once: those of a run's first segment are fused as they are tracked. It begins with the
+    first frame that the next one can be aligned with.
 
     Args:
         builder: what fuses them.
@@ -196,19 +199,38 @@ class LiveMap:
     def __init__(self, builder: MapBuilder) -> None:
         self._builder = builder
         self._reasons: Counter[str] = Counter()
+        self._first: tuple[Frame, np.ndarray, int] | None = None
+        """The first frame, until the next one tells whether it is any good, with its pose and segment."""
+        self._segment: int | None = None
+        """The map's; None before it has begun."""
 
     def watch(self, frame: Frame, step: Step | None) -> None:
         """Take one more frame; no step: it is the first."""
-        why = None if step is None else _why_not(step)
-        if why is None and step is not None and step.segment:
+        if step is None:
+            self._first = frame, np.eye(4), 0
+            return
+        if self._segment is None and step.alignment.status == AlignmentStatus.NO_REFERENCE:
+            self._reasons[LOST] += 1  # the frame before
+            self._first = frame, step.world_T_camera, step.segment
+            return
+        self._begin()
+        why = _why_not(step)
+        if why is None and step.segment != self._segment:
             why = ELSEWHERE
         if why is None:
-            self._builder.add(frame, np.eye(4) if step is None else step.world_T_camera)
+            self._builder.add(frame, step.world_T_camera)
         else:
             self._reasons[why] += 1
 
+    def _begin(self) -> None:
+        if self._first is not None:
+            frame, world_T_camera, self._segment = self._first
+            self._builder.add(frame, world_T_camera)
+            self._first = None
+
     def finish(self, shape: Shape) -> SceneMap:
         """The map."""
+        self._begin()
         return self._builder.extract(shape, _left_out(self._reasons))
 
 

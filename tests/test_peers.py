@@ -192,3 +192,12 @@ def test_motion_of_a_real_clip(name: str, data_dir: Path) -> None:
     distance = np.linalg.norm(truth[:3, 3])
     assert distance > 0.04
     assert np.linalg.norm(last_T_first[:3, 3] - truth[:3, 3]) < 0.5 * distance
+
+
+def test_open3d_that_lacks_a_library_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its own parts may be missing: then it raises OSError."""
+    (tmp_path / "open3d.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(GavoError, match="libGL"):
+        make_peer("open3d-color", CAMERA)

@@ -14,7 +14,7 @@ from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
-from gavo_jax.scene_map import MapBuilder, build_map, check_map, check_voxel, import_open3d
+from gavo_jax.scene_map import LiveMap, MapBuilder, SceneMap, build_map, check_map, check_voxel, import_open3d
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
@@ -122,6 +122,27 @@ def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
     steps += [stepped(i, segment=1) for i in (2, 3)]
     frames, _, left_out = fused(steps)
     assert frames == [WALK.timestamps[i] for i in (2, 3)] and left_out == ["2 frames: lost"]
+
+
+@pytest.mark.parametrize("begins", [0, 1, 2])
+def test_a_live_map_begins_with_the_first_frame_that_is_of_use(begins):
+    fuser: Any = Fused()
+    scene: Any = LiveMap(fuser)
+    scene.watch(WALK[0], None)
+    for i in range(1, 6):
+        lost = (AlignmentStatus.NO_REFERENCE,) if i <= begins else ()
+        scene.watch(WALK[i], stepped(i, *lost, segment=int(begins > 0), lost=bool(lost)))
+    frames, x, left_out = scene.finish("cloud")
+    assert frames == [WALK.timestamps[i] for i in range(begins, 6)] and x == list(range(begins, 6))
+    assert left_out == ([f"{begins} frame{'s' * (begins > 1)}: lost"] if begins else [])
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.obj"])
+def test_an_empty_map_is_not_written(tmp_path, name):
+    triangles = np.zeros((0, 3), int) if name == "a.obj" else None
+    nothing = SceneMap(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)), triangles)
+    with pytest.raises(GavoError, match="not written: nothing nearer than 4 m"):
+        nothing.write(tmp_path / name)
 
 
 @needs_open3d

@@ -52,6 +52,7 @@ COLUMNS = (
     ("m/frame", DRIFT_PER_FRAME, 5),
     ("ATE m", ABSOLUTE_ERROR, 4),
     ("end m", FINAL_DISTANCE, 4),
+    ("segments", "segments", 0),
     ("lost", "lost_pairs", 0),
     ("ms/pair", MILLISECONDS, 1),
     ("frames/s", FRAMES_PER_SECOND, 1),
@@ -62,7 +63,8 @@ TABLE_CAPTION = (
     "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
     "evaluate_rpe.py, fixed delta). m/frame: the same from frame to frame, in place of the drift. ATE: root "
     "mean square distance of associated positions after the best rigid alignment. End: distance from the true position "
-    "at the end, both relative to the first pose. ms/pair: median, from two decoded images to the motion on the host. "
+    "at the end, both relative to the first pose. Segments: stretches between which the motion is unknown. ms/pair: "
+    "median, from two decoded images to the motion on the host. "
     "frames/s: from files to poses, decoding included."
 )
 MEANINGS = {
@@ -70,6 +72,7 @@ MEANINGS = {
     "m/frame": "m/frame: relative pose error from frame to frame",
     "ATE m": "ATE: absolute error after alignment",
     "end m": "end: off at the last frame",
+    "segments": "segments: stretches between which the motion is unknown; errors are within them",
     "ms/pair": "ms/pair: from two decoded images to their motion",
     "frames/s": "frames/s: from files to poses, decoding included",
 }
@@ -254,8 +257,11 @@ def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
 
 
 def _shown(metrics: dict[str, Any], key: str) -> float | None:
-    """A figure as the table has it: errors per frame only where there is no drift over a second."""
-    return None if key == DRIFT_PER_FRAME and metrics[DRIFT] is not None else metrics[key]
+    """A figure as the table has it: errors per frame only where there is no drift over a second, segments only where
+    there are several.
+    """
+    is_told = metrics[DRIFT] is not None if key == DRIFT_PER_FRAME else key == "segments" and metrics[key] == 1
+    return None if is_told else metrics[key]
 
 
 def _versions(entries: list[Entry]) -> dict[str, str]:

@@ -68,12 +68,13 @@ def run_live(options: Run) -> int:
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)
+        print_run(name, metrics, folder.path, False)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
-    print_run(name, metrics, folder.path, False)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")
     if interrupted:
         return INTERRUPTED
+    viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
 
 
@@ -94,6 +95,7 @@ def _track(
         for images in newest:
             frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
             if count == 0:
+                viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
                 folder.start(
                     {
                         "options": options,
@@ -102,7 +104,6 @@ def _track(
                     },
                     frame.timestamp,
                 )
-                viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
                 start = time.perf_counter()
             step = odometry.register(frame, frame.timestamp)
             viewer.watch(frame, step, odometry.candidates)

@@ -6,6 +6,7 @@ from pathlib import Path
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, import_open3d, warn_of
 from gavo_jax.trajectory import Trajectory
@@ -32,13 +33,13 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
 def save_map(
     path: Path, sequence: Sequence, steps: Many[Step], trajectory: Trajectory, shape: Shape, voxel: float
 ) -> None:
-    """Fuse the frames of a run and write the map.
+    """Fuse the frames of a run, as its later frames have shown them to be, and write the map.
 
     Raises:
         GavoError: it cannot be written.
     """
     with waiting(f"a map of {len(steps) + 1} frames …"):
-        scene = build_map(sequence, steps, shape, voxel, trajectory=trajectory)
+        scene = build_map(sequence, revised(steps), shape, voxel, trajectory=trajectory)
     write_map(scene, path)
 
 

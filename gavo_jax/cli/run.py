@@ -88,8 +88,11 @@ def run(options: Run) -> int:
         progress = folder.resume(config, blank) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
-            tell(f"{folder.path}: the run came to its end before: nothing to resume")
+            shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
+            tell(f"{folder.path}: the run came to its end before: nothing to resume{shown}")
         else:
+            # before an earlier run is replaced: it may not open
+            viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
                 remove_trajectories(folder.path)
                 if folder.has_run():
@@ -97,6 +100,8 @@ def run(options: Run) -> int:
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
+                for step in (None, *folder.steps()):
+                    viewer.watch(None, step)
                 if mapper is not None:
                     mapper.replay(sequence, folder.steps())
             say(summary(sequence))
@@ -105,13 +110,12 @@ def run(options: Run) -> int:
                 say(f"left out: {counts}; metrics.json says why (left_out)")
             if line := settings_line(options):
                 say(line)
-            viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         write_trajectories(trajectory, folder.path, trajectory_formats)
+        print_run(name, metrics, folder.path, sequence.ground_truth is not None)
         if options.map is not None:
             save_map(options.map, sequence, folder.steps(), trajectory, shape, options.voxel)
-    print_run(name, metrics, folder.path, sequence.ground_truth is not None)
     if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
         say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
     if interrupted:

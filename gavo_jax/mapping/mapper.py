@@ -99,7 +99,7 @@ class Mapper:
             if is_found:
                 self._tie(keyframe)
             self._newest = None
-        elif frame is not None and step.origin == "tracked" and step.depth_is_trusted:
+        elif frame is not None and _may_be_keyframe(step):
             self._newest = frame, step, twist
 
     def find(self, frame: Frame) -> Found | None:
@@ -121,7 +121,7 @@ class Mapper:
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded."""
         self.watch(_decoded(sequence, 0), None)
-        last = max((step.index for step in steps if not step.lost), default=0)
+        last = max((step.index for step in steps if _may_be_keyframe(step)), default=0)
         for step in steps:
             frame = _decoded(sequence, step.index) if self.is_due(step) or step.index == last else None
             if frame is not None and step.origin == "relocalised":
@@ -222,6 +222,11 @@ class Mapper:
             covariance = UNTIED**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
+
+
+def _may_be_keyframe(step: Step) -> bool:
+    """Whether a step's frame becomes a keyframe if it is the run's last one."""
+    return step.origin == "tracked" and not step.lost and step.depth_is_trusted
 
 
 def _decoded(sequence: Sequence, index: int) -> Frame | None:

@@ -36,6 +36,7 @@ class Metrics(TypedDict):
     ate_translation_rmse_m: float | None
     """After alignment."""
     distance_error_final_m: float | None
+    """At the end, from the first pose on; None where the motion between is unknown somewhere."""
     compile_seconds: float
     milliseconds_per_pair_median: float | None
     frames_per_second: float | None
@@ -113,8 +114,15 @@ def compute_metrics(
         "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
         "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),
         "ate_translation_rmse_m": figure(lambda truth: absolute_trajectory_error(trajectory, truth).rmse),
-        "distance_error_final_m": figure(lambda truth: distance_error(trajectory, truth).final),
+        "distance_error_final_m": figure(lambda truth: distance_error(_unbroken(trajectory), truth).final),
         "compile_seconds": compile_seconds,
         "milliseconds_per_pair_median": float(np.median([step.milliseconds for step in steps])) if steps else None,
         "frames_per_second": (len(steps) + 1) / seconds if seconds > 0 else None,
     }
+
+
+def _unbroken(trajectory: Trajectory) -> Trajectory:
+    """The trajectory; raises GavoError where the way from its first pose to its last is not known."""
+    if trajectory.segments[0] != trajectory.segments[-1]:
+        raise GavoError("the first pose and the last are of different segments")
+    return trajectory

@@ -34,24 +34,28 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     """The steps of a run as its trajectory.txt and frames.csv tell them.
 
     Motions are those between the poses as they were found: of odometry.txt, where loops have corrected them since.
-    Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame without a pose has
-    the one before it.
+    Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame whose stamp is in
+    doubt has no pose; it gets the one before it.
 
     Args:
         folder: Of the run.
         trajectory: Of trajectory.txt, where it has been read already.
 
     Raises:
-        GavoError: a file cannot be read or is damaged.
+        GavoError: a file cannot be read or is damaged, or the poses are of another run.
     """
     poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
     found = Trajectory.read_tum(folder / ODOMETRY) if (folder / ODOMETRY).exists() else poses
     by_stamp, found_at = ({f"{t:.6f}": i for i, t in enumerate(one.timestamps)} for one in (poses, found))
     steps: list[Step] = []
     place = now = 0
-    for number, row in enumerate(csv.DictReader(read_text(folder / FRAMES).splitlines()), start=2):
+    for number, row in enumerate(_rows_of(folder / FRAMES), start=1):
         try:
             stamp = float(row["timestamp"])
+            if int(row["index"]) != number:
+                raise ValueError("a row is missing")
+            if row["status"] != str(AlignmentStatus.BAD_TIMESTAMP):
+                _require_pose(folder, row["timestamp"], by_stamp, found_at)
             if row["timestamp"] in by_stamp:
                 place = by_stamp[row["timestamp"]]
                 stamp = float(poses.timestamps[place])
@@ -62,9 +66,25 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
                 reference = float(found.timestamps[before])
             target_T_reference = inverse(found.world_T_camera[now]) @ found.world_T_camera[before]
             steps.append(_read_step(row, reference, stamp, poses.world_T_camera[place], target_T_reference))
+        except GavoError:
+            raise
         except (KeyError, TypeError, ValueError):
-            raise GavoError(f"{folder / FRAMES}:{number}: not a row of a run") from None
+            raise GavoError(f"{folder / FRAMES}:{number + 1}: not row {number} of a run") from None
     return steps
+
+
+def _rows_of(path: Path) -> list[dict[str, str]]:
+    try:
+        return list(csv.DictReader(read_text(path).splitlines()))
+    except csv.Error as error:
+        raise GavoError(f"{path}: not a table of frames: {error}") from None
+
+
+def _require_pose(folder: Path, stamp: str, poses: Mapping[str, int], found: Mapping[str, int]) -> None:
+    """Raise GavoError where a frame of frames.csv has no pose."""
+    for name, stamps in ((TRAJECTORY, poses), (ODOMETRY, found)):
+        if stamp not in stamps:
+            raise GavoError(f"{folder}: {name} and {FRAMES} are not of the same run: no pose at {stamp}")
 
 
 def _read_step(
@@ -168,7 +188,9 @@ def read_run(folder: str | Path) -> RecordedRun:
     if not (folder / CONFIG).exists():
         raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
     config = read_json(folder / CONFIG)
-    trajectory = Trajectory.read_tum(folder / TRAJECTORY)
+    # a run with loops that was killed has the poses as they were found alone
+    is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()
+    trajectory = Trajectory.read_tum(folder / (ODOMETRY if is_cut_short else TRAJECTORY))
     return RecordedRun(config, trajectory, revised(read_steps(folder, trajectory)))
 
 

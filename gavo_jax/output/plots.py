@@ -332,6 +332,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     Raises:
         GavoError: a file cannot be written.
     """
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
@@ -339,7 +340,8 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
         FigureCanvasAgg(figure).print_png(data, pil_kwargs={"optimize": True})
 
     def draw_svg(data: BytesIO) -> None:
-        FigureCanvasSVG(figure).print_svg(data, metadata={"Date": None})
+        with rc_context({"svg.hashsalt": name}):  # else its names are random
+            FigureCanvasSVG(figure).print_svg(data, metadata={"Date": None})
 
     # not by `savefig`, which draws twice for each file and lays out anew: that takes the most time
     figure.set_dpi(120)

@@ -195,7 +195,7 @@ class RunFolder:
                 f"{kept}: the images are not those that the run has seen before: run again without --resume"
             )
         self._open(files)
-        remove_files(self.path, METRICS)
+        remove_files(self.path, METRICS, LOOPS, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         return progress

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from gavo_jax.alignment.search import Population
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, printable
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import Trajectory
@@ -39,14 +39,17 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
+UNFINISHED = ".part"
+"""After the name of a recording that is being written; not the ending of what a new run clears away."""
 WAITING_FRAMES = 8
 """Frames that wait to be shown before the run waits for them."""
 SECONDS_TOGETHER = 0.25
 """What is shown within this time is sent together; a window lags behind the run by at most this."""
 MEMORY = "512MiB"
 """What the server of the web viewer keeps for browsers that come later."""
-HOST, GRPC_PORT, WEB_PORT = "127.0.0.1", 9876, 9090
-"""Where the web viewer is found: on this machine only; at other ports where something else is at these."""
+HOST, WEB_PORT = "127.0.0.1", 9090
+"""Where the web viewer's page is found: on this machine only, and at another port where something else is at this one.
+The data have a port that nobody can foretell: Rerun gives them to whoever asks there, by whatever name of the host."""
 WINDOW_SECONDS = 1.0
 """After which a window that found no screen would have ended."""
 PATIENCE = 60.0
@@ -98,6 +101,7 @@ class RerunViewer(Viewer):
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._partial = recording.with_name(recording.name + UNFINISHED)
 
     def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         """Open window, server or file, send the layout, and start the thread.
@@ -111,7 +115,7 @@ class RerunViewer(Viewer):
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         self._connect(stream)
-        stream.send_recording_name(title)
+        stream.send_recording_name(printable(title))
         stream.send_blueprint(make_blueprint())
         self._stream = stream
         self._thread = threading.Thread(target=self._work, args=(Scene(stream, camera, stamps, truth),), daemon=True)
@@ -127,8 +131,11 @@ class RerunViewer(Viewer):
         self._raise_fault()
         self._queue.put(lambda scene: scene.add_loops(trajectory, loops))
 
-    def close(self) -> None:
+    def close(self, is_cut_short: bool = False) -> None:
         """Wait for what is queued.
+
+        Args:
+            is_cut_short: an exception ended the run: a recording of it is not kept.
 
         Raises:
             GavoError: a frame could not be shown.
@@ -144,11 +151,25 @@ class RerunViewer(Viewer):
             self._fault = self._fault or fault
         if self.mode == "save":
             self._stream.disconnect()
+            self._keep(self._fault is None and not is_cut_short)
         self._raise_fault()
+
+    def _keep(self, is_whole: bool) -> None:
+        """Give a recording its name once it is whole: until then an earlier one keeps it."""
+        try:
+            if is_whole:
+                self._partial.replace(self.recording)
+            else:
+                self._partial.unlink(missing_ok=True)
+        except OSError as error:
+            self._fault = self._fault or error
+
+    def __exit__(self, *exception: object) -> None:
+        self.close(is_cut_short=exception[0] is not None)
 
     def stay(self) -> None:
         """Serve the browser until Ctrl-C; a window of its own and a file need nothing."""
-        if self.mode != "web":
+        if not self.url:
             return
         print(f"viewer at {self.url} (Ctrl-C ends it)", flush=True)
         try:
@@ -160,12 +181,13 @@ class RerunViewer(Viewer):
     def _connect(self, stream: RecordingStream) -> None:
         try:
             if self.mode == "save":
-                stream.save(self.recording)
+                self._partial.unlink(missing_ok=True)
+                stream.save(self._partial)
             elif self.mode == "spawn":
                 self._open_window(stream)
             else:
                 self._serve(stream)
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, UnicodeError) as error:
             where = f"{self.recording}: cannot be written" if self.mode == "save" else f"--viewer {self.mode}"
             raise GavoError(f"{where}: {error}") from None
 
@@ -227,9 +249,8 @@ def _serve_alone() -> tuple[subprocess.Popen[bytes], int, int]:
     Raises:
         RuntimeError: it does not start.
     """
-    wanted = [(GRPC_PORT, WEB_PORT), *[(0, 0)] * (ATTEMPTS - 1)]
-    for data, site in wanted:
-        port, page = _free_port(data), _free_port(site)
+    for site in (WEB_PORT, *[0] * (ATTEMPTS - 1)):
+        port, page = _free_port(0), _free_port(site)
         process = _start_server(port, page)
         try:
             _await_own(process, {port, page})

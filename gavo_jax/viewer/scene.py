@@ -14,7 +14,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import COUNTED
-from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.driver import MAX_DOUBTED, Step
 from gavo_jax.trajectory import Trajectory, inverse
 from gavo_jax.viewer.colors import BLUE, GREEN, GREY, GREYS, VERMILION, WHITE, color_of_body, packed
 from gavo_jax.viewer.layout import IMAGES
@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 
 CLOUD_STRIDE = 4
 """Every so many shown pixels along either side make a point of the cloud."""
+
+
+NOTHING = encode_jpeg(np.zeros((3, 4), np.uint8))
+"""In the place of a picture that there is not."""
 
 
 class Rows(NamedTuple):
@@ -69,13 +73,15 @@ class Scene:
         self._rays = rays(self._camera)[self._cloud]
         self._truth = Truth(stamps, truth)
         self._frame, self._generation = 0, 0
-        self._world_T_camera = np.eye(4)
+        self._segment = 0
+        self._world_T_camera: Float64[np.ndarray, "4 4"] | None = None
+        """Of the last frame, where the motion from there is known."""
         self._seen = SeenCubes()
         self._bodies: dict[int, Float64[np.ndarray, " 3"]] = {}
         """Where the bodies of the last frame are, by number."""
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
-        self._shown: deque[Shown] = deque(maxlen=8)
-        """The last frames that could be read; an older one is never a reference."""
+        self._shown: deque[Shown] = deque(maxlen=MAX_DOUBTED + 1)
+        """The last frames that could be read."""
         # in the order of sending: particles, shown at their own frame alone, are there before the time moves on
         self._archetypes: dict[str, Any] = {
             "search/particles": rr.Points3D,
@@ -104,7 +110,9 @@ class Scene:
         """Add one frame to what is to be sent."""
         self._frame = 0 if step is None else step.index
         world_T_camera = np.eye(4) if step is None else step.world_T_camera
-        truth = self._truth.at(self._frame, world_T_camera)
+        if step is not None and step.segment != self._segment:
+            self._segment, self._world_T_camera, self._last_truth, self._bodies = step.segment, None, None, {}
+        truth = self._truth.at(self._frame, world_T_camera, self._segment)
         shown = None if frame is None else shrink(frame, self._camera, self._depth_scale)
         bodies = () if step is None else step.bodies
         if shown is not None:
@@ -250,7 +258,9 @@ class Scene:
         if np.isfinite(step.alignment.error):
             self._add("curves/rmse", scalars=[float(np.sqrt(step.alignment.error))])
         reference = next((s for s in reversed(self._shown) if s.timestamp == step.reference_timestamp), None)
-        if shown is None or reference is None:
+        if shown is None or reference is None:  # what was shown is of another frame
+            for name in ("reference", "warped", "residual"):
+                self._add(f"images/{name}", blob=[NOTHING])
             return
         warped, seen = warp_target(reference, shown, np.asarray(step.alignment.target_T_reference), self._camera)
         self._add("images/reference", blob=[reference.jpeg])
@@ -303,7 +313,9 @@ def _joined(parts: list[Any]) -> Any:
 
 
 class Truth:
-    """Where the camera was, in the estimate's world: the first pose that is known is laid on the estimate's."""
+    """Where the camera was, in the estimate's world: in each segment, as between them the motion is not known, the
+    first pose whose truth is known is laid on it.
+    """
 
     def __init__(self, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         self._stamps = stamps
@@ -311,15 +323,17 @@ class Truth:
         self._known = np.zeros(len(self._stamps), bool)
         if truth is not None:
             self._truth_T_camera, self._known = truth.interpolate(stamps)
-        self._world_T_truth: Float64[np.ndarray, "4 4"] | None = None
+        self._world_T_truth: dict[int, Float64[np.ndarray, "4 4"]] = {}
 
-    def at(self, index: int, world_T_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:
-        """Return the true world_T_camera of a frame, None where it is not known."""
+    def at(
+        self, index: int, world_T_camera: Float64[np.ndarray, "4 4"], segment: int = 0
+    ) -> Float64[np.ndarray, "4 4"] | None:
+        """Return the true world_T_camera of a frame of a segment, None where it is not known."""
         if not self._is_known(index):
             return None
-        if self._world_T_truth is None:
-            self._world_T_truth = world_T_camera @ inverse(self._truth_T_camera[index])
-        return self._world_T_truth @ self._truth_T_camera[index]
+        if segment not in self._world_T_truth:
+            self._world_T_truth[segment] = world_T_camera @ inverse(self._truth_T_camera[index])
+        return self._world_T_truth[segment] @ self._truth_T_camera[index]
 
     def _is_known(self, index: int) -> bool:
         """Of a live source, and of a run whose sequence is not there, nothing is known of the later frames."""

@@ -245,6 +245,20 @@ def test_refused_run_leaves_an_earlier_one_alone(gavo, clip, tmp_path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_viewer_that_does_not_open_leaves_an_earlier_run_alone(gavo, clip, tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise RuntimeError("no window")
+
+    arguments = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
+    assert gavo(*arguments).status == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    monkeypatch.setattr("gavo_jax.viewer.live.RerunViewer._open_window", fail)
+    monkeypatch.setattr("gavo_jax.viewer.live._has_screen", lambda: True)
+    assert is_refused(gavo(*arguments, "--viewer", "spawn"), "--viewer spawn")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+
+
 def write(name: str, text: str) -> Any:
     return lambda clip: (clip / name).write_text(text)
 

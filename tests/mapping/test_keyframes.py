@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small import CAMERA
 
-from gavo_jax.alignment.result import no_alignment
+from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
@@ -103,6 +103,22 @@ def test_a_guessed_frame_becomes_no_keyframe():
     for step in steps:
         mapper.watch(WALK[step.index], replace(step, origin="guessed"))
     assert [keyframe.index for keyframe in mapper.finish().keyframes] == [0]
+
+
+def test_what_may_be_the_last_keyframe_is_read_again_where_a_run_goes_on():
+    """The last frame that was not lost is of doubtful depth: the one before it becomes the keyframe."""
+    steps = drifting(WALK, np.zeros(6))[:5]
+    steps[2] = replace(steps[2], alignment=with_finding(steps[2].alignment, AlignmentStatus.DEPTH_MISMATCH))
+    steps[3:] = [replace(step, lost=True, origin="guessed") for step in steps[3:]]
+    in_one_go, resumed = Mapper(CAMERA), Mapper(CAMERA)
+    in_one_go.watch(WALK[0], None)
+    for step in steps:
+        in_one_go.watch(WALK[step.index], step)
+    resumed.replay(WALK, steps[:3])
+    for step in steps[3:]:
+        resumed.watch(WALK[step.index], step)
+    kept = [[keyframe.index for keyframe in mapper.finish().keyframes] for mapper in (in_one_go, resumed)]
+    assert kept == [[0, 2], [0, 2]]
 
 
 def test_loops_bring_the_end_back_to_where_it_was():

@@ -583,6 +583,20 @@ def test_a_keyframe_without_readings_takes_all_of_the_newest(overlap: float) -> 
     assert np.all(renewed.points.q == 1)
 
 
+def test_there_is_no_distance_at_the_end_where_the_way_there_is_unknown() -> None:
+    stamps = np.arange(4) / 30
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, 0, 3] = np.arange(4)
+    truth = Trajectory(stamps, poses)
+    shrunk = np.array(poses)
+    shrunk[:, 0, 3] *= 0.5
+    ends = [
+        compute_metrics(Trajectory(stamps, shrunk, np.array(segments)), truth, [], 1.0, 0.0)["distance_error_final_m"]
+        for segments in ([0, 0, 0, 0], [0, 0, 0, 1], [0, 1, 1, 0])
+    ]
+    assert ends == [pytest.approx(1.5), None, pytest.approx(1.5)]
+
+
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
     result = run(sequence[:6], FRAME_TO_FRAME)
     assert result.metrics["lost_pairs"] == 0

@@ -156,6 +156,14 @@ def test_save(tmp_path):
         plots.save(figure, tmp_path / "nowhere", "trajectory")
 
 
+def test_the_same_figure_is_the_same_bytes(tmp_path):
+    errors = {"ga": distance_error(straight(1.1), straight(1.0))}
+    first, second = (
+        [path.read_bytes() for path in plots.save(plots.plot_distance_error(errors), tmp_path, "errors")] for _ in "ab"
+    )
+    assert first == second
+
+
 def test_a_saved_figure_is_filled_to_its_edges(tmp_path):
     figure = plots.plot_convergence({1: np.array([[4.0, 2.0, 1.0]]), 2: np.array([[9.0, 2.0, 1.0]])})
     picture, vector = plots.save(figure, tmp_path, "convergence")

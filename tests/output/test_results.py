@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +12,11 @@ import pytest
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.output.files import describe, json_text, prepare_folder, write_json
-from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
+from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_run
 from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.settings import OdometryOptions
 from gavo_jax.status import AlignmentStatus
 
 
@@ -124,3 +127,62 @@ def test_prepared_folder(tmp_path):
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(GavoError, match="file"):
             prepare_folder(path)
+
+
+def recorded(folder: Path, stamps: tuple[float, ...] = (1.0, 2.0, 3.0)) -> Path:
+    """A folder of a run whose camera goes on along x."""
+    with RunFolder(folder) as run:
+        run.start({}, 0.0)
+        for index, stamp in enumerate(stamps, start=1):
+            pose = np.eye(4)
+            pose[0, 3] = index
+            run.add(Step(index, stamp - 1.0, stamp, no_alignment(AlignmentStatus.OK), pose, 1.0, False))
+    return folder
+
+
+def altered(words: str, row: int = 1) -> Callable[[Path], None]:
+    def alter(folder: Path) -> None:
+        lines = (folder / "frames.csv").read_text().splitlines()
+        lines[row : row + 1] = [words] if words else []
+        (folder / "frames.csv").write_text("\n".join(lines))
+
+    return alter
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / "trajectory.txt").write_text("7 0 0 0 0 0 0 1\n8 0 0 0 0 0 0 1\n"), "same run"),
+        (lambda folder: (folder / "odometry.txt").write_text("7 0 0 0 0 0 0 1\n8 0 0 0 0 0 0 1\n"), "odometry.txt"),
+        (altered(""), "frames.csv:2: not row 1 of a run"),
+        (altered("1," + "x" * 200_000), "frames.csv"),
+    ],
+)
+def test_files_that_are_not_of_one_run_are_told(tmp_path, damage, words):
+    assert [step.world_T_camera[0, 3] for step in read_run(recorded(tmp_path / "run")).steps] == [1, 2, 3]
+    damage(tmp_path / "run")
+    with pytest.raises(GavoError, match=words):
+        read_run(tmp_path / "run")
+
+
+def test_a_run_with_loops_that_was_killed_is_read(tmp_path):
+    folder = recorded(tmp_path / "run")
+    (folder / "trajectory.txt").rename(folder / "odometry.txt")
+    run = read_run(folder)
+    assert len(run.trajectory.timestamps) == 4 and [step.world_T_camera[0, 3] for step in run.steps] == [1, 2, 3]
+
+
+def test_what_loops_corrected_before_a_run_goes_on_is_not_left(tmp_path):
+    """It would look whole beside the longer run, should that be killed."""
+    config = {"odometry": OdometryOptions(loops=True)}
+    result = no_alignment(AlignmentStatus.OK)
+    with RunFolder(tmp_path, trajectory="odometry.txt") as folder:
+        folder.start(config, 0.0)
+        folder.add(Step(1, 0.0, 1.0, result, np.eye(4), 1.0, False), Progress(last_index=1))
+        folder.save_checkpoint()
+        for name in ("trajectory.txt", "loops.csv"):
+            (tmp_path / name).write_text("of the part")
+        folder.finish({}, complete=False)
+    with RunFolder(tmp_path, trajectory="odometry.txt") as folder:
+        assert folder.resume(config, {}) is not None
+        assert not (tmp_path / "trajectory.txt").exists() and not (tmp_path / "loops.csv").exists()

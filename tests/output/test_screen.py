@@ -82,9 +82,10 @@ def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys:
     with (tmp_path / "frames.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(FRAME_COLUMNS)
-        for status, error in ((frozen, np.nan), (ok, 4.5), (frozen, 4.5), (frozen, np.nan)):
+        pairs = (frozen, np.nan), (ok, 4.5), (frozen, 4.5), (frozen, np.nan)
+        for index, (status, error) in enumerate(pairs, start=1):
             alignment = no_alignment(status)._replace(error=np.float32(error))
-            rows.writerow(frame_row(Step(1, 0.0, 1.0, alignment, np.eye(4), 1.0, False)))
+            rows.writerow(frame_row(Step(index, 0.0, 1.0, alignment, np.eye(4), 1.0, False)))
     print_run("run", {"statuses": {"frozen": 3, "ok": 1, "gap": 1}}, tmp_path, has_truth=False)
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table if row[0].startswith("pairs:")}

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from gavo_jax.odometry.stream import track
 from gavo_jax.se3 import exp
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer import colors, live, pictures, search_space
+from gavo_jax.viewer.scene import NOTHING
 from gavo_jax.viewer.seen import SeenCubes
 
 FRAMES, GENERATIONS, PARTICLES = 4, 8 + 6, (16,) * 8 + (8,) * 6
@@ -34,9 +36,8 @@ ENTITIES_OF_A_PAIR = (
     "/images/warped",
     "/images/residual",
     "/search/truth",
-    "/world/estimate",
-    "/world/truth",
 )
+ENTITIES_OF_A_KNOWN_MOTION = ("/world/estimate", "/world/truth")
 ENTITIES_OF_A_FRAME = ("/images/target", "/world/camera", "/world/camera/image")
 ENTITIES_OF_A_LEVEL = ("/search/bounds", "/search/ticks", "/search/numbers")
 ENTITIES_OF_A_GENERATION = ("/search/error", "/search/particles", "/state")
@@ -86,7 +87,9 @@ def rows(run):
 
 def test_every_entity_has_its_rows(run, rows):
     pairs = FRAMES - 1
+    segments = [0, *(step.segment for step in run[0])]
     expected = {
+        **dict.fromkeys(ENTITIES_OF_A_KNOWN_MOTION, sum(a == b for a, b in pairwise(segments))),
         **dict.fromkeys(ENTITIES_OF_A_FRAME, FRAMES),
         **dict.fromkeys(ENTITIES_OF_A_PAIR, pairs),
         **dict.fromkeys(ENTITIES_OF_A_GENERATION, pairs * GENERATIONS),
@@ -116,8 +119,8 @@ def test_particles_curves_and_path_are_those_of_the_run(run, rows):
         assert np.allclose(last, found, atol=0.01)
         [rmse] = [row for row in rows["/curves/rmse"] if row["frame"] == step.index]
         assert component(rmse, "scalars")[0] == pytest.approx(float(np.sqrt(step.alignment.error)))
-        [piece] = [row for row in rows["/world/estimate"] if row["frame"] == step.index]
-        assert np.allclose(component(piece, "strips")[0][1], step.world_T_camera[:3, 3], atol=1e-6)
+        for piece in [row for row in rows["/world/estimate"] if row["frame"] == step.index]:
+            assert np.allclose(component(piece, "strips")[0][1], step.world_T_camera[:3, 3], atol=1e-6)
     texts = [component(row, "text")[0] for row in sorted(rows["/state"], key=lambda row: row["generation"])]
     assert "| 16 | 4 | 1/16 | 1 of 8 |" in texts[0] and "| 8 | 3 | 1/8 | 6 of 6 |" in texts[GENERATIONS - 1]
     [error] = re.findall(r"\| ([\d.]+) mm \|", texts[0])
@@ -218,7 +221,44 @@ def test_a_lost_and_an_unreadable_frame_are_shown_as_far_as_known(run, tmp_path)
         shown.watch(sequence[2], replace(steps[1], reference_timestamp=float(sequence.timestamps[1]), lost=False))
     found = read_recording(tmp_path / "lost.rrd")
     assert len(found["/images/target"]) == 2 and len(found["/world/estimate"]) == 2
-    assert "/world/truth" not in found and "/images/warped" not in found
+    assert "/world/truth" not in found
+    shown_images = [component(row, "blob") for row in found["/images/warped"]]
+    assert [bytes(blob[0]) for blob in shown_images] == [NOTHING] * 2, "not those of a frame before"
+
+
+def test_between_segments_nothing_is_known(run, tmp_path):
+    """Nor is an error told that holds the unknown motion."""
+    steps, sequence, _ = run
+    apart = np.diag([1.0, 1.0, 1.0, 1.0])
+    apart[0, 3] = 5.0
+    placed = [steps[0], *(replace(step, segment=1, world_T_camera=apart @ step.world_T_camera) for step in steps[1:])]
+    shown = live.make_viewer("save", tmp_path / "segments.rrd")
+    with shown:
+        shown.open("segments", sequence.camera, sequence.timestamps, sequence.ground_truth)
+        for step in (None, *placed):
+            shown.watch(None, step)
+    found = read_recording(tmp_path / "segments.rrd")
+    errors = [component(row, "scalars")[0] for row in found["/curves/distance_error"]]
+    assert len(errors) == len(steps) and max(errors) < 0.2
+    pieces = [np.array(component(row, "strips")[0]) for row in found["/world/estimate"]]
+    assert len(pieces) == len(steps) - 1 and max(np.linalg.norm(piece[1] - piece[0]) for piece in pieces) < 0.5
+
+
+def test_a_recording_has_its_name_once_it_is_whole(run, tmp_path):
+    """The one before stays until then, and where the run does not come to its end."""
+    _, sequence, _ = run
+    path = tmp_path / "run.rrd"
+    path.write_bytes(b"earlier")
+    shown = live.make_viewer("save", path)
+    with pytest.raises(KeyboardInterrupt), shown:
+        shown.open("", sequence.camera, sequence.timestamps, None)
+        shown.watch(sequence[0], None)
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_page_that_nobody_serves_is_not_waited_for(tmp_path):
+    live.make_viewer("web", tmp_path / "run.rrd").stay()
 
 
 def test_generations_are_sorted_coloured_and_thinned():
