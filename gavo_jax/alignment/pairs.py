@@ -20,6 +20,7 @@ from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
 from gavo_jax.image.numbers import as_array, as_depth
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
+from gavo_jax.precision import in_32_bits
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -220,6 +221,7 @@ def align_rows(sides, camera, settings, keys, guesses, count: int | None = None)
     return jax.tree.map(lambda leaf: leaf[:rows], result)
 
 
+@in_32_bits
 def align(
     reference: Frame | tuple[Any, Any],
     target: Frame | tuple[Any, Any],
@@ -267,6 +269,7 @@ def align(
     return row._replace(status=AlignmentStatus(int(row.status)))
 
 
+@in_32_bits
 def align_batch(
     references: Any,
     targets: Any,

@@ -29,6 +29,7 @@ from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.precision import in_32_bits
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 
@@ -114,7 +115,7 @@ class BodyAware:
         """Compile what every frame needs, side by side: the search, and the look at what it explains."""
         start, state = time.perf_counter(), self.blank_state()
         with ThreadPoolExecutor(max_workers=1) as worker:
-            look = worker.submit(self.retina.look, state.scene, state.tracker, np.eye(4))
+            look = worker.submit(in_32_bits(self.retina.look), state.scene, state.tracker, np.eye(4))
             self.first.warm_up()
             jax.block_until_ready(look.result())
         return time.perf_counter() - start

@@ -23,6 +23,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
+from gavo_jax.precision import in_32_bits
 
 Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
 ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")
@@ -149,6 +150,7 @@ class _Trial:
         return evaluate
 
 
+@in_32_bits
 def estimate_camera(
     sequence: Sequence,
     wanted: Iterable[Wanted] = ALWAYS,

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax
 import tyro
 
 from gavo_jax import compiler, interrupts
@@ -52,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    jax.config.update("jax_enable_x64", False)  # in every thread; see `precision`
     with interrupts.raised(), _told_warnings():
         try:
             status = _run(arguments)

@@ -31,6 +31,7 @@ from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
+from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
@@ -63,6 +64,7 @@ def track_together(
         return _drive(sequence, odometries, register, on_frame)
 
 
+@in_32_bits
 def track_stacked(
     sequence: FrameSequence,
     settings: Sequence[Settings],

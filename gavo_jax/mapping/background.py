@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Found, Step
+from gavo_jax.precision import in_32_bits
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -41,7 +42,7 @@ class BackgroundMapper:
     def watch(self, frame: Frame | None, step: Step | None) -> None:
         """Take notice of a frame, soon; see `Mapper.watch`."""
         self._wait_for(MOST_AHEAD - 1)
-        self._ahead.append(self._worker.submit(self.mapper.watch, frame, step))
+        self._ahead.append(self._worker.submit(in_32_bits(self.mapper.watch), frame, step))
 
     def find(self, frame: Frame) -> Found | None:
         """Where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
@@ -58,7 +59,7 @@ class BackgroundMapper:
     def _after_all(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """What a function returns that the worker runs once the map has seen all frames."""
         self._wait_for(0)
-        return self._worker.submit(work, *args, **kwargs).result()
+        return self._worker.submit(in_32_bits(work), *args, **kwargs).result()
 
     def _wait_for(self, most: int) -> None:
         """Wait until the worker has no more than so many frames left."""

@@ -26,6 +26,7 @@ from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.way import Way
+from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -136,6 +137,7 @@ class Odometry:
         GavoError: The camera's images are too small.
     """
 
+    @in_32_bits
     def __init__(
         self,
         camera: Camera,
@@ -154,10 +156,12 @@ class Odometry:
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
 
+    @in_32_bits
     def warm_up(self) -> float:
         """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
         return self.aligner.warm_up()
 
+    @in_32_bits
     def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
         """Track one more frame.
 

@@ -20,6 +20,7 @@ from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before
 from gavo_jax.odometry.stream import track, unwatched
+from gavo_jax.precision import in_32_bits
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -68,6 +69,7 @@ class OdometryRun:
         return build_map(self.sequence, self.steps, shape, voxel, trajectory=self.trajectory)
 
 
+@in_32_bits
 def run_odometry(
     sequence: Sequence,
     settings: Settings | Solver | None = None,

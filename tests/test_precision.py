@@ -1,0 +1,50 @@
+"""In a program that computes in 64 bits, the results are the same ones, bit for bit."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from small import CAMERA, GENETIC
+
+import gavo_jax as gavo
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.precision import in_32_bits
+
+FRAMES = SyntheticSequence(frames=4, camera=CAMERA)
+SETTINGS = replace(GENETIC, odometry=replace(GENETIC.odometry, bodies="mask"))
+
+
+def test_results_are_those_of_32_bits(tmp_path: Path) -> None:
+    """In a process of its own: the switch is for the whole program, and threads begin with it."""
+    program = (
+        "import sys; import numpy as np; from test_precision import results\n"
+        "import jax; assert jax.numpy.zeros(1).dtype == np.float64\n"
+        "np.savez(sys.argv[1], *results()); assert jax.numpy.zeros(1).dtype == np.float64"
+    )
+    places = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    outside = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": places}
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "found.npz")], env=outside, check=True)
+    with np.load(tmp_path / "found.npz") as found:
+        for name, wanted in zip(found.files, results(), strict=True):
+            np.testing.assert_array_equal(found[name], wanted)
+
+
+def results() -> list[np.ndarray]:
+    """Motions and covariances of a pair, of a batch and of a run."""
+    one = gavo.align(FRAMES[0], FRAMES[1], CAMERA, SETTINGS, guess=np.eye(4))
+    batch = gavo.align_batch([FRAMES[0]], [FRAMES[1]], CAMERA, SETTINGS)
+    run = gavo.run_odometry(FRAMES, SETTINGS)
+    found = [one, batch, *run.alignments]
+    return [np.asarray(leaf) for result in found for leaf in (result.target_T_reference, result.covariance)]
+
+
+def test_where_it_is_switched_off_nothing_changes() -> None:
+    with jax.enable_x64(True):
+        assert jax.numpy.zeros(1).dtype == np.float64
+        assert in_32_bits(lambda: jax.numpy.zeros(1))().dtype == np.float32
+        assert jax.numpy.zeros(1).dtype == np.float64
+    assert in_32_bits(lambda: jax.numpy.zeros(1))().dtype == np.float32
