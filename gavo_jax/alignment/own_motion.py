@@ -207,8 +207,9 @@ def with_own_motion(result: Alignment, found: OwnMotion) -> Alignment:
     as determined.
     """
     motion = found.target_T_reference
-    deviation = np.sqrt(np.diag(found.covariance))
-    is_vague = deviation[:3].max() > MAX_TRANSLATION_DEVIATION or deviation[3:].max() > MAX_ROTATION_DEVIATION
+    variance = np.diag(found.covariance)
+    most = np.repeat(np.square([MAX_TRANSLATION_DEVIATION, MAX_ROTATION_DEVIATION]), 3)
+    is_vague = not np.all((variance >= 0) & (variance <= most))
     findings = int(result.findings) & ~bit(AlignmentStatus.LOW_TEXTURE)
     findings |= bit(AlignmentStatus.LOW_TEXTURE) if is_vague else 0
     status = [status for status in GRAVITY if findings & bit(status)]

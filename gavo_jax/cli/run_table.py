@@ -111,18 +111,19 @@ def _of_bodies(path: Path) -> list[Row]:
 
 
 def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:
-    """What a trajectory tells without a truth beside it."""
+    """What a trajectory tells without a truth beside it: of its end nothing where the way there is unknown."""
     places = trajectory.world_T_camera[:, :3, 3]
     known = np.diff(trajectory.segments) == 0
     path = float(np.linalg.norm(np.diff(places, axis=0), axis=1)[known].sum())
     angle = float(np.degrees(rotation_angle(trajectory.world_T_camera[-1:, :3, :3])[0]))
     share = metrics.get("statuses", {}).get("ok", 0) / max(1, metrics.get("pairs", 0))
-    return [
-        ("length of the path", number(path), "m"),
-        ("end: x right, y down, z forward", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
-        ("end: turned by", number(angle, 2), "deg"),
-        ("pairs that are ok", number(100 * share, 1), "%"),
-    ]
+    rows = [("length of the path", number(path), "m")]
+    if trajectory.segments[0] == trajectory.segments[-1]:
+        rows += [
+            ("end: x right, y down, z forward", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
+            ("end: turned by", number(angle, 2), "deg"),
+        ]
+    return [*rows, ("pairs that are ok", number(100 * share, 1), "%")]
 
 
 def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: bool) -> str | None:

@@ -68,7 +68,7 @@ def level_of(population: Population) -> Level | None:
     positions = (camera_positions(twists) * MILLIMETRES).astype(np.float32)
     return Level(
         positions[:-1].reshape(*rmse.shape, 3),
-        PARTICLE_COLORS[place.astype(np.uint8)],
+        PARTICLE_COLORS[np.nan_to_num(place, nan=255.0).astype(np.uint8)],
         positions[-1],
         np.asarray(population.half_widths)[:3] * np.float32(MILLIMETRES),
         int(population.level),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
-from gavo_jax.alignment.result import no_alignment
+from gavo_jax.alignment.result import no_alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
@@ -73,5 +73,7 @@ def test_corners_decide_whether_a_motion_is_determined() -> None:
     findings = bit(AlignmentStatus.LOW_TEXTURE) | bit(AlignmentStatus.LOW_OVERLAP)
     result = no_alignment(AlignmentStatus.LOW_TEXTURE)._replace(findings=findings)
     assert with_own_motion(result, found).status == AlignmentStatus.LOW_OVERLAP
+    impossible = with_own_motion(result, found._replace(covariance=-found.covariance))
+    assert AlignmentStatus.LOW_TEXTURE in on_host(impossible).statuses, "a variance that is none tells nothing"
     vague = with_own_motion(result, found._replace(covariance=100.0 * found.covariance))
     assert vague.status == AlignmentStatus.LOW_OVERLAP and vague.findings == findings

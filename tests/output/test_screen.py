@@ -96,6 +96,16 @@ def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys:
     }
 
 
+@pytest.mark.parametrize("segments", [(0, 0), (0, 1)])
+def test_of_the_end_nothing_is_said_where_the_way_there_is_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], segments: tuple[int, int]
+) -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    Trajectory(np.arange(2.0), poses, np.array(segments)).write_tum(tmp_path / "trajectory.txt")
+    print_run("run", {}, tmp_path, has_truth=False)
+    assert ("end: turned by" in capsys.readouterr().out) == (segments == (0, 0))
+
+
 LONG = "clip: a folder of frames, 40 frames of 640x480; camera fx 517.3 fy 516.5 cx 318.6 cy 255.3 (file); depth in mm"
 
 
