@@ -329,6 +329,13 @@ def _plain(image: Any) -> Any:
     return image if isinstance(image, jax.Array) else as_array(image)
 
 
+def _readings(depth: Any) -> Any:
+    """Depth that a program takes, 0 where it holds no finite number."""
+    if not isinstance(depth, jax.Array):
+        return as_depth(depth)
+    return jnp.where(jnp.isfinite(depth), depth, 0) if jnp.issubdtype(depth.dtype, jnp.floating) else depth
+
+
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
         raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
@@ -339,10 +346,9 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
             fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
             raise GavoError(fault + what_helps(name, image))
     require_grey_levels(grey)
-    if not isinstance(depth, jax.Array):
-        depth = as_depth(depth)
+    depth = _readings(depth)
     if camera.is_distorted:
-        grey, depth = camera.undistort(np.asarray(grey), as_depth(np.asarray(depth)))
+        grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
 
 
@@ -373,6 +379,6 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
             raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
         require_grey_levels(side[0])
-        return Images(jnp.asarray(side[0]), jnp.asarray(side[1]))
+        return Images(jnp.asarray(side[0]), jnp.asarray(_readings(side[1])))
     images = [_rectified_images(frame, camera) for frame in side]
     return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

@@ -16,7 +16,7 @@ from gavo_jax import presets
 from gavo_jax.alignment import pairs
 from gavo_jax.alignment.information import Information
 from gavo_jax.alignment.judgement import Evidence, find_against
-from gavo_jax.alignment.pairs import align, align_batch
+from gavo_jax.alignment.pairs import align, align_batch, stacked_images
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.visits import levels_of, prepare_pair, stack_levels, visited_levels
 from gavo_jax.camera import Camera
@@ -266,6 +266,16 @@ def test_a_batch_of_arrays_is_a_batch_of_frames(
     again = align_batch(stacked((0, 8)), stacked((1, 9)), sequence.camera, keys=keys)
     for a, b in zip(batch, again, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("put", [np.asarray, jnp.asarray])
+def test_depth_that_is_no_number_is_no_reading_however_it_comes(put: Any) -> None:
+    grey, depth = np.zeros((2, 120, 160), np.float32), np.ones((2, 120, 160), np.float32)
+    depth[0, 0], depth[0, 1] = np.inf, np.nan
+    camera = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+    for side in ((put(grey), put(depth)), [(put(grey[i]), put(depth[i])) for i in range(2)]):
+        cleaned = np.asarray(stacked_images(side, camera).depth)
+        assert not cleaned[0, :2].any() and (cleaned[0, 2:] == 1).all() and (cleaned[1] == 1).all()
 
 
 def test_a_batch_of_two_pairs_of_images_is_no_stack_of_them(
