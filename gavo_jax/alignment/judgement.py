@@ -88,7 +88,9 @@ def conclude(
     against = find_against(evidence, covariance, objective, search.rival, share * points, chosen_by)
     if options.precondition:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
-        against[AlignmentStatus.HIGH_ERROR] |= edge.is_out_of_reach(motion)
+        # along a way that the images leave open any motion is as good, that at the edge, too
+        is_told = ~against[AlignmentStatus.LOW_TEXTURE]
+        against[AlignmentStatus.HIGH_ERROR] |= is_told & edge.is_out_of_reach(motion)
     findings = as_findings(against)
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
