@@ -267,7 +267,7 @@ def _rigid(place: str, rows: Any) -> np.ndarray:
         matrix = np.array(rows, float)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise ValueError
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise GavoError(f"{place}: must be four rows of four numbers") from None
     rotation = matrix[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()

@@ -99,7 +99,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
                 raise
             except KeyError as error:
                 raise GavoError(f"{path}: {read.__doc__ or ''} Its entry {error} is missing") from None
-            except (TypeError, ValueError, IndexError, AttributeError):
+            except (TypeError, ValueError, IndexError, AttributeError, OverflowError):
                 raise GavoError(
                     f"{path}: {read.__doc__ or ''} Entries are missing, or an entry is of another kind"
                 ) from None

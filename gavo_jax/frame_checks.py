@@ -60,12 +60,16 @@ class History(NamedTuple):
     range_timestamp: float = 0.0
     units_known: bool = False
     """Whether a frame's depth was that of a camera; since then it has changed only as a scene can."""
+    has_relief: bool = False
+    """Whether a frame's readings have differed."""
     doubts: int = 0
     """Frames in a row that were refused only for being unlike those before."""
 
 
 MIN_DEPTH_SHARE = 0.05
 """Share of an image, or of a reference's points, with a reading, below which there is no depth to align by."""
+FLAT = 1e-4
+"""Share of the farthest reading by which readings differ at least that are not all of one depth."""
 REMEMBERED = 15
 """Frames whose median says what is usual."""
 MAX_DOUBTS = 3
@@ -252,11 +256,18 @@ def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray)
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
-    """Whether depth is the last frame's once more, though it claims to be of another moment; none at all is not."""
+    """Whether depth is the last frame's once more, though it claims to be of another moment. None at all is not; nor is
+    a wall that is seen from straight before it by an exact sensor, and has been since the first frame.
+    """
     rows, stamp = np.asarray(frame.depth)[:: ROW_STEP**2], frame.depth_timestamp
     checksum = zlib.crc32(rows.tobytes())
     repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
-    return repeated and bool(np.any(rows > 0)), history._replace(depth_checksum=checksum, depth_timestamp=stamp)
+    readings = _readings(rows)
+    has_relief = readings.size > 0 and bool(np.ptp(readings) > FLAT * readings.max())
+    history = history._replace(
+        depth_checksum=checksum, depth_timestamp=stamp, has_relief=history.has_relief or has_relief
+    )
+    return repeated and history.has_relief and readings.size > 0, history
 
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:

@@ -34,7 +34,7 @@ NO_POSE = "numbers that are not finite, or a zero quaternion"
 TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
 
 
-SEGMENT_COMMENT = re.compile(r"# segment (\d+)\b")
+SEGMENT_COMMENT = re.compile(r"# segment (\d{1,9})\b")
 """Start of the comment line before a pose of another segment than the last one's, with that segment's number from 1."""
 
 

@@ -247,6 +247,7 @@ def rig(pose: object) -> str:
 FAULTS = {
     "pose without camera.toml": (TOML + f"colour_T_depth = {np.eye(4).tolist()}\n", "[depth]"),
     "pose of three rows.toml": (rig(np.eye(4)[:3].tolist()), "four rows"),
+    "pose of huge numbers.toml": (rig(f"[[{10**400}, 0, 0, 0]]"), "four rows"),
     "pose of text.toml": (rig('["a"]'), "four rows"),
     "skewed pose.toml": (rig((2 * np.eye(4)).tolist()), "rigid"),
     "mirrored pose.toml": (rig(np.diag([-1.0, 1, 1, 1]).tolist()), "rigid"),

@@ -234,3 +234,12 @@ def test_depth_that_is_missing_throughout_is_missing_not_frozen(frames: list[Fra
     empty = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames[:3]]
     findings, _ = look(History(), *empty)
     assert [finding.status for finding in findings] == [Status.NO_DEPTH] * 3
+
+
+def test_a_wall_from_straight_before_it_is_not_frozen_and_depth_that_becomes_one_is(frames: list[Frame]) -> None:
+    """Of an exact sensor each such depth image is the last one's, to the digit."""
+    flat = [replace(frame, depth=np.full_like(frame.depth, 10000)) for frame in frames]
+    findings, _ = look(History(), *flat[:4])
+    assert [finding.status for finding in findings] == [Status.OK] * 4
+    findings, _ = look(History(), frames[0], *flat[1:4])
+    assert [finding.status for finding in findings][2:] == [Status.FROZEN] * 2

@@ -141,6 +141,12 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, none):
     assert trajectory.timestamps[-1] == 3 and len(trajectory) == 2 and trajectory.segments.tolist() == [0, 1]
 
 
+def test_a_segment_of_a_number_that_no_file_has_is_a_comment(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(f"1 0 0 0 0 0 0 1\n# segment {10**22}\n2 0 0 0 0 0 0 1\n")
+    assert Trajectory.read_tum(path).segments.tolist() == [0, 0]
+
+
 @pytest.mark.parametrize("segments", [[0, 0, 1, 1, 0, 0], [1, 1, 2, 2, 2, 4], [0, 0, 0, 0, 0, 0]])
 def test_segments_come_back_by_their_numbers(tmp_path, segments):
     """A stretch that was found in the map goes on with the first segment: read back, it was a third one."""

@@ -40,26 +40,16 @@ def evaluate(options: Evaluate) -> int:
             refuse_foreign(options.plot, file, what)
     paths = options.estimate, options.groundtruth
     (estimate, *_), (truth, *_) = read = _read(*paths)
-    try:
-        _check_units(estimate.timestamps, truth.timestamps)
-        relative = relative_pose_error(estimate, truth, options.delta, options.unit)
-        absolute = absolute_trajectory_error(estimate, truth)
-        distance = distance_error(estimate, truth)
-    except GavoError as error:
-        hint = _hint(estimate, truth, options)
-        raise GavoError(f"{options.estimate} against {options.groundtruth}: {error}{hint}") from None
-    series = {
-        "rpe_translation": relative.translation,
-        "rpe_rotation": relative.rotation,
-        "ate": absolute,
-        "distance_error": distance,
-    }
+    series, missing = _errors(estimate, truth, options)
     if options.json:
         span = {"delta": options.delta, "delta_unit": options.unit}
-        print(json.dumps({**span, **{name: errors.summary() for name, errors in series.items()}}, indent=2))
+        figures = {name: None for name in NAMES} | {name: errors.summary() for name, errors in series.items()}
+        print(json.dumps({**span, **figures}, indent=2))
     else:
         _print(options, series)
     note = tell if options.json else say  # beside the JSON, not in it
+    for words in missing:
+        note(words)
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
             note(f"{path}: its stamps are taken for {UNITS[unit]}")
@@ -72,6 +62,31 @@ def evaluate(options: Evaluate) -> int:
         if not options.json:
             say(f"figures in {folder}")
     return 0
+
+
+NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")
+"""Of the errors, in the order in which they are told."""
+
+
+def _errors(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> tuple[dict[str, ErrorSeries], list[str]]:
+    """The errors by name, and why those of the whole trajectory cannot be had where they cannot.
+
+    Raises:
+        GavoError: no two poses are as far apart as the relative error asks, or stamps are of another unit.
+    """
+    try:
+        _check_units(estimate.timestamps, truth.timestamps)
+        relative = relative_pose_error(estimate, truth, options.delta, options.unit)
+    except GavoError as error:
+        hint = _hint(estimate, truth, options)
+        raise GavoError(f"{options.estimate} against {options.groundtruth}: {error}{hint}") from None
+    series, missing = {"rpe_translation": relative.translation, "rpe_rotation": relative.rotation}, []
+    for name, compute in (("ate", absolute_trajectory_error), ("distance_error", distance_error)):
+        try:
+            series[name] = compute(estimate, truth)
+        except GavoError as error:
+            missing.append(str(error))
+    return series, missing
 
 
 def _read(*paths: Path) -> list[tuple[Trajectory, float]]:
@@ -122,16 +137,17 @@ def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
 def _print(options: Evaluate, series: dict[str, ErrorSeries]) -> None:
     """Print a row for each kind of error, and below what each is."""
     span = _span(options.delta, options.unit)
-    names = (f"RPE translation, m/{span}", f"RPE rotation, deg/{span}", "ATE, m", "distance error, m")
+    heads = (f"RPE translation, m/{span}", f"RPE rotation, deg/{span}", "ATE, m", "distance error, m")
+    names: dict[str, str] = dict(zip(NAMES, heads, strict=True))
     rows = [
-        (name, *(number(value, 6) for value in (e.rmse, e.mean, e.median, e.max)), len(e.values))
-        for name, e in zip(names, series.values(), strict=True)
+        (names[name], *(number(value, 6) for value in (e.rmse, e.mean, e.median, e.max)), len(e.values))
+        for name, e in series.items()
     ]
     print_table(
         f"{options.estimate} against {options.groundtruth}", ("", "RMSE", "mean", "median", "max", "count"), rows
     )
-    for name, errors in zip(names, series.values(), strict=True):
-        say(f"{name}: {errors.definition}.")
+    for name, errors in series.items():
+        say(f"{names[name]}: {errors.definition}.")
 
 
 def _span(delta: float, unit: str) -> str:

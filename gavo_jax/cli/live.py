@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_files import load_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files import load_calibration
 from gavo_jax.cli.map_file import check_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_seed, choose_settings, with_shortcuts
+from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.devices import open_device
-from gavo_jax.datasets.live import LiveImages, Newest, frame_of
+from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
@@ -45,7 +46,7 @@ def run_live(options: Run) -> int:
     if settings.odometry.loops:
         raise GavoError(f"--loops: {NOT_LIVE.format(options.sequence)}")
     device = open_device(options.sequence)
-    camera = device.camera if options.camera == "auto" else load_camera(options.camera)
+    camera = _camera(options, device)
     name = f"{device.name}-{method}-{preset}"
     path = options.output or Path("runs") / name
     enable_compilation_cache()
@@ -124,12 +125,28 @@ def _track(
     return time.perf_counter() - start, False
 
 
+def _camera(options: Run, device: LiveDevice) -> Camera:
+    """The device's own, or the one that is named, which has the device's unit of depth where it says none."""
+    camera = device.camera
+    if options.camera != "auto":
+        calibration = load_calibration(options.camera, (camera.width, camera.height), camera.depth_scale)
+        if calibration.depth is not None:
+            raise GavoError(f"{options.camera}: [depth]: {NOT_LIVE.format(options.sequence)}")
+        camera = calibration.color
+    check_positive("--depth-scale", options.depth_scale, 1e6)
+    return camera if options.depth_scale is None else replace(camera, depth_scale=options.depth_scale)
+
+
 def _refuse_what_cannot_be(options: Run) -> None:
     """Raise GavoError for options that a live camera has no use for."""
     for option, is_given in (
         ("--resume", options.resume),
         ("--start", options.start != 0),
         ("--stride", options.stride != 1),
+        ("--moving", options.moving != 0),
+        ("--rate", options.rate is not None),
+        ("--colour-topic", options.colour_topic is not None),
+        ("--depth-topic", options.depth_topic is not None),
     ):
         if is_given:
             raise GavoError(f"{option}: {NOT_LIVE.format(options.sequence)}")

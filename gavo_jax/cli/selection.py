@@ -10,6 +10,7 @@ from gavo_jax.datasets.actors import MOST_BODIES
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
 from gavo_jax.errors import GavoError
 from gavo_jax.output.files import describe, read_json
@@ -40,12 +41,13 @@ def open_sequence(source: Source, force: bool = False, color: bool = False) -> S
         raise GavoError(f"--moving: is of the {SYNTHETIC} room, not of {source.sequence}")
     if not 0 <= source.moving <= MOST_BODIES:
         raise GavoError(f"--moving: must be from 0 to {MOST_BODIES}, not {source.moving}")
-    return open_part(
+    sequence = open_part(
         *(source.sequence, source.camera, source.start, source.frames, source.stride),
         reading=replace(reading_of(source), color=color),
         force=force or source.force,
         moving=source.moving,
     )
+    return without_distortion(sequence)  # somebody's own dataset may leave it in
 
 
 def reading_of(source: Source) -> Reading:

@@ -4,7 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple, overload
@@ -88,7 +88,10 @@ class Reading:
         if isinstance(self.camera, Calibration):
             return self.camera
         if isinstance(self.camera, Camera):
-            return Calibration(self.camera)
+            # a camera always has a scale: TUM's, where nobody said one
+            if self.camera.depth_scale != DEPTH_SCALE or depth_scale == DEPTH_SCALE:
+                return Calibration(self.camera)
+            return Calibration(replace(self.camera, depth_scale=depth_scale), states_depth_scale=False)
         return load_calibration(self.camera, size, depth_scale, is_rectified)
 
 

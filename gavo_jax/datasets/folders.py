@@ -42,6 +42,8 @@ class NumberedFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of numbered images"
     poses_of_depth: ClassVar[bool] = False
+    DEPTH_SCALE: ClassVar[float] = MILLIMETRES
+    """Units a metre, where a camera file that is named does not say them."""
     """Whether the poses are those of the depth camera, where it is another than the colour camera."""
     STAMPS: ClassVar[str] = ""
     """The file of `stamps`."""
@@ -100,7 +102,7 @@ class NumberedFolder(FileSequence):
             raise GavoError(f"{path / cls.STAMPS}: has no row of any frame that is there")
         entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
-        calibration = reading.calibration(own, partial(size_of_most, entries), MILLIMETRES)
+        calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
         if (path / TRUTH).exists():  # somebody's own, which is better than the dataset's poses
             truth = truth_in(path, None if is_stamped else lambda counts: counts / rate)
         else:
@@ -198,7 +200,8 @@ class Replica(NumberedFolder):
     """A rendered room of Replica as NICE-SLAM has it: `results/frame*.jpg`, `results/depth*.png`, `traj.txt`."""
 
     kind: ClassVar[str] = "Replica room"
-    CAMERA = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680, depth_scale=6553.5)
+    DEPTH_SCALE: ClassVar[float] = 6553.5
+    CAMERA = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680, depth_scale=DEPTH_SCALE)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -479,6 +479,20 @@ def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
 
 
+def test_evaluate_tells_what_can_be_had(gavo, tmp_path):
+    """A truth of 5 Hz between the estimate's stamps has no pose at any of them."""
+    poses = np.tile(np.eye(4), (61, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(61)
+    stamps = 100.0 + np.arange(61) / 30
+    Trajectory(stamps, poses).write_tum(tmp_path / "estimate.txt")
+    Trajectory(stamps[::6] + 0.005, poses[::6]).write_tum(tmp_path / "truth.txt")
+    done = gavo("evaluate", "estimate.txt", "truth.txt", "--json")
+    figures = json.loads(done.out)
+    assert done.status == 0 and figures["rpe_translation"]["rmse"] < 0.01 and figures["ate"]["rmse"] < 0.01
+    assert figures["distance_error"] is None and "distance error: the ground truth covers no pose" in done.err
+    assert "distance error: the ground truth" in gavo("evaluate", "estimate.txt", "truth.txt").out
+
+
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
     truth = clip / "groundtruth.txt"
     done = gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames", "--json", "--plot", tmp_path / "figures")

@@ -109,9 +109,25 @@ class Unhurried:
             yield images
 
 
+@pytest.mark.parametrize(("options", "scale"), [((), 1000.0), (("--depth-scale", "2000"), 2000.0)])
+def test_a_lens_that_is_named_leaves_the_devices_unit_of_depth(tmp_path, capsys, monkeypatch, options, scale):
+    """A camera file that says none stands for TUM's 5000: a trajectory five times too short."""
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", lambda: Player(replace(CAMERA, depth_scale=1000.0)))
+    file = tmp_path / "lens.toml"
+    file.write_text("fx = 131.0\nfy = 131.0\ncx = 79.5\ncy = 59.5\nwidth = 160\nheight = 120\n")
+    done = runner(capsys)(
+        *("run", "player", "--method", "small-newton", "--output", tmp_path / "run", "--camera", file, *options)
+    )
+    assert done.status == 0, done.err
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["sequence"]["camera"]["depth_scale"] == scale
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("player", "--rate", "15"), "--rate: not with the live source 'player'"),
         (("player", "--resume"), "--resume: not with the live source 'player'"),
         (("player", "--loops"), "--loops: not with the live source 'player'"),
         (("player", "--map", "a.xyz"), "a.xyz: a map ends in .ply"),

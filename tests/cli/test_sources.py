@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -345,3 +346,10 @@ def test_a_clip_of_more_than_a_second_has_its_drift(gavo, tmp_path):
     write_tum(SyntheticSequence(frames=34, noise=KINECT, camera=CAMERA), tmp_path / "clip")
     done = gavo("run", "clip", *FAST, "--output", "out")
     assert "drift: RPE over 1 s, translation" in done.out and "No drift" not in done.out
+
+
+def test_commands_take_the_lens_out_of_a_dataset_of_ones_own(monkeypatch):
+    """The driver does so of each frame; the map, the figures and the viewer had them as they were."""
+    bent = replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0, 0.0))
+    monkeypatch.setattr("gavo_jax.cli.selection.open_part", lambda *_, **__: SyntheticSequence(2, camera=bent))
+    assert not open_sequence(Source()).camera.is_distorted

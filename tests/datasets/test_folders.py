@@ -649,3 +649,18 @@ def test_links_to_folders_and_files_are_followed(folder, name):
     sequence.check()
     assert recognise(folder.parent / "link").kind == LAYOUTS[name][0] and len(sequence) == 4
     assert (sequence.ground_truth is None) == (open_source(folder).ground_truth is None)
+
+
+def test_a_camera_that_says_no_unit_has_that_of_the_source(tmp_path):
+    """A camera made in Python always has one: TUM's, where nobody said another."""
+    bare = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+    file = tmp_path / "bare.toml"
+    file.write_text("fx = 131.0\nfy = 131.0\ncx = 79.5\ncy = 59.5\nwidth = 160\nheight = 120\n")
+    for name, scale in (("seven_scenes", 1000.0), ("replica", 6553.5)):
+        folder = tmp_path / name
+        folder.mkdir()
+        LAYOUTS[name][1](folder)
+        for camera in (bare, str(file)):
+            assert open_source(folder, Reading(camera=camera)).camera.depth_scale == scale, (name, camera)
+        said = Reading(camera=dataclasses.replace(bare, depth_scale=2000.0))
+        assert open_source(folder, said).camera.depth_scale == 2000
