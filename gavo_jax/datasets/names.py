@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from os.path import commonprefix
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,10 +145,38 @@ def stamps(names: Sequence[str]) -> list[float] | None:
     """Seconds, where all names are stamps; None where they are not.
 
     Stamps are seconds or milliseconds with decimals, day and time, or whole numbers: since 1970 in s, ms, µs or ns, or
-    since a device was switched on in ms, µs or ns. Nothing else may change from name to name, and the rate has to be
-    that of a camera.
+    since a device was switched on in ms, µs or ns. Nothing else may change from name to name but an index before them
+    that grows with them, and the rate has to be that of a camera.
     """
+    bare = _without_tail(names)
+    found = _stamps(names) or _stamps(bare)
+    if found or (split := _without_index(bare)) is None:
+        return found
+    indices, rest = split
+    found = _stamps(rest)
+    return found if found and (np.argsort(indices) == np.argsort(found, kind="stable")).all() else None
+
+
+def _stamps(names: Sequence[str]) -> list[float] | None:
+    """The same of names that stamps end."""
     return next((found for read in (_redwood, _dates, _decimals, _counts) if (found := read(names))), None)
+
+
+def _without_tail(names: Sequence[str]) -> list[str]:
+    """Names without what follows the last number that changes, if that is the same in all."""
+    tail = commonprefix([name[::-1] for name in names])[::-1] if len(set(names)) > 1 else ""
+    tail = re.sub(r"^\d*(\.\d+)?", "", tail)  # digits belong to the number
+    return [name.removesuffix(tail) for name in names]
+
+
+def _without_index(names: Sequence[str]) -> tuple[list[int], list[str]] | None:
+    """The first number that changes, and what follows it; None where it tells no frames apart, or is a time."""
+    head = re.sub(r"\d*$", "", commonprefix(names))
+    found = [match for name in names if (match := re.match(r"(\d+)(\D.*)", name.removeprefix(head), re.DOTALL))]
+    indices = [int(match[1]) for match in found]
+    if len(set(indices)) < len(names) or max(indices, default=0) >= 10**MOST_DIGITS or unit_of(indices) is not None:
+        return None
+    return indices, [match[2] for match in found]
 
 
 def _redwood(names: Sequence[str]) -> list[float] | None:

@@ -177,6 +177,26 @@ def test_names_that_are_stamps_are_paired_by_time(folder, stems, seconds):
     assert delay is not None and abs(delay - seconds[1] - (0.01 if "." in stems[0] else 0.0)) < 1e-6
 
 
+@pytest.mark.parametrize("form", ["{stamp}_{kind}", "{kind}/{stamp}_{kind}", "{kind}_{i:05}_{stamp}"])
+@pytest.mark.parametrize(("first", "unit"), [(1700000000123, 1e-3), (77033333, 1e-6)])
+def test_stamps_may_stand_before_a_word_or_after_an_index(folder, form, first, unit):
+    """They became numbers of frames, and steps of 33 ms those of a second and more."""
+    numbers = [first + round(0.033 / unit) * i for i in range(4)]
+    for i, stamp in enumerate(numbers):
+        image(folder / f"{form.format(stamp=stamp, kind='color', i=i)}.png", GREYS[i])
+        image(folder / f"{form.format(stamp=stamp + 3, kind='depth', i=i)}.png", raw(METRES[i], 1000))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    np.testing.assert_allclose(sequence.timestamps, unit * np.array(numbers), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1, 2, 3), (1, 2, 4, 9), (0, 5, 10, 15)])
+def test_numbers_of_frames_before_a_word_are_no_stamps(folder, numbers):
+    for i, number in enumerate(numbers):
+        image(folder / f"{number:06}_color.png", GREYS[i])
+        image(folder / f"{number:06}_depth.png", raw(METRES[i], 1000))
+    np.testing.assert_allclose(open_source(folder, Reading(camera=CAMERA)).timestamps, np.array(numbers) / 30)
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e-9])
 def test_an_image_without_a_number_changes_no_stamp(folder, unit):
     """Milliseconds became numbers of frames by it; of nanoseconds no frame was left."""

@@ -33,6 +33,12 @@ STAMPS = {
     "from zero": at(0.0, 1e-6),
     "Redwood": [f"{i + 1:07}-{round(1e6 * time):012}" for i, time in enumerate(TIMES)],
     "a day": [f"cam 2024-05-01 12-30-59.{900 + round(1e3 * time):03}" for time in TIMES[:3]],
+    "milliseconds before a word": [f"{name}_color" for name in at(CLOCK, 1e-3)],
+    "seconds before a word": [f"{CLOCK + time:.6f}_color_640x480" for time in TIMES],
+    "a day before a word": [f"20240501T123059.{round(1e3 * time):03}-depth" for time in TIMES],
+    "microseconds since switched on before a word": [f"{name}_color" for name in at(77.0, 1e-6)],
+    "milliseconds after an index": [f"color_{i:05}_{name}" for i, name in enumerate(at(CLOCK, 1e-3), 8)],
+    "seconds after an index": [f"{i}_{CLOCK + time:.6f}_v2" for i, time in enumerate(TIMES, 8)],
     "over a minute": ["20240501T123059,900", "20240501T123059,933", "20240501T123059,967", "20240501T123100,000"],
 }
 
@@ -78,6 +84,10 @@ def test_a_frame_that_is_missing_changes_no_unit():
         ["1", "40", "55", "200"],
         ["10", "30", "41", "77", "90", "131", "150", "199"],
         [f"shot1.{i}" for i in range(1, 15)],
+        *([f"rgb_{i:05}_640x480" for i in some] for some in (range(9, 20), range(0, 400, 40), (3, 4, 9, 10, 12))),
+        [f"{i}_{name}" for i, name in zip([3, 2, 5, 4, 1, 6], at(CLOCK, 1e-3), strict=True)],
+        [f"{1305031102 + i}_{175 + 33 * i}" for i in range(6)],
+        [f"{i}_{5 * i}_color" for i in range(20)],
         ["scan1.0001", "scan1.0002", "scan1.0003"],
         ["20240501_123059_000", "20240501_123059_001"],
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
