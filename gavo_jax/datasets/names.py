@@ -40,9 +40,10 @@ FEWEST_OF_A_CLOCK = 6
 """Stamps that can be even by more than chance."""
 
 DATE = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)(?:[.,_-](\d{3,9}))?$"
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
+    r"(?:(?:[.,_-]|(?=(?:\d{3}){1,3}$))(\d{3,9}))?$"
 )
-"""Day and time of day, to the second or finer."""
+"""Day and time of day, to the second or finer; what is finer follows a mark, or in 3, 6 or 9 digits at once."""
 
 REDWOOD = re.compile(r"\d{6,7}-(\d{12})$")
 """A number and microseconds, as Redwood and SUN3D have it."""

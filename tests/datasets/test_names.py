@@ -33,6 +33,10 @@ STAMPS = {
     "from zero": at(0.0, 1e-6),
     "Redwood": [f"{i + 1:07}-{round(1e6 * time):012}" for i, time in enumerate(TIMES)],
     "a day": [f"cam 2024-05-01 12-30-59.{900 + round(1e3 * time):03}" for time in TIMES[:3]],
+    "over a minute at once": [f"PXL_20230501_12{time}" for time in ("0059934", "0059967", "0100000", "0100033")],
+    "over a minute in digits": [
+        f"2023050112{time}" for time in ("0059934000", "0059967333", "0100000667", "0100034000")
+    ],
     "milliseconds before a word": [f"{name}_color" for name in at(CLOCK, 1e-3)],
     "seconds before a word": [f"{CLOCK + time:.6f}_color_640x480" for time in TIMES],
     "a day before a word": [f"20240501T123059.{round(1e3 * time):03}-depth" for time in TIMES],
