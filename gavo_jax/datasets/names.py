@@ -103,15 +103,15 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
 
 
 def _check_start(found: Found) -> None:
-    """Refuse as many images of both kinds, each without a gap, that begin with other numbers.
+    """Refuse enough images of both kinds, each without a gap, that begin with other numbers.
 
     Whether one number or one place in the order is one frame is open then.
     """
     color, depth, _ = found
-    if len(color) != len(depth) or len(color) < FEWEST or color.keys() == depth.keys():
+    if min(len(color), len(depth)) < FEWEST:
         return
     (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
-    if b - a + 1 == d - c + 1 == len(color):
+    if a != c and b - a + 1 == len(color) and d - c + 1 == len(depth):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
             "number, or leave those without a partner out"
