@@ -203,10 +203,16 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     if not found or len(set(seconds)) < len(set(found)):  # of 1.1 and 1.10 the second is the tenth of something
         return None
     seconds = filled_in(found)
-    if _is_between(seconds, INTERVALS):
-        return seconds
-    thousandths = [UNITS[1] * number for number in seconds]  # as RealSense's tools name the images that they export
-    return thousandths if _is_between(thousandths, DEVICE_INTERVALS) else None
+    unit = decimal_unit(seconds)
+    return None if unit is None else [unit * number for number in seconds]
+
+
+def decimal_unit(numbers: Sequence[float]) -> float | None:
+    """Seconds of what numbers with decimals count: one, or a thousandth, as RealSense's tools have it; else None."""
+    if _is_between(numbers, INTERVALS):
+        return UNITS[0]
+    is_thousandth = clock_unit(numbers) != UNITS[0] and _is_between([UNITS[1] * n for n in numbers], DEVICE_INTERVALS)
+    return UNITS[1] if is_thousandth else None
 
 
 def filled_in(numbers: Sequence[str]) -> list[float]:

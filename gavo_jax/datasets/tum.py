@@ -24,7 +24,7 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.names import filled_in, unit_of, unpaired
+from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.truth import truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import associate
@@ -189,7 +189,8 @@ def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row
     are_whole = all(WHOLE.fullmatch(row.written) for row in (*color, *depth))
     if rate and not are_whole:
         raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
-    unit = _unit([row.stamp for row in color], rate) if are_whole else 1.0
+    stamps = [row.stamp for row in color]
+    unit = _unit(stamps, rate) if are_whole else decimal_unit(stamps) or 1.0
     for row in (*color, *depth):
         if not abs(unit * row.stamp) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")

@@ -209,6 +209,15 @@ def test_zeros_that_are_missing_at_the_end_are_not(folder):
     np.testing.assert_array_equal(TumSequence(folder, CAMERA).timestamps, times)
 
 
+@pytest.mark.parametrize(("first", "step", "unit"), [(123456.789, 33.3, 1e-3), (1305031102.5, 12.5, 1.0)])
+def test_milliseconds_may_have_decimals(folder, first, step, unit):
+    stamps = [first + i * step for i in range(6)]
+    for kind in ("rgb", "depth"):
+        rows = [f"{stamp:.3f} {kind}/{i}.png" for i, stamp in enumerate(stamps)]
+        (folder / f"{kind}.txt").write_text("\n".join(rows))
+    np.testing.assert_allclose(TumSequence(folder, CAMERA).timestamps, unit * np.array(stamps), rtol=0, atol=1e-6)
+
+
 def test_milliseconds_with_decimals_are_refused(folder):
     for kind in ("rgb", "depth"):
         edit(folder / f"{kind}.txt", "\n100.", "\n1305031102175.")
