@@ -103,15 +103,16 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
 
 
 def _check_start(found: Found) -> None:
-    """Refuse enough images of both kinds, each without a gap, that begin with other numbers.
+    """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others.
 
-    Whether one number or one place in the order is one frame is open then.
+    Whether one number or one place in the order is one frame is open then. Of a camera that started, or stopped, later
+    than the other one, the other ends are alike.
     """
     color, depth, _ = found
     if min(len(color), len(depth)) < FEWEST:
         return
     (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
-    if a != c and b - a + 1 == len(color) and d - c + 1 == len(depth):
+    if a != c and b != d and b - a + 1 == len(color) and d - c + 1 == len(depth):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
             "number, or leave those without a partner out"
