@@ -263,11 +263,9 @@ def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
     checksum = zlib.crc32(rows.tobytes())
     repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
     readings = _readings(rows)
-    has_relief = readings.size > 0 and bool(np.ptp(readings) > FLAT * readings.max())
-    history = history._replace(
-        depth_checksum=checksum, depth_timestamp=stamp, has_relief=history.has_relief or has_relief
-    )
-    return repeated and history.has_relief and readings.size > 0, history
+    has_relief = history.has_relief or (readings.size > 0 and bool(np.ptp(readings) > FLAT * readings.max()))
+    history = history._replace(depth_checksum=checksum, depth_timestamp=stamp, has_relief=has_relief)
+    return repeated and has_relief and readings.size > 0, history
 
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:

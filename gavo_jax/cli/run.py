@@ -100,10 +100,11 @@ def run(options: Run) -> int:
                 folder.start(config, float(sequence.timestamps[0]))
             else:
                 odometry.progress = progress
-                for step in (None, *folder.steps()):
+                steps = folder.steps()
+                for step in (None, *steps):
                     viewer.watch(None, step)
                 if mapper is not None:
-                    mapper.replay(sequence, folder.steps())
+                    mapper.replay(sequence, steps)
             say(summary(sequence))
             if lines := left_out(sequence):
                 counts = ", ".join(line.partition(": ")[0] for line in lines)

@@ -42,9 +42,9 @@ class NumberedFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of numbered images"
     poses_of_depth: ClassVar[bool] = False
+    """Whether the poses are those of the depth camera, where it is another than the colour camera."""
     DEPTH_SCALE: ClassVar[float] = MILLIMETRES
     """Units a metre, where a camera file that is named does not say them."""
-    """Whether the poses are those of the depth camera, where it is another than the colour camera."""
     STAMPS: ClassVar[str] = ""
     """The file of `stamps`."""
 
