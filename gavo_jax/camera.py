@@ -133,7 +133,7 @@ class Camera:
         if not self.is_distorted:
             return image
         self._check_size(image)
-        coordinates, fractions, _ = _undistortion_maps(self)
+        coordinates, fractions, _ = _undistortion_maps(self._on_host())
         return cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistort_depth(self, depth: UInt16[np.ndarray, "height width"]) -> np.ndarray:
@@ -145,9 +145,14 @@ class Camera:
         if not self.is_distorted:
             return depth
         self._check_size(depth)
-        _, _, nearest = _undistortion_maps(self)
+        _, _, nearest = _undistortion_maps(self._on_host())
         none = np.empty(0, np.float32)
         return cv2.remap(depth, nearest, none, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+    def _on_host(self) -> "Camera":
+        """The same of Python's numbers, which have a hash."""
+        values = {name: float(getattr(self, name)) for name in ("fx", "fy", "cx", "cy", "depth_scale", "readout")}
+        return replace(self, **values)
 
     def _check_size(self, image: np.ndarray) -> None:
         if image.shape[:2] != (self.height, self.width):

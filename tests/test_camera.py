@@ -101,6 +101,15 @@ def test_undistortion_samples_where_the_lens_put_the_light(name):
     np.testing.assert_array_equal(color, np.repeat(undistorted[..., None], 3, axis=-1))
 
 
+def test_a_camera_of_jax_numbers_undistorts_like_one_of_pythons():
+    camera = replace(Camera.preset("fr1"), fx=517.25, fy=516.5, cx=318.5, cy=255.25)
+    traced = jax.tree.map(jnp.float32, camera)
+    image = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
+    np.testing.assert_array_equal(traced.undistort_image(image), camera.undistort_image(image))
+    depth = image.astype(np.uint16)
+    np.testing.assert_array_equal(traced.undistort_depth(depth), camera.undistort_depth(depth))
+
+
 def test_undistortion_leaves_no_black_rim():
     camera = Camera.preset("fr1")
     grey = np.full((480, 640), 200, np.uint8)

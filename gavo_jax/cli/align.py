@@ -1,6 +1,5 @@
 """`gavo align`: one pair of images, the motion between them as JSON."""
 
-import contextlib
 import itertools
 import sys
 from functools import partial
@@ -103,18 +102,23 @@ def _cameras(options: Align) -> tuple[Calibration, float | None]:
     """The cameras, and units per metre if they are known: those of the source that the images are of, if of one.
 
     Raises:
-        GavoError: there is no camera, or it cannot be read.
+        GavoError: there is no camera, or it cannot be read; or the source cannot, and nothing else tells the unit.
     """
-    source = source_around(options.rgb0)
+    source, fault = source_around(options.rgb0), None
     if source is not None:
-        with contextlib.suppress(GavoError):  # what is wrong with its other frames is nothing to this pair
+        try:
             sequence = open_source(source, Reading(options.camera, options.depth_scale))
             if isinstance(sequence, FileSequence):
                 return sequence.calibration, sequence.depth_unit.file
+        except GavoError as error:  # what is wrong with its other frames is nothing to this pair
+            fault = error
     size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
-    if options.camera != "auto":
-        return load_calibration(options.camera, size), options.depth_scale
-    folder = options.rgb0.absolute().parent
-    file = own_camera_file(folder) or own_camera_file(folder.parent)
-    found = preset_by_name(folder.parent) if file is None else load_calibration(file, size)
+    if options.camera == "auto":
+        folder = options.rgb0.absolute().parent
+        file = own_camera_file(folder) or own_camera_file(folder.parent)
+        found = preset_by_name(folder.parent) if file is None else load_calibration(file, size)
+    else:
+        found = load_calibration(options.camera, size)
+    if fault is not None and not found.states_depth_scale and options.depth_scale is None:
+        raise GavoError(f"{fault}; to do without the other frames, say --depth-scale")
     return found, options.depth_scale

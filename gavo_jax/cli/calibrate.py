@@ -54,6 +54,9 @@ def calibrate(options: Calibrate) -> int:
 def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     """The cameras as they record, with what was found; a delay that they had already counts on."""
     before = getattr(sequence, "calibration", None) or Calibration(sequence.camera)
+    unit = getattr(sequence, "depth_unit", None)
+    if unit is not None:  # what files of floats count, their camera seldom says
+        before = before.with_depth_scale(unit.file)
     values = {
         name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
     }

@@ -3,7 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED
@@ -57,14 +58,17 @@ def run_live(options: Run) -> int:
         remove_trajectories(folder.path)
         say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
         scene = None if options.map is None else LiveMap(MapBuilder(odometry.camera, options.voxel))
-        seconds, interrupted = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
+        end = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
         if odometry.progress.last_index < 1:
-            raise GavoError(f"{device.name}: ended after {newest.received} frames: at least two are needed")
+            tracked = odometry.progress.last_index + 1
+            seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
+            raise end.fault or GavoError(f"{device.name}: ended after {seen}: at least two are needed")
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed, "complete": True},
-            **conclude(first, folder.steps(), None, None, seconds, compile_seconds).figures,
+            **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed},
+            "complete": end.fault is None,
+            **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
@@ -73,10 +77,23 @@ def run_live(options: Run) -> int:
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")
-    if interrupted:
+    if end.fault is not None:
+        raise end.fault
+    if end.interrupted:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+class _End(NamedTuple):
+    """How tracking came to its end."""
+
+    seconds: float
+    """It took."""
+    interrupted: bool = False
+    """By Ctrl-C."""
+    fault: GavoError | None = None
+    """Of the device."""
 
 
 def _track(
@@ -88,27 +105,32 @@ def _track(
     viewer: Viewer,
     settings: Settings,
     scene: LiveMap | None,
-) -> tuple[float, bool]:
-    """Track until there is no more; the seconds it took, and whether Ctrl-C came."""
+) -> _End:
+    """Track until there is no more. Images that are unlike the first ones make a lost frame."""
     count, start = 0, time.perf_counter()
     images: LiveImages
     try:
         for images in newest:
-            frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
+            try:
+                frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
+            except GavoError as error:
+                if count == 0:
+                    raise
+                frame = FrameError(str(error))
             if count == 0:
-                viewer.open(newest.device.name, odometry.camera, np.array([frame.timestamp]), None)
+                viewer.open(newest.device.name, odometry.camera, np.array([images.timestamp]), None)
                 folder.start(
                     {
                         "options": options,
                         "sequence": {"name": newest.device.name, "frames": None, "camera": camera},
                         **circumstances(settings),
                     },
-                    frame.timestamp,
+                    images.timestamp,
                 )
                 start = time.perf_counter()
-            step = odometry.register(frame, frame.timestamp)
-            viewer.watch(frame, step, odometry.candidates)
-            if scene is not None:
+            step = odometry.register(frame, images.timestamp)
+            viewer.watch(frame if isinstance(frame, Frame) else None, step, odometry.candidates)
+            if scene is not None and isinstance(frame, Frame):
                 scene.watch(frame, step)
             if step is not None:
                 folder.add(step, odometry.progress)
@@ -121,8 +143,12 @@ def _track(
         if count < 2:
             raise
         tell(f"{newest.device.name}: interrupted after {count} frames")
-        return time.perf_counter() - start, True
-    return time.perf_counter() - start, False
+        return _End(time.perf_counter() - start, interrupted=True)
+    except GavoError as error:  # what was tracked counts
+        if count < 2:
+            raise
+        return _End(time.perf_counter() - start, fault=error)
+    return _End(time.perf_counter() - start)
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:

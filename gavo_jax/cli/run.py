@@ -17,6 +17,7 @@ from gavo_jax.cli.selection import (
     with_whole_paths,
 )
 from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.early import INTERRUPTED
@@ -80,6 +81,7 @@ def run(options: Run) -> int:
                 "first_timestamp": float(sequence.timestamps[0]),
                 "last_timestamp": float(sequence.timestamps[-1]),
                 "camera": sequence.camera,
+                "recorded": recorded_as(sequence),
                 **({"bodies": options.moving} if options.moving else {}),
             },
             **circumstances(settings),

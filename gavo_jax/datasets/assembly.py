@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,9 +28,11 @@ MUCH = 0.02
 
 METRES, MILLIMETRES = 1.0, 1000.0
 
-METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 60.0), (300.0, 60000.0)
-"""Median depth of a file of floats that is taken as one of metres, or of millimetres; between them, and a little above,
-lie centimetres."""
+METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 30.0), (300.0, 60000.0)
+"""Median depth of a file of floats that is taken as one of metres, or of millimetres; between them lie centimetres."""
+
+STATED_MEDIANS = (0.05, 60.0)
+"""Metres: a median depth that confirms the unit that a camera file says."""
 
 
 class DepthUnit(NamedTuple):
@@ -40,6 +42,21 @@ class DepthUnit(NamedTuple):
     """In the files."""
     frame: float
     """In frames: their camera's `depth_scale`."""
+
+
+def recorded_as(sequence: Any) -> dict[str, Any]:
+    """How a sequence's images were recorded, where it tells: what its frames come of, beside their own camera."""
+    calibration: Calibration | None = getattr(sequence, "calibration", None)
+    if calibration is None:
+        return {}
+    unit = getattr(sequence, "depth_unit", None)
+    return {
+        "color": calibration.color,
+        "depth": calibration.depth,
+        "color_T_depth": calibration.color_T_depth,
+        "depth_delay": calibration.depth_delay,
+        "depth_scale": None if unit is None else unit.file,
+    }
 
 
 class DepthImage(NamedTuple):
@@ -81,7 +98,7 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
 
 def _likely_unit(median: float, calibration: Calibration) -> float | None:
     stated = calibration.color.depth_scale
-    if calibration.preset is None and calibration.states_depth_scale and _is_within(median / stated, METRE_MEDIANS):
+    if calibration.preset is None and calibration.states_depth_scale and _is_within(median / stated, STATED_MEDIANS):
         return stated
     if _is_within(median, METRE_MEDIANS):
         return METRES

@@ -104,7 +104,7 @@ class NumberedFolder(FileSequence):
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
         if (path / TRUTH).exists():  # somebody's own, which is better than the dataset's poses
-            truth = truth_in(path, None if is_stamped else lambda counts: counts / rate)
+            truth = truth_in(path, times.values(), None if is_stamped else lambda counts: counts / rate)
         else:
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
@@ -273,12 +273,18 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = plain_files(path)
-        paired = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, reading)
+        paired = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, cls.clock(path, reading))
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
         left_out = paired.left_out + unread + unread_truth(path, truth)
         return cls(root.name, paired.entries, calibration, truth, reading, left_out)
+
+    @classmethod
+    def clock(cls, path: Path, reading: Reading) -> Seconds:
+        """Times of frames by their numbers."""
+        rate = reading.rate or RATE
+        return lambda numbers: numbers / rate
 
     @classmethod
     def truth(cls, path: Path, paired: "Paired") -> tuple[Trajectory | None, list[str]]:
@@ -287,7 +293,7 @@ class PlainFolder(FileSequence):
         Raises:
             GavoError: it cannot be read.
         """
-        found = truth_in(path, paired.seconds, paired.times)
+        found = truth_in(path, [entry.stamp for entry in paired.entries], paired.seconds, paired.times)
         if found is not None or not (path / TRANSFORMS).is_file():
             return found, []
         return read_transforms(path / TRANSFORMS, {entry.color.stem: entry.stamp for entry in paired.entries})
@@ -357,17 +363,16 @@ def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading
     return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
 
 
-def _by_number(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired:
-    """Frames by the numbers in the names."""
+def _by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
+    """Frames by the numbers in the names, whose times a clock says."""
     found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
     if not numbers:
         counts = f"{len(color)} colour and {len(depth)} depth images"
         raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
-    rate = reading.rate or RATE
-    entries = [Entry(n / rate, found.color[n], found.depth[n]) for n in numbers]
-    times = {n: n / rate for n in found.depth}
-    return Paired(entries, found.unpaired(len(numbers)), times, lambda counts: counts / rate)
+    times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
+    entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
+    return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)
 
 
 def _millimetres(calibration: Calibration) -> Calibration:

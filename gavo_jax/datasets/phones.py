@@ -1,9 +1,10 @@
-"""Scans of phones: Stray Scanner's folders, and ARKitScenes."""
+"""Scans of phones: Stray Scanner's folders, ARKitScenes, and what Record3D exports."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -11,18 +12,22 @@ from jaxtyping import Float
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_exports import common_camera
-from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.folders import NumberedFolder, Paired, PlainFolder
 from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.names import Found, by_number
-from gavo_jax.errors import GavoError, data_rows, number
+from gavo_jax.datasets.truth import Seconds
+from gavo_jax.errors import GavoError, data_rows, number, read_text
 from gavo_jax.trajectory import SHORTEST_QUATERNION, Trajectory, inverse, rotation_from_quaternion
 
 LARGEST = 1e10
 """Of a file of poses, seconds since 1970 included."""
+
+SLOWEST, FASTEST = 0.1, 1000.0
+"""Frames per second that may be a rate."""
 
 
 class StrayScan(NumberedFolder):
@@ -118,6 +123,58 @@ class ArkitScenes(PlainFolder):
         if found is not None or not (path / cls.POSES).is_file():
             return found, unread
         return _read_turns(path / cls.POSES), []
+
+
+class Record3D(PlainFolder):
+    """What the app Record3D exports as EXR and RGB: images by their numbers, and `metadata.json`.
+
+    That says the camera, and when the frames were taken: `frameTimestamps`, by their numbers, or `fps`.
+    """
+
+    kind: ClassVar[str] = "export of Record3D"
+    FILE: ClassVar[str] = "metadata.json"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the camera in its file, beside images."""
+        file = path / cls.FILE
+        return file.is_file() and '"K"' in read_text(file, MAX_JSON_BYTES) and super().recognises(path)
+
+    @classmethod
+    def clock(cls, path: Path, reading: Reading) -> Seconds:
+        """As its file says, unless a rate is said."""
+        try:
+            told = json.loads(read_text(path / cls.FILE, MAX_JSON_BYTES))
+        except (ValueError, RecursionError):  # with a camera file in the folder it need not be one
+            told = {}
+        rate, stamps = (told.get(key) if isinstance(told, dict) else None for key in ("fps", "frameTimestamps"))
+        if reading.rate is not None:
+            return super().clock(path, reading)
+        if isinstance(stamps, list) and len(stamps) > 1:
+            return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps)
+        is_rate = isinstance(rate, int | float) and SLOWEST <= rate <= FASTEST
+        return super().clock(path, replace(reading, rate=rate) if is_rate else reading)
+
+
+def _clock_of(place: str, stamps: list[Any]) -> Seconds:
+    """Times of frames that count from 0, by the stamps of all of them.
+
+    Raises:
+        GavoError: they are no times; or, when it is asked, a frame is beyond the last of them.
+    """
+    try:
+        times = np.array(stamps, np.float64)
+    except (TypeError, ValueError):
+        times = np.empty(0)
+    if times.shape != (len(stamps),) or not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise GavoError(f"{place}: expected increasing seconds: say --rate to do without them")
+
+    def at(numbers: np.ndarray) -> np.ndarray:
+        if np.max(numbers) > len(times) - 1:
+            raise GavoError(f"{place}: {len(times)} of them, and a frame {np.max(numbers):.0f}: say --rate instead")
+        return np.interp(numbers, np.arange(len(times)), times)
+
+    return at
 
 
 def _at_width(camera: Camera, width: int) -> Camera:

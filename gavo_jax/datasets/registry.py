@@ -10,7 +10,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images
-from gavo_jax.datasets.phones import ArkitScenes, StrayScan
+from gavo_jax.datasets.phones import ArkitScenes, Record3D, StrayScan
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -71,7 +71,18 @@ class Dataset(Protocol):
 
 
 BUILT_IN: tuple[Dataset, ...] = (
-    *(TumSequence, SevenScenes, ScanNet, Replica, BagSequence, StrayScan, ArkitScenes, Open3DFolder, PlainFolder),
+    *(
+        TumSequence,
+        SevenScenes,
+        ScanNet,
+        Replica,
+        BagSequence,
+        StrayScan,
+        ArkitScenes,
+        Record3D,
+        Open3DFolder,
+        PlainFolder,
+    ),
 )
 """In the order in which they are asked."""
 

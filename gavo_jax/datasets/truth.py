@@ -33,6 +33,9 @@ SKEWED = 0.01
 
 MAX_POSE_BYTES = 4096
 
+MILLISECOND = 1e-3
+"""Seconds."""
+
 MAX_NUMBER = 10**18
 """Of a frame."""
 
@@ -40,11 +43,14 @@ Seconds = Callable[[np.ndarray], np.ndarray]
 """Times of frames by their numbers."""
 
 
-def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] | None = None) -> Trajectory | None:
+def truth_in(
+    folder: Path, frames: Iterable[float], seconds: Seconds | None, depth: Mapping[int, float] | None = None
+) -> Trajectory | None:
     """The true trajectory that lies in a folder, if one does.
 
     Args:
         folder: of the frames.
+        frames: their stamps, seconds. Of all that the truth's stamps may count, they count what meets these best.
         seconds: times of frames by their numbers, where they have no stamps: a truth of whole numbers counts them, too,
             where these are no stamps since 1970. Else such a truth counts what gives its poses a rate: seconds, milli-,
             micro- or nanoseconds.
@@ -54,13 +60,28 @@ def truth_in(folder: Path, seconds: Seconds | None, depth: Mapping[int, float] |
         GavoError: it cannot be read.
     """
     if (folder / TRUTH).exists():
-        truth = Trajectory.read_tum(folder / TRUTH)
-        if seconds and clock_unit(truth.timestamps.tolist()) is None and _are_whole(truth):
-            return replace(truth, timestamps=seconds(truth.timestamps))
-        return replace(truth, timestamps=counted_in(truth) * truth.timestamps)
+        return _timed(Trajectory.read_tum(folder / TRUTH), list(frames), seconds)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
+
+
+def _timed(truth: Trajectory, frames: list[float], seconds: Seconds | None) -> Trajectory:
+    """A truth with its stamps in seconds."""
+    stamps = truth.timestamps
+    known = clock_unit(stamps.tolist())
+    readings = [counted_in(truth) * stamps]
+    if _are_whole(truth) and seconds:
+        readings.insert(1 if known else 0, seconds(stamps))
+    if not known:
+        readings.append(MILLISECOND * stamps)
+    low, high = min(frames), max(frames)
+
+    def met(reading: np.ndarray) -> float:
+        """Share of the frames' time, to a tenth."""
+        return round(float(min(high, reading.max()) - max(low, reading.min())) / max(high - low, MILLISECOND), 1)
+
+    return replace(truth, timestamps=max(readings, key=lambda reading: max(met(reading), 0.0)))
 
 
 def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:
@@ -72,7 +93,7 @@ def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:
 def counted_in(trajectory: Trajectory) -> float:
     """Seconds of what stamps count: since 1970, or as whole numbers whose steps have the rate of a camera."""
     stamps = trajectory.timestamps.tolist()
-    return clock_unit(stamps) or (_are_whole(trajectory) and unit_of(stamps)) or 1.0
+    return (_are_whole(trajectory) and unit_of(stamps)) or clock_unit(stamps) or 1.0
 
 
 def icl_truth(folder: Path) -> Path | None:

@@ -112,7 +112,8 @@ class TumSequence(FileSequence):
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry) for entry in entries]
-        truth = truth_in(self.folder, None if unit == 1 else lambda counts: unit * counts)
+        stamps = [entry.stamp for entry in files]
+        truth = truth_in(self.folder, stamps, None if unit == 1 else lambda counts: unit * counts)
         why = f"within {max_difference:g} s that is not another's"
         super().__init__(
             name or resolved.name,

@@ -1,6 +1,7 @@
 """What is found of a small rendered camera, how a least is found, even clocks, and the camera file."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -143,6 +144,17 @@ def test_a_depth_scale_is_of_the_file_in_the_file_and_of_the_frames_in_their_cam
     assert estimate.found["depth_scale"].value == file
     assert estimate.camera.depth_scale == of_frames
     assert calibration_of(sequence, estimate).color.depth_scale == file
+    nothing: Any = SimpleNamespace(found={}, depth_delay=0.0)
+    assert calibration_of(sequence, nothing).color.depth_scale == stated
+
+
+def test_a_unit_that_floats_were_found_to_have_is_what_the_file_says():
+    """Their camera's scale is of whole numbers, and was not what they were read by."""
+    sequence: Any = Floats(1000.0, 1000.0)
+    sequence.calibration = Calibration(replace(CAMERA, depth_scale=5000.0), states_depth_scale=False)
+    nothing: Any = SimpleNamespace(found={}, depth_delay=0.0)
+    written = calibration_of(sequence, nothing)
+    assert written.color.depth_scale == 1000.0 and written.states_depth_scale
 
 
 def test_a_least_comes_with_how_sure_it_is():

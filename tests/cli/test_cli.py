@@ -419,6 +419,18 @@ def test_align_needs_a_camera_and_a_likely_unit(gavo, clip):
     assert is_refused(gavo("align", rgb, depth, rgb, depth, "--depth-scale", 0), "--depth-scale", "0.001")
 
 
+def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, clip):
+    """Its lists are torn: what its depth counts is open if the camera's file does not say it."""
+    rgb, depth = images(clip, "rgb"), images(clip, "depth")
+    command = ["align", rgb[0], depth[0], rgb[1], depth[1]]
+    (clip / "rgb.txt").write_text("hello\n")
+    assert gavo(*command).status == 0
+    (clip / "camera.toml").unlink()
+    (clip / "intrinsics.txt").write_text(f"{CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy}\n")
+    assert is_refused(gavo(*command), "rgb.txt:1", "say --depth-scale")
+    assert gavo(*command, "--depth-scale", CAMERA.depth_scale).status == 0
+
+
 def test_evaluate_refuses(gavo, clip):
     truth = clip / "groundtruth.txt"
     assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")

@@ -15,6 +15,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.devices import register_device
 from gavo_jax.datasets.live import LiveImages
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.errors import GavoError
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.scene_map import build_map
 from gavo_jax.trajectory import Trajectory
@@ -63,6 +64,38 @@ def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     assert abs(trajectory.world_T_camera - expected.world_T_camera).max() < 1e-6
     assert (tmp_path / "run" / "trajectory.json").exists()
     assert "0 of 5 frames came while another was tracked" in done.out
+
+
+class Stumbling(Player):
+    """Its third image has another size; at the end it is unplugged, if it has a reason."""
+
+    def __init__(self, reason: str = ""):
+        super().__init__()
+        self.reason, self.given = reason, 0
+
+    def read(self):
+        images, self.given = super().read(), self.given + 1
+        if images is None and self.reason:
+            raise GavoError(self.reason)
+        return images and (images._replace(color=images.color[:-1]) if self.given == 3 else images)
+
+
+@pytest.mark.parametrize("reason", ["", "player: unplugged"])
+def test_what_was_tracked_outlives_a_wrong_image_and_a_device_that_is_gone(tmp_path, capsys, monkeypatch, reason):
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", lambda: Stumbling(reason))
+    done = runner(capsys)("run", "player", "--method", "small-newton", "--output", tmp_path)
+    assert done.status == (2 if reason else 0) and done.err.count("\n") == bool(reason) and reason in done.err
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["lost_pairs"], metrics["complete"]) == (5, 1, not reason)
+    assert "unreadable" in (tmp_path / "frames.csv").read_text().splitlines()[2]
+
+
+def test_a_device_that_gives_one_frame_says_how_many_were_tracked(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
+    register_device("player", lambda: Player(frames=[FRAMES[0]]))
+    done = runner(capsys)("run", "player", "--method", "small-newton", "--output", tmp_path)
+    assert done.status == 2 and "player: ended after 1 frames: at least two are needed" in done.err
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="Rerun is not installed")

@@ -94,10 +94,11 @@ def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder):
     assert (sequence[0].depth == 2.0 * sequence.camera.depth_scale).all()
 
 
-def test_floats_that_may_be_centimetres_are_refused(folder):
+@pytest.mark.parametrize("factor", [20, 40])
+def test_floats_that_may_be_centimetres_are_refused(folder, factor):
     wrote(folder, "plain")
     for i, metres in enumerate(METRES):
-        image(folder / f"depth/{i}.tiff", (40 * metres).astype(np.float32))
+        image(folder / f"depth/{i}.tiff", (factor * metres).astype(np.float32))
     with pytest.raises(GavoError, match="in neither metres nor millimetres: say --depth-scale"):
         assert open_source(folder).camera
 
@@ -565,6 +566,34 @@ def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):
     recorded = {"w": 160, "h": 120, "K": MATRIX.T.ravel().tolist(), "fps": 30, "poses": []}
     (folder / "metadata.json").write_text(json.dumps(recorded))
     assert open_source(folder).camera.fx == 131
+    assert recognise(folder).kind == "export of Record3D"
+
+
+@pytest.mark.parametrize(
+    ("told", "rate", "expected"),
+    [
+        ({"fps": 60}, None, np.arange(4) / 60),
+        ({"fps": 60}, 10.0, np.arange(4) / 10),
+        ({"fps": "fast"}, None, np.arange(4) / 30),
+        ({"fps": 60, "frameTimestamps": [7.0, 7.02, 7.1, 7.13, 7.2]}, None, [7.0, 7.02, 7.1, 7.13]),
+        ({"frameTimestamps": [7.0, 7.02]}, None, "2 of them, and a frame 2"),
+        ({"frameTimestamps": [7.0, 7.0, 7.1, 7.2]}, None, "expected increasing seconds"),
+        ({"frameTimestamps": [7.0, "x", 7.1, 7.2]}, None, "expected increasing seconds"),
+    ],
+)
+def test_frames_of_record3d_have_the_times_that_it_tells(folder, told, rate, expected):
+    wrote(folder, "plain")
+    (folder / "camera.yaml").unlink()
+    for part in ("rgb", "depth"):
+        for i, file in enumerate(sorted((folder / part).iterdir())):
+            file.rename(file.with_name(f"{i}{file.suffix}"))
+    recorded = {"w": 160, "h": 120, "K": MATRIX.T.ravel().tolist(), **told}
+    (folder / "metadata.json").write_text(json.dumps(recorded))
+    if isinstance(expected, str):
+        with pytest.raises(GavoError, match=expected):
+            open_source(folder, Reading(rate=rate))
+    else:
+        np.testing.assert_allclose(open_source(folder, Reading(rate=rate)).timestamps, expected, atol=1e-9)
 
 
 def test_a_film_beside_depth_says_how_its_frames_become_images(folder):

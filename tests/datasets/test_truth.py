@@ -117,6 +117,29 @@ def test_truth_in_the_unit_of_stamps_that_are_names_has_their_times(folder, unit
     np.testing.assert_allclose(truth_of(folder).timestamps[::3], open_source(folder).timestamps, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["microseconds", "nanoseconds", "milliseconds with decimals"])
+@pytest.mark.parametrize("layout", ["plain", "tum"])
+@pytest.mark.parametrize("minutes", [0.1, 20, 60])
+def test_a_truth_counts_what_its_images_do_since_a_device_was_switched_on(tmp_path, layout, kind, minutes):
+    """A number of 16 to 68 minutes in micro- or nanoseconds could be one of seconds since 1970, too."""
+    times = [60 * minutes + 0.0333 * i for i in range(4)]
+    unit, digits = {"microseconds": (1e-6, 0), "nanoseconds": (1e-9, 0)}.get(kind, (1e-3, 3))
+    stamps = [f"{time / unit:.{digits}f}" for time in times]
+    (tmp_path / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
+    for part, pixels in (("rgb", GREYS), ("depth", DEPTHS)):
+        for stamp, one in zip(stamps, pixels, strict=True):
+            image(tmp_path / f"{part}/{stamp}.png", one)
+        if layout == "tum":
+            rows = [f"{stamp} {part}/{stamp}.png" for stamp in stamps]
+            (tmp_path / f"{part}.txt").write_text("\n".join(rows) + "\n")
+    rows = [f"{time / unit:.{digits}f} 0 0 0 0 0 0 1" for time in np.arange(times[0], times[-1] + 0.01, 0.01)]
+    (tmp_path / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    sequence = open_source(tmp_path)
+    np.testing.assert_allclose(sequence.timestamps, times, rtol=0, atol=2e-6)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.timestamps[[0, -1]], times[::3], rtol=0, atol=0.01)
+
+
 def icl(folder: Path, name: str = "livingRoom2.gt.freiburg", first: int = 2) -> None:
     """ICL-NUIM's: frames and poses by number, the first without a pose; its world's and its cameras' y points up."""
     rows = []

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -215,6 +216,16 @@ def test_another_run_is_not_resumed(clip, broken, capsys, more, words):
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and str(broken / "config.json") in error and all(word in error for word in words)
     assert {path: path.read_bytes() for path in broken.iterdir()} == before
+
+
+def test_a_run_of_another_lens_is_not_resumed(clip, broken, tmp_path, capsys):
+    """Frames have no distortion either way: their camera is the same."""
+    camera = tmp_path / "camera.toml"
+    own = (clip / "camera.toml").read_text()
+    camera.write_text(re.sub(r"distortion = .*", "distortion = [0.1, 0, 0, 0, 0]", own))
+    capsys.readouterr()
+    assert main(arguments(clip, broken, "--resume", "--camera", str(camera))) == 2
+    assert "sequence.recorded.color.distortion" in capsys.readouterr().err
 
 
 def altered(path: Path, **changes: Any) -> None:
