@@ -77,6 +77,19 @@ class _Topic(NamedTuple):
     """Nanoseconds."""
     stamps: np.ndarray
     """Seconds, of their headers; 0 where they have none."""
+    repeated: int = 0
+    """How many have the stamp of one before them."""
+
+
+def _once(topic: _Topic) -> _Topic:
+    """A topic of which a message that comes twice, by its stamp, counts the first time.
+
+    Two publishers of one topic leave such, or a recording that was played while it was recorded again.
+    """
+    is_first = np.zeros(len(topic.stamps), bool)
+    is_first[np.unique(topic.stamps, return_index=True)[1]] = True
+    again = ~is_first & np.isfinite(topic.stamps)
+    return topic._replace(stamps=np.where(again, np.nan, topic.stamps), repeated=int(again.sum()))
 
 
 def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
@@ -120,7 +133,7 @@ class BagSequence:
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
         self.ground_truth: Trajectory | None = None
         color, depth = self._bag.choose(reading)
-        self._topics = _in_one_time(self._bag.topic(color), self._bag.topic(depth))
+        self._topics = tuple(map(_once, _in_one_time(self._bag.topic(color), self._bag.topic(depth))))
         i, j = associate(self._topics[0].stamps, self._topics[1].stamps, reading.max_difference)
         if len(i) == 0:
             spans = " and ".join(_span(topic) for topic in self._topics)
@@ -128,11 +141,13 @@ class BagSequence:
         order = np.argsort(self._topics[0].stamps[i], kind="stable")
         self._pairs = np.stack([i, j], 1)[order]
         self._timestamps = self._topics[0].stamps[i][order]
-        self.left_out = [
-            f"{len(topic.stamps) - len(i)} of {topic.name}: none of {other} within {reading.max_difference:g} s"
-            for topic, other in zip(self._topics, (depth, color), strict=True)
-            if len(topic.stamps) > len(i)
-        ]
+        self.left_out = []
+        for topic, other in zip(self._topics, (depth, color), strict=True):
+            for count, why in (
+                (topic.repeated, "the stamp of one before it"),
+                (len(topic.stamps) - topic.repeated - len(i), f"none of {other} within {reading.max_difference:g} s"),
+            ):
+                self.left_out += [f"{count} of {topic.name}: {why}"] * (count > 0)
         self.calibration = self._calibrate(path, reading)
         self._stream = _Stream(self._bag, self._topics)
         self._shared = _Shared(self, reading)
@@ -318,6 +333,8 @@ class _Bag:
         self.path = path
         if path.is_file() and path.suffix not in SUFFIXES:
             raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
+        if path.is_dir() and path.suffix == ".bag":
+            raise GavoError(f"{path}: a folder of ROS 2, which the library takes for a file of ROS 1: rename it")
         with _legible(path):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()

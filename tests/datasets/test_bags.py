@@ -418,6 +418,24 @@ def test_messages_without_partners_are_counted(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_messages_that_come_twice_count_once(tmp_path, kind):
+    """All frames were there twice, each pair of them lost."""
+    path = tmp_path / ("twice.bag" if kind == "ros1" else "twice")
+    recorder = Recorder(path, kind)
+    for shot in shots():
+        for late in (0.0, 0.001):
+            recorder.image(COLOR, shot.stamp, shot.bgr, "bgr8", shot.stamp + late)
+            recorder.image(DEPTH, shot.stamp, shot.depth, "16UC1", shot.stamp + late)
+    recorder.close()
+    sequence = open_source(path, Reading(camera=CAMERA))
+    assert isinstance(sequence, BagSequence)
+    np.testing.assert_allclose(sequence.timestamps, STAMPS, atol=1e-6)
+    assert sequence.left_out == [f"4 of {topic}: the stamp of one before it" for topic in (COLOR, DEPTH)]
+    for frame, shot in zip(sequence, shots(), strict=True):
+        np.testing.assert_array_equal(frame.depth, shot.depth)
+
+
 @pytest.mark.parametrize("stamp", [0.0, 77.0])
 def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     """Of both topics, even where one has stamps."""
@@ -462,6 +480,12 @@ def test_an_ending_in_capitals_is_to_be_written_small(tmp_path, bags):
     (tmp_path / "WALK.BAG").write_bytes(bags["ros1", "raw", "u16"].read_bytes())
     with pytest.raises(GavoError, match=r"WALK\.BAG: the library reads it only as \.bag: rename it"):
         open_source(tmp_path / "WALK.BAG")
+
+
+def test_a_folder_of_ros_2_may_not_be_called_a_file_of_ros_1(tmp_path):
+    path = record(tmp_path / "walk", "mcap", "raw", shots(), CAMERA).rename(tmp_path / "walk.bag")
+    with pytest.raises(GavoError, match=r"walk\.bag: a folder of ROS 2, .*: rename it"):
+        open_source(path)
 
 
 def test_a_message_without_a_stamp_is_left_out(tmp_path):
