@@ -59,8 +59,8 @@ MAX_MISPLACED = 0.25
 class TumSequence(FileSequence):
     """A folder with `rgb.txt`, `depth.txt`, the images they list and, where known, `groundtruth.txt`.
 
-    Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`); frames come in the
-    order of their colour stamps and carry them. Images are decoded one by one when asked for, and nothing of them is
+    Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`), or by the rows of a
+    list of pairs (`ASSOCIATIONS`) in place of the two; frames come in the order of their colour stamps and carry them. Images are decoded one by one when asked for, and nothing of them is
     kept.
 
     Lists need not be sorted. But where all but a few stamps of a list increase (`MAX_MISPLACED`), those few are in
@@ -106,15 +106,18 @@ class TumSequence(FileSequence):
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
-        color_rows, depth_rows, unit = _read_lists(resolved, self.folder, rate)
-        entries = _associate_lists(color_rows, depth_rows, max_difference)
+        color_rows, depth_rows, unit, are_paired = _read_lists(resolved, self.folder, rate)
+        if are_paired:
+            entries, why = _by_place(color_rows, depth_rows), "with a stamp of its own in their row"
+        else:
+            entries = _associate_lists(color_rows, depth_rows, max_difference)
+            why = f"within {max_difference:g} s that is not another's"
         if not entries:
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
-        files = [_files(entry) for entry in entries]
+        files = [_files(entry, max_difference) for entry in entries]
         stamps = [entry.stamp for entry in files]
         truth = truth_in(self.folder, stamps, None if unit == 1 else lambda counts: unit * counts)
-        why = f"within {max_difference:g} s that is not another's"
         super().__init__(
             name or resolved.name,
             files,
@@ -169,21 +172,24 @@ class _Entry(NamedTuple):
     depth: _Row | None
 
 
-def _files(entry: _Entry) -> Entry:
-    """Paths, stamps and doubts of a frame."""
+def _files(entry: _Entry, max_difference: float) -> Entry:
+    """Paths, stamps and doubts of a frame. A depth stamp that is further off is of another clock, and tells nothing."""
     misplaced = next((row for row in entry if row is not None and row.misplaced), None)
     doubt = f"{misplaced.place}: stamp {misplaced.stamp:.6f} is out of order or given twice" if misplaced else ""
     color, depth = entry
-    return Entry(color.stamp, color.path, depth and depth.path, depth and depth.stamp, doubt)
+    is_near = depth is not None and abs(depth.stamp - color.stamp) < max_difference
+    return Entry(color.stamp, color.path, depth and depth.path, depth.stamp if depth and is_near else None, doubt)
 
 
-def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row], float]:
-    """Rows of colour and of depth, from two lists or one of pairs, and the seconds of what their stamps counted."""
+def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row], float, bool]:
+    """Rows of colour and of depth, the seconds of what their stamps counted, and whether one list has them in pairs."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
     if all((folder / name).exists() for name in OPENLORIS) and not (folder / COLOR_LIST).exists():
         names, ours = " and ".join(OPENLORIS), f"{COLOR_LIST} and {DEPTH_LIST}"
         raise GavoError(f"{folder / COLOR_LIST}: no such file; {names}, as OpenLORIS has them: copy them to {ours}")
-    if both is None or (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists():
+    if (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists():
+        both = None
+    if both is None:
         color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
     else:
         color, depth = _read_pairs(root, both)
@@ -196,7 +202,7 @@ def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row
         if not abs(unit * row.stamp) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
     color, depth = ([row._replace(stamp=unit * row.stamp) for row in rows] for rows in (color, depth))
-    return color, depth, unit
+    return color, depth, unit, both is not None
 
 
 WHOLE = re.compile(r"-?\d+")
@@ -294,6 +300,13 @@ def _in_order(stamps: list[float]) -> list[bool]:
     return [used and rivals[i] == 1 for i, used in zip(before, on_a_longest, strict=True)]
 
 
+def _by_place(color: list[_Row], depth: list[_Row]) -> list[_Entry]:
+    """Frames as the rows of one list say, from the first one that is in no doubt."""
+    partners = {row.place: row for row in depth}
+    paired = [_Entry(row, None if row.misplaced else partners[row.place]) for row in color if row.place in partners]
+    return list(itertools.dropwhile(_is_in_doubt, paired))
+
+
 def _associate_lists(color: list[_Row], depth: list[_Row], max_difference: float) -> list[_Entry]:
     """Frames in the order of their colour stamps, from the first one that is in no doubt.
 
@@ -309,8 +322,8 @@ def _associate_lists(color: list[_Row], depth: list[_Row], max_difference: float
         taken = set(i.tolist())
         good = [row for at, row in enumerate(good) if at not in taken]
     entries.sort(key=lambda entry: entry.color.stamp)
+    return list(itertools.dropwhile(_is_in_doubt, entries))
 
-    def in_doubt(entry: _Entry) -> bool:
-        return entry.depth is None or entry.depth.misplaced
 
-    return list(itertools.dropwhile(in_doubt, entries))
+def _is_in_doubt(entry: _Entry) -> bool:
+    return entry.depth is None or entry.depth.misplaced

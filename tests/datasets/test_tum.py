@@ -181,6 +181,37 @@ def test_stamps_that_are_whole_numbers_count_what_gives_a_cameras_rate(folder, n
         np.testing.assert_allclose(np.diff(TumSequence(folder, CAMERA, rate=10.0).timestamps), 0.1)
 
 
+@pytest.mark.parametrize("offset", [0.033, -0.1, 10.0])
+@pytest.mark.parametrize("depth_first", [False, True])
+def test_pairs_that_a_list_says_are_frames_whatever_the_clock_of_depth(folder, offset, depth_first):
+    """They were paired anew, each with the depth of another frame."""
+    rows = []
+    for i, stamp in enumerate(STAMPS):
+        pair = [f"{stamp:.6f} rgb/{i}.png", f"{stamp + offset:.6f} depth/{i}.png"]
+        rows.append(" ".join(pair[::-1] if depth_first else pair))
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").unlink()
+    (folder / "associations.txt").write_text("\n".join(rows))
+    sequence = TumSequence(folder, CAMERA)
+    np.testing.assert_allclose(sequence.timestamps, STAMPS)
+    assert sequence.left_out == ()
+    for i in range(len(STAMPS)):
+        np.testing.assert_array_equal(sequence[i].depth, depth_image(i))
+        assert sequence[i].depth_timestamp is None
+
+
+def test_a_stamp_out_of_order_in_a_list_of_pairs_puts_its_frame_in_doubt(folder):
+    rows = [f"{stamp:.6f} rgb/{i}.png {stamp + 0.004:.6f} depth/{i}.png" for i, stamp in enumerate(STAMPS)]
+    rows[3] = rows[3].replace(f"{STAMPS[3] + 0.004:.6f}", f"{STAMPS[0]:.6f}")
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").unlink()
+    (folder / "associations.txt").write_text("\n".join(rows))
+    sequence = TumSequence(folder, CAMERA)
+    assert len(sequence) == len(STAMPS) and sequence[2].depth_timestamp == pytest.approx(STAMPS[2] + 0.004)
+    with pytest.raises(TimestampError, match=r"associations\.txt:4: stamp .* out of order"):
+        sequence[3]
+
+
 @pytest.mark.parametrize("layout", ["two lists", "one list"])
 def test_zeros_that_are_missing_after_the_point_are_filled_in(folder, layout):
     """Whole seconds and the rest printed one after the other: 102.008 s is 102.8000."""
