@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from gavo_jax.camera_words import Table, beside
 from gavo_jax.errors import GavoError, shown
-
-Table = dict[str, Any]
 
 Rays = tuple[np.ndarray, np.ndarray]
 
@@ -81,8 +80,15 @@ def read_realsense(path: Path, values: Table) -> Table:
     """Looks like intrinsics of RealSense's SDK."""
     names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy", "width": "width", "height": "height"}
     table = {ours: values[theirs] for ours, theirs in names.items()}
-    lens = sdk_distortion(f"{path}: the", values.get("model", "none"), values.get("coeffs") or [0.0] * 5, table)
-    return {**table, **({"distortion": lens} if lens else {})}
+    distortion = values.get("distortion")  # its model by librealsense's own names, or the coefficients
+    model = values.get("model", distortion if isinstance(distortion, str) else values.get("distortion_model", "none"))
+    told = beside(str(path), {key: value for key, value in values.items() if not isinstance(value, str)})
+    coefficients = told.pop("distortion", None) or [0.0] * 5
+    if model == "none" and any(coefficients):
+        raise GavoError(f"{path}: coefficients of a lens, and no model of it: one of {', '.join(LENSES)}")
+    lens = sdk_distortion(f"{path}: the", model, coefficients, table)
+    told.pop("model", None)
+    return {**told, **table, **({"distortion": lens} if lens else {})}
 
 
 LIKE = 0.01

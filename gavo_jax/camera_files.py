@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, Camera
-from gavo_jax.camera_makes import MODELS, PARSERS, PROJECTION, Table
+from gavo_jax.camera_makes import PARSERS, PROJECTION, Table
+from gavo_jax.camera_words import MODELS, model_of
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
@@ -210,7 +211,7 @@ def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
 
 def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float, ...], Any]:
     given = values.get("model", "pinhole")
-    model = MODELS.get(given.lower()) if isinstance(given, str) else None
+    model = model_of(given)
     if model is None:
         raise GavoError(f"{path}: {part}model: {shown(given)} is none of {', '.join(MODELS)}")
     numbers = values.get("distortion", [])

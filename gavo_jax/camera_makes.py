@@ -14,24 +14,19 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera_exports import Table, is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
+from gavo_jax.camera_words import MATRIX, beside, first, known, numbers_of
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 PROJECTION = "projection_matrix"
 """Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
-MODELS = {
-    "pinhole": "pinhole",
-    "none": "pinhole",
-    "plumb_bob": "pinhole",
-    "radtan": "pinhole",
-    "brown": "pinhole",
-    "rational": "pinhole",
-    "rational_polynomial": "pinhole",
-    "fisheye": "fisheye",
-    "equidistant": "fisheye",
-    "kannalabrandt8": "fisheye",
-}
-"""Names of distortion models, as ROS, Kalibr and others call them."""
+FOCAL = ("fx", "fy", "cx", "cy")
+
+NESTED = ("camera", "cam", "camera_params", "cam_params")
+"""Tables in which Replica, NICE-SLAM, SplaTAM and others keep a camera."""
+
+OWN = ("width", "height", "distortion", "model", "depth_scale", "readout", "depth_delay")
+"""Keys of our own that mean what they mean there."""
 
 SAME_CAMERA = 0.5
 """Pixels by which colour and depth camera of a scan may differ where depth is registered."""
@@ -111,14 +106,13 @@ def of_matrix(place: str, numbers: list[Any]) -> Table:
 
     Args:
         place: names the file in messages.
-        numbers: nine.
+        numbers: nine, or three rows of three.
 
     Raises:
         GavoError: they are no camera matrix.
         ValueError: they are not nine.
     """
-    if all(isinstance(row, list) for row in numbers):
-        numbers = [value for row in numbers for value in row]
+    numbers = numbers_of(numbers)
     fx, skew, cx, below, fy, cy, left, right, one = numbers
     if not any(isinstance(number, str) for number in numbers):
         if not any(numbers):
@@ -133,43 +127,24 @@ def of_matrix(place: str, numbers: list[Any]) -> Table:
 def _read_open3d(path: Path, values: Table) -> Table:
     """Looks like Open3D's intrinsics."""
     values = {**values, **values.get("intrinsic", {})}
-    lens = {"distortion": values["distortion"]} if np.any(values.get("distortion", 0)) else {}
-    scale = {"depth_scale": values["depth_scale"]} if "depth_scale" in values else {}
     size = {"width": values["width"], "height": values["height"]}
-    return {**of_matrix(str(path), values["intrinsic_matrix"]), **size, **lens, **scale}
+    return {**of_matrix(str(path), values["intrinsic_matrix"]), **size, **beside(str(path), values)}
 
 
-def _read_replica(path: Path, values: Table) -> Table:
+def _read_nested(path: Path, values: Table) -> Table:
     """Looks like Replica's cam_params."""
-    camera = values["camera"]
-    names = {"fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy", "width": "w", "height": "h", "depth_scale": "scale"}
-    return {ours: camera[theirs] for ours, theirs in names.items()}
+    camera = next(values[name] for name in NESTED if isinstance(values.get(name), dict))
+    unit = {"depth_scale": camera["scale"]} if "scale" in camera else {}
+    return {**{key: camera[key] for key in FOCAL}, **beside(str(path), {**camera, **unit})}
 
 
 def _read_ros(path: Path, values: Table) -> Table:
     """Looks like a ROS camera_info."""
-
-    def first(*names: str) -> Any:
-        return next((values[name] for name in names if name in values), None)
-
-    def numbers(entry: Any) -> list[Any]:
-        return list(entry["data"] if isinstance(entry, dict) else entry or [])
-
-    sizes = {"width": first("image_width", "width", "w"), "height": first("image_height", "height", "h")}
     return {
-        **of_matrix(str(path), numbers(first("camera_matrix", "K", "k"))),
-        **{key: value for key, value in sizes.items() if value is not None},
-        **camera_info_distortion(first("distortion_model") or "", numbers(first("distortion_coefficients", "D", "d"))),
-        **{key: values[key] for key in ("depth_scale", "readout") if key in values},
-        PROJECTION: numbers(first(PROJECTION, "P", "p")),
+        **of_matrix(str(path), numbers_of(first(values, MATRIX))),
+        **beside(str(path), values),
+        PROJECTION: numbers_of(first(values, ("projectionmatrix", "p"))),
     }
-
-
-def camera_info_distortion(model: str, numbers: list[Any]) -> Table:
-    """Our keys for what a ROS camera_info says of the lens; an empty list stands for none, but of a fisheye."""
-    if len(numbers):
-        return {"distortion": numbers, "model": model or "plumb_bob"}
-    return {"model": model} if MODELS.get(str(model).lower()) == "fisheye" else {}
 
 
 def _read_kalibr(path: Path, values: Table) -> Table:
@@ -186,36 +161,64 @@ def _read_kalibr(path: Path, values: Table) -> Table:
 
 
 def _kalibr_camera(path: Path, values: Table) -> Table:
-    if values["camera_model"] != "pinhole":
+    """Looks like a camera of Kalibr or of EuRoC."""
+    if values.get("camera_model", "pinhole") != "pinhole":
         raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: pinhole is the only one that is read")
     (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
-    lens = camera_info_distortion(values.get("distortion_model", "none"), list(values.get("distortion_coeffs") or []))
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, **lens}
+    size = {"width": width, "height": height}
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, **beside(str(path), values)}
+
+
+def _read_vins(path: Path, values: Table) -> Table:
+    """Looks like a camera of VINS."""
+    return {**{key: values["projection_parameters"][key] for key in FOCAL}, **beside(str(path), values)}
+
+
+def _read_flat(path: Path, values: Table) -> Table:
+    """Looks like a camera of single numbers."""
+    ours = {key: value for key, value in values.items() if key in OWN or not known(key)}
+    others = {key: value for key, value in values.items() if key not in ours}
+    return {**ours, **beside(str(path), others)}
 
 
 def _is_open3d(values: Table) -> bool:
     return "intrinsic_matrix" in values or isinstance(values.get("intrinsic"), dict)
 
 
-def _is_replica(values: Table) -> bool:
-    return isinstance(values.get("camera"), dict)
+def _is_nested(values: Table) -> bool:
+    return any(isinstance(values.get(name), dict) for name in NESTED)
 
 
 def _is_ros(values: Table) -> bool:
-    return any(key in values for key in ("camera_matrix", "K", "k"))
+    return first(values, MATRIX) is not None
 
 
 def _is_kalibr(values: Table) -> bool:
     return "cam0" in values
 
 
+def _is_one_of_kalibr(values: Table) -> bool:
+    return isinstance(values.get("intrinsics"), list) and "resolution" in values
+
+
+def _is_vins(values: Table) -> bool:
+    return isinstance(values.get("projection_parameters"), dict)
+
+
+def _is_flat(values: Table) -> bool:
+    return "fx" in values and "ppx" not in values
+
+
 MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...] = (
     (_is_open3d, _read_open3d),
-    (_is_replica, _read_replica),
+    (_is_nested, _read_nested),
     (_is_ros, _read_ros),
     (_is_kalibr, _read_kalibr),
+    (_is_one_of_kalibr, _kalibr_camera),
+    (_is_vins, _read_vins),
     (is_realsense, read_realsense),
     (is_nerfstudio, read_nerfstudio),
+    (_is_flat, _read_flat),
 )
 """How each make is known, and read."""
 
@@ -227,7 +230,7 @@ def _parse_storage(path: Path, text: str) -> Table:
     except (cv2.error, SystemError) as error:
         raise GavoError(f"{path}: not readable by OpenCV's FileStorage: {_line(error)}") from None
     try:
-        return _storage_orb(storage) or _storage_matrices(path, storage)
+        return _storage_orb(storage) or _storage_table(path, storage)
     except GavoError:
         raise
     except (cv2.error, SystemError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -236,41 +239,33 @@ def _parse_storage(path: Path, text: str) -> Table:
         storage.release()
 
 
-def _storage_matrices(path: Path, storage: Any) -> Table:
-    def matrix(*names: str) -> np.ndarray | None:
-        found = (storage.getNode(name) for name in names)
-        return next((_matrix_of(node) for node in found if not node.empty()), None)
-
-    def whole(*names: str) -> int | None:
-        found = (storage.getNode(name) for name in names)
-        return next((int(node.real()) for node in found if not node.empty() and node.isInt()), None)
-
-    intrinsics = matrix("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
-    if intrinsics is None or intrinsics.size != 9:
+def _storage_table(path: Path, storage: Any) -> Table:
+    """What a FileStorage holds, read as YAML or JSON of the same names would be."""
+    root = storage.root()
+    values = {name: _plain_value(root.getNode(name)) for name in root.keys()}
+    if not _is_ros(values) and not _is_vins(values):
         raise GavoError(f"{path}: camera_matrix: missing, or not 3x3")
-    table = of_matrix(str(path), intrinsics.ravel().tolist())
-    coefficients = matrix("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1")
-    model = storage.getNode("distortion_model")
-    named = model.string() if model.isString() else "fisheye" if whole("fisheye_model", "fisheye") else "plumb_bob"
-    table |= camera_info_distortion(named, [] if coefficients is None else coefficients.ravel().tolist())
-    size = storage.getNode("image_size")
-    sides = [int(size.at(i).real()) for i in range(2)] if size.isSeq() and size.size() == 2 else [None, None]
-    width, height = whole("image_width", "width", "image_Width"), whole("image_height", "height", "image_Height")
-    sizes = {"width": width or sides[0], "height": height or sides[1]}
-    scale = storage.getNode("depth_scale")
-    stated = {"depth_scale": scale.real()} if scale.isReal() or scale.isInt() else {}
-    return {**table, **{key: value for key, value in sizes.items() if value is not None}, **stated}
+    return _of_known_make(path, values)
+
+
+def _plain_value(node: Any) -> Any:
+    """A node of a FileStorage as numbers, text, lists and tables; a matrix as rows, None where it is nothing."""
+    if node.isMap():
+        names = node.keys()
+        if {"rows", "cols", "data"} <= set(names):
+            return _matrix_of(node).tolist()
+        return {name: _plain_value(node.getNode(name)) for name in names}
+    if node.isSeq():
+        return [_plain_value(node.at(i)) for i in range(node.size())]
+    if node.isString():
+        return node.string()
+    if node.isInt():
+        return int(node.real())
+    return node.real() if node.isReal() else None
 
 
 def _matrix_of(node: Any) -> np.ndarray:
-    """A matrix of a FileStorage, or the numbers of a plain list.
-
-    Not by its own `mat()`, which writes beyond its memory where sizes do not agree.
-    """
-    if node.isSeq():
-        return np.array([_real(node.at(i)) for i in range(node.size())])
-    if not node.isMap():
-        raise TypeError("a matrix that is neither a matrix nor a list")
+    """A matrix of a FileStorage. Not by its own `mat()`, which writes beyond its memory where sizes do not agree."""
     data = node.getNode("data")
     numbers = [_real(data.at(i)) for i in range(data.size())] if data.isSeq() else []
     rows, columns = (node.getNode(name) for name in ("rows", "cols"))

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -187,6 +188,106 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
     assert name.endswith(".csv") or load_camera(tmp_path / name) == found.color
 
 
+K = {"K": MATRIX.tolist(), "width": 640, "height": 480}
+SDK = {key: value for key, value in REALSENSE.items() if key not in ("model", "coeffs")}
+FLAT = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5}
+EUROC = f"""sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: [500, 510, 319.5, 239.5]
+distortion_model: radial-tangential
+distortion_coefficients: {RADTAN}
+"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: camera
+image_width: 640
+image_height: 480
+distortion_parameters:
+   k1: 0.1
+   k2: -0.2
+   p1: 0.001
+   p2: -0.002
+projection_parameters:
+   fx: 500.0
+   fy: 510.0
+   cx: 319.5
+   cy: 239.5
+"""
+COMMON_NAMES: dict[str, tuple[str | dict[str, Any], Camera]] = {
+    **{
+        f"{name}.json": ({**K, name: [[*RADTAN, 0.0]]}, BROWN)
+        for name in ("dist", "dist_coeff", "dist_coeffs", "distCoeffs", "distortion", "distortion_coefficients", "d")
+    },
+    "tutorial.yaml": (
+        f"camera_matrix: {MATRIX.tolist()}\ndist_coeff: [{[*RADTAN, 0.0]}]\nimage_size: [640, 480]\n",
+        BROWN,
+    ),
+    "storage.yml": (storage(".yml", {**OTHER, "D": "dist_coeffs"}), BROWN),
+    "storage fisheye.yml": (storage(".yml", OTHER, False, EQUIDISTANT) + "model: fisheye\n", FISH),
+    "storage factor.yml": (storage(".yml", OTHER) + "DepthMapFactor: 1000.\n", replace(BROWN, depth_scale=1000.0)),
+    "open3d.json": ({**OPEN3D, "distortion_coefficients": RADTAN}, BROWN),
+    "replica.json": ({"camera": {**REPLICA["camera"], **LENS}}, replace(BROWN, depth_scale=6553.5)),
+    "nice-slam.yaml": (
+        "cam:\n  H: 480\n  W: 640\n  fx: 500\n  fy: 510\n  cx: 319.5\n  cy: 239.5\n  png_depth_scale: 6553.5\n",
+        replace(NONE, depth_scale=6553.5),
+    ),
+    "splatam.json": (
+        {"camera_params": {**FLAT, "image_width": 640, "image_height": 480, "png_depth_scale": 1000.0}},
+        replace(NONE, depth_scale=1000.0),
+    ),
+    "realsense.json": ({**SDK, "distortion": "brown_conrady", "distortion_coeffs": [*RADTAN, 0.0]}, BROWN),
+    "model.json": ({**K, "D": EQUIDISTANT, "model": "fisheye"}, FISH),
+    "camera model.json": ({**K, "D": EQUIDISTANT, "camera_model": "fisheye"}, FISH),
+    "flag.json": ({**K, "D": EQUIDISTANT, "fisheye": True}, FISH),
+    "device.json": ({**K, "D": RADTAN, "model": "D435"}, BROWN),
+    "delay.yaml": (ros1("plumb_bob", RADTAN) + "depth_delay: -0.02\n", BROWN),
+    "factor.json": ({**K, "depth_factor": 1000}, replace(NONE, depth_scale=1000.0)),
+    "metres.json": ({**K, "depth_scale": 0.001}, replace(NONE, depth_scale=1000.0)),
+    "kalibr.yaml": (kalibr("radtan", RADTAN) + "  depth_scale: 1000\n", replace(BROWN, depth_scale=1000.0)),
+    "euroc.yaml": (EUROC, BROWN),
+    "vins.yaml": (VINS, BROWN),
+    "flat.json": ({**FLAT, "w": 640, "h": 480, **LENS}, BROWN),
+    "camera matrix.json": ({"cameraMatrix": MATRIX.tolist(), "image_size": [640, 480]}, NONE),
+}
+
+
+@pytest.mark.parametrize("name", COMMON_NAMES)
+def test_lens_and_unit_go_by_all_their_common_names(tmp_path, name):
+    """They were left aside without a word."""
+    said, camera = COMMON_NAMES[name]
+    (tmp_path / name).write_text(said if isinstance(said, str) else json.dumps(said))
+    found = load_calibration(tmp_path / name)
+    np.testing.assert_allclose(found.color.distortion, camera.distortion, atol=1e-12)
+    assert replace(found.color, distortion=camera.distortion) == camera
+    assert found.depth_delay == (-0.02 if name == "delay.yaml" else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"my_distortion": RADTAN}, "'my_distortion': not known, and looks like a lens"),
+        ({"dist_params": {"k1": 0.1}}, "'dist_params': not known"),
+        ({"depth_unit_scale": 0.001}, "'depth_unit_scale': not known"),
+    ],
+)
+def test_what_looks_like_a_lens_and_is_not_known_is_refused(tmp_path, more, words):
+    path = tmp_path / "camera.json"
+    for known in (K, OPEN3D, {"camera": {**FLAT, "w": 640, "h": 480}}):
+        whole = {"camera": {**known["camera"], **more}} if "camera" in known else {**known, **more}
+        path.write_text(json.dumps(whole))
+        with pytest.raises(GavoError, match=words):
+            load_calibration(path)
+    path.write_text(json.dumps({**K, "max_distance": 5.0, "undistorted": True, "my_distortion": [0.0] * 5}))
+    assert load_calibration(path).color == NONE
+
+
 @pytest.mark.parametrize(
     ("text", "camera"),
     [
@@ -309,7 +410,7 @@ FAULTS = {
     "orb without.yaml": (ORB.replace("Camera.cx", "Camera.cz"), "cx: missing"),
     "orb text.yaml": (ORB.replace("0.1\n", '"0.1"\n'), "Camera.k1: not a number"),
     "orb odd.yaml": (ORB.replace("PinHole", "Scaramuzza"), "Scaramuzza"),
-    "opencv text.yaml": (LIST_OF_OPENCV.replace("500.0", '"x"'), "not a number"),
+    "opencv text.yaml": (LIST_OF_OPENCV.replace("500.0", '"x"'), "fx: must be a number"),
     "kalibr alone.yaml": (kalibr("radtan", RADTAN, True).split("  T_cn")[0], "T_cn_cnm1"),
     "ros zero.yaml": (ros1("plumb_bob", RADTAN).replace(str(ROWS), str([0.0] * 9)), "nobody calibrated"),
     "ros skewed.yaml": (ros1("plumb_bob", RADTAN).replace("500.0, 0.0", "500.0, 9.0"), "not a camera matrix"),

@@ -60,8 +60,8 @@ class TumSequence(FileSequence):
     """A folder with `rgb.txt`, `depth.txt`, the images they list and, where known, `groundtruth.txt`.
 
     Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`), or by the rows of a
-    list of pairs (`ASSOCIATIONS`) in place of the two; frames come in the order of their colour stamps and carry them. Images are decoded one by one when asked for, and nothing of them is
-    kept.
+    list of pairs (`ASSOCIATIONS`) in place of the two; frames come in the order of their colour stamps and carry them.
+    Images are decoded one by one when asked for, and nothing of them is kept.
 
     Lists need not be sorted. But where all but a few stamps of a list increase (`MAX_MISPLACED`), those few are in
     doubt: a frame of such a colour or depth stamp has its place by it, but reading it raises `TimestampError`. In an

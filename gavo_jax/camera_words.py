@@ -1,0 +1,167 @@
+"""What programs call the numbers that stand beside a camera's matrix: size, lens, unit of depth.
+
+Names are compared without case and punctuation. What looks like a lens or a unit and is neither known is refused: a
+camera that loses its lens in silence drifts.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+
+from gavo_jax.errors import GavoError
+
+Table = dict[str, Any]
+
+MATRIX = ("cameramatrix", "k", "m1")
+"""Of fx, fy, cx and cy."""
+
+LENS = (
+    *("distortion", "distortioncoefficients", "distortioncoeffs", "distortioncoeff", "distortionparameters"),
+    *("distcoeffs", "distcoeff", "distcoefs", "distcoefficients", "dist", "coeffs", "d", "d1"),
+)
+"""Of a list of coefficients, or a table of them by name."""
+
+LENS_MODEL = ("distortionmodel", "distortiontype", "modeltype")
+"""Of a lens model, whatever it is;"""
+ANY_MODEL = ("model", "cameramodel")
+"""of one, or of the device's make."""
+
+IS_FISHEYE = ("fisheye", "fisheyemodel", "isfisheye")
+"""Of a flag."""
+
+UNIT = ("depthscale", "depthfactor", "pngdepthscale", "depthmapfactor")
+"""Of raw depth units per metre, or metres per unit."""
+
+WIDTH, HEIGHT, SIZE = ("width", "imagewidth", "w"), ("height", "imageheight", "h"), ("imagesize", "resolution")
+"""Of the image's sides, pixels, and of both."""
+
+KEPT = ("readout", "depth_delay")
+"""As in our own files."""
+
+LEAST_UNITS = 0.05
+"""Per metre: fewer are metres per unit."""
+
+PINHOLE_ORDER, FISHEYE_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), ("k1", "k2", "k3", "k4")
+"""Of OpenCV's coefficients."""
+
+LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor)")
+
+MODELS = {
+    "pinhole": "pinhole",
+    "none": "pinhole",
+    "plumb_bob": "pinhole",
+    "radtan": "pinhole",
+    "radial_tangential": "pinhole",
+    "brown": "pinhole",
+    "opencv": "pinhole",
+    "rational": "pinhole",
+    "rational_polynomial": "pinhole",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
+    "kannalabrandt8": "fisheye",
+    "opencv_fisheye": "fisheye",
+}
+"""Names of distortion models, as ROS, Kalibr and others call them; see `model_of`."""
+
+
+def model_of(name: Any) -> str | None:
+    """Our name of a distortion model: "pinhole" or "fisheye"; None where it is not known."""
+    return MODELS.get(name.lower().replace("-", "_")) if isinstance(name, str) else None
+
+
+def plain(name: str) -> str:
+    """A name without case and punctuation."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def first(values: Table, names: tuple[str, ...]) -> Any:
+    """The value of the first of some names that is there; None where none is."""
+    found = {plain(key): value for key, value in reversed(values.items())}
+    return next((found[name] for name in names if found.get(name) is not None), None)
+
+
+def numbers_of(entry: Any) -> list[Any]:
+    """A list, of rows or of numbers, or a matrix with its `data`, as a flat list."""
+    if isinstance(entry, dict):
+        entry = entry["data"]
+    flat: list[Any] = []
+    for value in entry if isinstance(entry, list) else [] if entry is None else [entry]:
+        flat += value if isinstance(value, list) else [value]
+    return flat
+
+
+def beside(place: str, values: Table) -> Table:
+    """Our keys for what stands beside a camera's matrix.
+
+    Args:
+        place: names the file in messages.
+        values: as a program wrote them.
+
+    Raises:
+        GavoError: a name that looks like a lens or a unit is not known.
+    """
+    _refuse_unknown(place, values)
+    return {**_size(values), **_lens(values), **_unit(values), **{key: values[key] for key in KEPT if key in values}}
+
+
+def known(key: str) -> bool:
+    """Whether a name is one that `beside` reads."""
+    words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *PINHOLE_ORDER)
+    return plain(key) in words or key in KEPT
+
+
+def camera_info_distortion(model: str, coefficients: list[Any]) -> Table:
+    """Our keys for what a ROS camera_info, or another file, says of the lens; an empty list stands for none, but of a
+    fisheye.
+    """
+    if len(coefficients):
+        return {"distortion": coefficients, "model": model or "plumb_bob"}
+    return {"model": model} if model_of(model) == "fisheye" else {}
+
+
+def _lens(values: Table) -> Table:
+    named, model = first(values, LENS_MODEL), first(values, ANY_MODEL)
+    if named is None:
+        is_fisheye = bool(first(values, IS_FISHEYE)) or model_of(model) == "fisheye"
+        named = "fisheye" if is_fisheye else ""
+    coefficients = first(values, LENS)
+    by_name = coefficients if isinstance(coefficients, dict) and "data" not in coefficients else values
+    order = FISHEYE_ORDER if model_of(named) == "fisheye" else PINHOLE_ORDER
+    if coefficients is None or by_name is not values:
+        found = {plain(key): value for key, value in by_name.items()}
+        last = max((at for at, name in enumerate(order) if found.get(name) is not None), default=-1)
+        coefficients = [found.get(name) or 0.0 for name in order[: last + 1]]
+        coefficients += [0.0] * (max(4, len(coefficients)) - len(coefficients) if coefficients else 0)
+        if order is PINHOLE_ORDER and len(coefficients) in (6, 7):
+            coefficients += [0.0] * (8 - len(coefficients))
+    return camera_info_distortion(named, numbers_of(coefficients))
+
+
+def _size(values: Table) -> Table:
+    both = numbers_of(first(values, SIZE))
+    sides = (first(values, WIDTH), first(values, HEIGHT))
+    width, height = both if None in sides and len(both) == 2 else sides
+    return {key: value for key, value in (("width", width), ("height", height)) if value is not None}
+
+
+def _unit(values: Table) -> Table:
+    unit = first(values, UNIT)
+    if isinstance(unit, int | float) and 0 < unit < LEAST_UNITS:
+        unit = 1 / unit
+    return {} if unit is None else {"depth_scale": unit}
+
+
+def _refuse_unknown(place: str, values: Table) -> None:
+    for key, value in values.items():
+        if known(key) or not LOOKS_LIKE_A_LENS.search(plain(key)) or isinstance(value, bool | str):
+            continue
+        try:
+            is_told = value is not None and bool(np.any(np.array(numbers_of(value), float)))
+        except (TypeError, ValueError, KeyError):
+            is_told = True
+        if is_told:
+            raise GavoError(
+                f"{place}: {key[:60]!r}: not known, and looks like a lens or a unit of depth: "
+                "name it distortion_coefficients or depth_scale"
+            )
