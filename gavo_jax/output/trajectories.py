@@ -185,8 +185,8 @@ def _euroc_rows(trajectory: Trajectory) -> Iterator[str]:
 
 
 def _nanoseconds(trajectory: Trajectory) -> list[int]:
-    """Stamps as whole nanoseconds: seconds and their fraction apart, so that no digit of the fraction is lost."""
-    return [round(stamp // 1) * 10**9 + round(stamp % 1 * 1e9) for stamp in trajectory.timestamps.tolist()]
+    """Stamps as whole nanoseconds, to the microsecond, as trajectory.txt has them: seconds since 1970 hold no more."""
+    return [round(stamp * 1e6) * 1000 for stamp in trajectory.timestamps.tolist()]
 
 
 def _quaternions(trajectory: Trajectory) -> Float[np.ndarray, "n 4"]:

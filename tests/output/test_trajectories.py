@@ -29,6 +29,13 @@ def test_euroc_is_what_we_read_ourselves(tmp_path):
     np.testing.assert_allclose(1e-9 * read.timestamps, TRAJECTORY.timestamps, atol=1e-6)
 
 
+def test_nanoseconds_have_no_digits_that_seconds_since_1970_do_not_hold(tmp_path):
+    times = Trajectory(np.array([1305031102.175304, 1305031102.211214]), np.tile(np.eye(4), (2, 1, 1)))
+    write_trajectory(times, tmp_path / "t.csv", "euroc")
+    rows = [row.split(",")[0] for row in (tmp_path / "t.csv").read_text().splitlines() if row[0].isdigit()]
+    assert rows == ["1305031102175304000", "1305031102211214000"]
+
+
 def test_euroc_is_what_evo_reads(tmp_path):
     write_trajectory(TRAJECTORY, tmp_path / "t.csv", "euroc")
     read = file_interface.read_euroc_csv_trajectory(str(tmp_path / "t.csv"))
