@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gavo_jax.camera import NUMBERS_OF_DISTORTION
 from gavo_jax.errors import GavoError
 
 Table = dict[str, Any]
@@ -42,8 +43,8 @@ KEPT = ("readout", "depth_delay")
 LEAST_UNITS = 0.05
 """Per metre: fewer are metres per unit."""
 
-PINHOLE_ORDER, FISHEYE_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), ("k1", "k2", "k3", "k4")
-"""Of OpenCV's coefficients."""
+ORDER = {"pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
+"""Of OpenCV's coefficients, by model."""
 
 LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor)")
 
@@ -107,7 +108,7 @@ def beside(place: str, values: Table) -> Table:
 
 def known(key: str) -> bool:
     """Whether a name is one that `beside` reads."""
-    words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *PINHOLE_ORDER)
+    words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *ORDER["pinhole"])
     return plain(key) in words or key in KEPT
 
 
@@ -121,21 +122,27 @@ def camera_info_distortion(model: str, coefficients: list[Any]) -> Table:
 
 
 def _lens(values: Table) -> Table:
-    named, model = first(values, LENS_MODEL), first(values, ANY_MODEL)
-    if named is None:
-        is_fisheye = bool(first(values, IS_FISHEYE)) or model_of(model) == "fisheye"
-        named = "fisheye" if is_fisheye else ""
-    coefficients = first(values, LENS)
-    by_name = coefficients if isinstance(coefficients, dict) and "data" not in coefficients else values
-    order = FISHEYE_ORDER if model_of(named) == "fisheye" else PINHOLE_ORDER
-    if coefficients is None or by_name is not values:
-        found = {plain(key): value for key, value in by_name.items()}
-        last = max((at for at, name in enumerate(order) if found.get(name) is not None), default=-1)
-        coefficients = [found.get(name) or 0.0 for name in order[: last + 1]]
-        coefficients += [0.0] * (max(4, len(coefficients)) - len(coefficients) if coefficients else 0)
-        if order is PINHOLE_ORDER and len(coefficients) in (6, 7):
-            coefficients += [0.0] * (8 - len(coefficients))
-    return camera_info_distortion(named, numbers_of(coefficients))
+    model, given = _lens_model(values), first(values, LENS)
+    given = values if given is None else given  # k1, k2, … may stand beside the rest
+    by_name = isinstance(given, dict) and "data" not in given
+    return camera_info_distortion(model, _by_name(given, model) if by_name else numbers_of(given))
+
+
+def _lens_model(values: Table) -> Any:
+    """The name of the lens model; empty where none is told."""
+    named = first(values, LENS_MODEL)
+    if named is not None:
+        return named
+    return "fisheye" if first(values, IS_FISHEYE) or model_of(first(values, ANY_MODEL)) == "fisheye" else ""
+
+
+def _by_name(values: Table, model: Any) -> list[Any]:
+    """Coefficients k1, k2, … in OpenCV's order and number; those that are missing among them are zero."""
+    kind = model_of(model) or "pinhole"
+    found = {plain(key): value for key, value in values.items() if value is not None}
+    last = max((at for at, name in enumerate(ORDER[kind]) if name in found), default=-1)
+    count = next(count for count in (0, *NUMBERS_OF_DISTORTION[kind]) if count > last)
+    return [found.get(name, 0.0) for name in ORDER[kind][:count]]
 
 
 def _size(values: Table) -> Table:
