@@ -33,8 +33,8 @@ from gavo_jax.datasets.messages import (
     color_of,
     depth_of,
     is_calibrated,
-    is_depth,
 )
+from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
 from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 from gavo_jax.trajectory import Trajectory, associate
@@ -60,12 +60,6 @@ ROUNDED = 0.05
 
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """In the name of a topic whose images are free of distortion."""
-
-COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered", "depth_to_rgb", "depth_to_color")
-"""Words in the names of topics that are chosen before others."""
-
-MOVED_COLOR = ("rgb_to_depth", "color_to_depth")
-"""In the names of topics of colour as the depth camera would see it, which are chosen last."""
 
 
 class _Topic(NamedTuple):
@@ -375,36 +369,21 @@ class _Bag:
             return next(filter(is_good, messages), None)
 
     def choose(self, reading: Reading) -> tuple[str, str]:
-        """The topics of colour and depth, those that are named or those that the messages' types speak for."""
-        depth = {}
+        """The topics of colour and depth, those that are named or those that messages and names speak for."""
+        images = {}
         for name, kind in sorted(self.kinds.items()):
             if (message := self.first(name)) is not None:
-                depth[name] = is_depth(kind, message, name)
-        found = []
-        for is_wanted, given, what, option, words in (
-            (True, reading.depth_topic, "depth", "--depth-topic", DEPTH_NAMES),
-            (False, reading.color_topic, "colour", "--colour-topic", COLOR_NAMES),
-        ):
-            if given is not None:
-                if given not in depth:
-                    raise GavoError(f"{self.path}: {option}: no images on {given!r}: those are on {_named(depth)}")
-                found.append(given)
-                continue
-            names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
-            names = [name for name in names if name not in found] or names
-            names = [name for name in names if not _is_named(name, MOVED_COLOR)] or names
-            best = [name for name in names if _is_named(name, words)] or names
-            if len(best) != 1:
-                if not depth:
-                    raise GavoError(f"{self.path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
-                what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
-                raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
-            found += best
-        if found[0] == found[1]:
-            raise GavoError(
-                f"{self.path}: {found[0]}: chosen as colour and as depth alike: there are images on {_named(depth)}"
-            )
-        return found[1], found[0]
+                images[name] = Images.of(kind, message, name)
+        color, depth = choose(self.path, images, reading.color_topic, reading.depth_topic)
+        are_named = reading.color_topic is not None and reading.depth_topic is not None
+        if are_of_two_cameras(color, depth) and not are_named:
+            frames = images[color].frame, images[depth].frame
+            if frames[0] == frames[1] or between(self._transforms(), *frames) is None:
+                raise GavoError(
+                    f"{self.path}: {color} and {depth} are of two cameras, by their names: "
+                    "say --colour-topic and --depth-topic if they are of one"
+                )
+        return color, depth
 
     def calibration(self, color: str, depth: str) -> Calibration:
         """The cameras of two topics, from the camera_info beside each."""
@@ -418,7 +397,7 @@ class _Bag:
         if other is None or moved is None:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
         frames = (info.header.frame_id, other[1].header.frame_id)
-        says_so = _is_named(depth, DEPTH_NAMES)
+        says_so = says_registered(color, depth)
         is_one_place = frames[0] == frames[1] or not all(frames) or says_so
         are_placed = any(frames) or says_so  # two that have no name are not for that one frame
         color_T_depth = between(self._transforms(), *frames) if are_placed else None
@@ -526,11 +505,6 @@ def _stamp(raw: Any, is_2: bool) -> float:
     return seconds + nanoseconds * 1e-9
 
 
-def _without_copies(names: list[str]) -> list[str]:
-    """Topics without those that hold the same images as another, compressed."""
-    return [name for name in names if name.rpartition("/")[0] not in names]
-
-
 def _is_same(a: Camera, b: Camera) -> bool:
     """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
     numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
@@ -540,12 +514,3 @@ def _is_same(a: Camera, b: Camera) -> bool:
 def _is_rectified(topic: str) -> bool:
     """Whether a topic's name says that its images are free of distortion."""
     return bool(RECTIFIED.search(topic))
-
-
-def _is_named(topic: str, words: tuple[str, ...]) -> bool:
-    """Whether a topic's name holds one of some words, small or capital."""
-    return any(word in topic.lower() for word in words)
-
-
-def _named(topics: Any) -> str:
-    return ", ".join(sorted(topics)) or "no topic"

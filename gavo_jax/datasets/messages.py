@@ -62,9 +62,14 @@ INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|dispa
 """In the name of a topic of numbers that are brightness, pixels or a probability, and no depth."""
 
 
+def encoding_of(kind: str, message: Any) -> str:
+    """What an image message says that it holds: of a compressed one the format."""
+    return message.encoding if kind == IMAGE else message.format
+
+
 def is_depth(kind: str, message: Any, topic: str) -> bool:
     """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
-    encoding = message.encoding if kind == IMAGE else message.format
+    encoding = encoding_of(kind, message)
     is_named = "depth" in topic.lower()
     if INFRARED.search(topic) and not is_named:
         return False

@@ -214,6 +214,118 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
 
 
+def with_topics(path: Path, frames: dict[str, str], infos: bool = True) -> Path:
+    """A recording of topics, each in its frame, with depth where the name's last words say so and a camera_info."""
+    recorder = Recorder(path, "mcap")
+    for stamp in (1.0, 1.1):
+        for topic, frame in frames.items():
+            is_depth = "depth" in topic.replace("depth_camera", "") and not topic.endswith(
+                ("colored", "overlay", "rgb_to_depth/image_raw")
+            )
+            pixels, encoding = (MILLIMETRES[0], "16UC1") if is_depth else (BGRS[0], "bgr8")
+            recorder.image(topic, stamp, pixels, encoding, frame=frame)
+            if infos:
+                recorder.info(f"{topic.rpartition('/')[0]}/camera_info", stamp, CAMERA, frame=frame)
+    recorder.close()
+    return path
+
+
+def topics_of(path: Path, reading: Reading | None = None) -> list[str]:
+    sequence = open_source(path, reading or Reading(camera=CAMERA))
+    assert isinstance(sequence, BagSequence)
+    return [topic.name for topic in sequence._topics]
+
+
+@pytest.mark.parametrize("frames", [("front", "rear"), ("optical", "optical"), ("", "")])
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [
+        ("/front/color/image_raw", "/rear/aligned_depth_to_color/image_raw"),
+        ("/robot/front/image_raw", "/robot/rear/depth_registered/image"),
+        ("/device_0/sensor_1/Color_0/image/data", "/device_1/sensor_0/depth_0/image/data"),
+        ("/usb_cam/image_raw", "/camera/depth/image_raw"),
+        ("/front_rgb", "/rear_depth"),
+    ],
+)
+def test_colour_of_one_camera_and_depth_of_another_are_no_pair(tmp_path, color, depth, frames):
+    """The word aligned says of depth that it lies on the colour of its own camera."""
+    path = with_topics(tmp_path / "rig", dict(zip((color, depth), frames, strict=True)))
+    for reading in (Reading(), Reading(color_topic=color), Reading(depth_topic=depth), Reading(camera=CAMERA)):
+        with pytest.raises(
+            GavoError, match=f"{color} and {depth} are of two cameras.*--colour-topic and --depth-topic"
+        ):
+            open_source(path, reading)
+    both = Reading(color_topic=color, depth_topic=depth)
+    assert topics_of(path, replace(both, camera=CAMERA)) == [color, depth]
+    if color.count("/") > 1 and frames == ("front", "rear"):
+        with pytest.raises(GavoError, match=f"{depth} is of another camera than {color}"):
+            open_source(path, both)
+
+
+def test_two_cameras_that_the_recordings_transforms_join_are_a_pair(tmp_path):
+    color, depth = "/wide/color/image_raw", "/tof/aligned_depth/image_raw"
+    recorder = Recorder(tmp_path / "rig", "mcap")
+    recorder.fixed(1.0, {("wide", "tof"): ([0.1, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])})
+    for stamp in (1.0, 1.1):
+        for topic, pixels, encoding in ((color, BGRS[0], "bgr8"), (depth, MILLIMETRES[0], "16UC1")):
+            place = topic.split("/")[1]
+            recorder.image(topic, stamp, pixels, encoding, frame=place)
+            recorder.info(f"{topic.rpartition('/')[0]}/camera_info", stamp, CAMERA, frame=place)
+    recorder.close()
+    sequence = open_source(tmp_path / "rig")
+    assert isinstance(sequence, BagSequence) and sequence.calibration.color_T_depth is not None
+    assert sequence.calibration.color_T_depth[0, 3] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("front", "rear"),
+    [
+        (("/front/rgb/image_raw", "/front/depth/image_raw"), ("/rear/image_raw", "/rear/depth_registered/image_raw")),
+        (("/front_rgb", "/front_depth"), ("/rear_image", "/rear_depth_registered")),
+        (
+            ("/cam1/color/image_raw", "/cam1/aligned_depth_to_color/image_raw"),
+            ("/cam2/color/image", "/cam2/depth/image"),
+        ),
+    ],
+)
+def test_of_two_cameras_one_is_to_be_named(tmp_path, front, rear):
+    path = with_topics(tmp_path / "two", dict.fromkeys(front + rear, "camera"), infos=False)
+    told = f"2 cameras, {' with '.join(front)}; {' with '.join(rear)}: say --colour-topic or --depth-topic of one"
+    with pytest.raises(GavoError, match=re.escape(told)):
+        open_source(path, Reading(camera=CAMERA))
+    for pair in (front, rear):
+        assert topics_of(path, Reading(camera=CAMERA, color_topic=pair[0])) == list(pair)
+        assert topics_of(path, Reading(camera=CAMERA, depth_topic=pair[1])) == list(pair)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "others"),
+    [
+        ("/camera/image_raw", "/camera/depth/image_raw", ["/camera/depth/image_colored"]),
+        ("/camera/image_raw", "/camera/depth/image_raw", ["/detector/rgb_overlay"]),
+        ("/depth_camera/image_raw", "/depth_camera/depth/image_raw", ["/depth_camera/image_depth_colored"]),
+        ("/depth_camera/rgb/image", "/depth_camera/depth_image", ["/camera/image_raw", "/map/colored"]),
+        ("/cam/color/image_raw", "/cam/depth/image_rect", ["/cam/infra1/image_raw", "/cam/confidence/overlay"]),
+        ("/kinect/rgb_to_depth/image_raw", "/kinect/depth/image_raw", []),
+        ("/front/rgb", "/front/depth", ["/rear/aligned_depth_to_color/image_raw"]),
+    ],
+)
+def test_colour_is_that_of_the_depth_topics_camera(tmp_path, color, depth, others):
+    """A picture of depth, drawn in colours, is none; nor is one that another program has drawn upon."""
+    path = with_topics(tmp_path / "many", dict.fromkeys([color, depth, *others], "camera"), infos=False)
+    assert topics_of(path) == [color, depth]
+
+
+def test_a_picture_of_depth_is_colour_where_it_is_named(tmp_path):
+    picture, depth = "/camera/depth/image_colored", "/camera/depth/image_raw"
+    path = with_topics(tmp_path / "picture", {picture: "camera", depth: "camera"})
+    with pytest.raises(
+        GavoError, match=f"no colour images; there are images on {picture}, {depth}: say --colour-topic"
+    ):
+        open_source(path)
+    assert topics_of(path, Reading(color_topic=picture)) == [picture, depth]
+
+
 def test_brightness_of_16_bits_is_no_depth(tmp_path):
     recorder = Recorder(tmp_path / "ir", "mcap")
     for stamp in (1.0, 1.1):
