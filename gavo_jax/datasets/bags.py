@@ -46,6 +46,16 @@ METADATA = "metadata.yaml"
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of what is compressed so."""
 
+MCAP = b"\x89MCAP0\r\n"
+"""First bytes of such a file."""
+
+FOREIGN = {
+    "": "its header names no profile, and the library reads 'ros2' alone: ros2 bag convert writes it so, if ROS 2's "
+    "messages are in it",
+    "ros1": "its profile is 'ros1', and the library reads 'ros2' alone: name the .bag that it was made from",
+}
+"""What to do about an MCAP by the profile in its header."""
+
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
 
@@ -484,9 +494,21 @@ def _legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
 def _mending(path: Path) -> str:
     """What may help with a recording that is torn."""
     files = [path] if path.is_file() else list(path.iterdir())
+    profiles = {_profile(file) for file in files if file.suffix.lower() == ".mcap"}
+    if (profile := next(iter(profiles - {"ros2", None}), None)) is not None:
+        return FOREIGN.get(profile, f"its profile is {profile[:40]!r}, and the library reads 'ros2' alone")
     kinds = {file.suffix.lower() for file in files}
     tool = "mcap recover" if ".mcap" in kinds else "rosbag reindex" if ".bag" in kinds else "ros2 bag reindex"
     return f"get it anew, or mend it with {tool}"
+
+
+def _profile(file: Path) -> str | None:
+    """The profile in the header of an MCAP, the first of its records; None where there is no such header."""
+    with contextlib.suppress(OSError, struct.error, UnicodeDecodeError), file.open("rb") as stream:
+        magic, kind, _, length = struct.unpack("<8sBQI", stream.read(21))
+        if (magic, kind) == (MCAP, 1) and len(profile := stream.read(min(length, 64))) == length:
+            return profile.decode()
+    return None
 
 
 def _close(reader: Any) -> None:

@@ -3,6 +3,7 @@
 import gc
 import os
 import re
+import struct
 import sys
 import threading
 import tracemalloc
@@ -324,6 +325,22 @@ def test_a_picture_of_depth_is_colour_where_it_is_named(tmp_path):
     ):
         open_source(path)
     assert topics_of(path, Reading(color_topic=picture)) == [picture, depth]
+
+
+@pytest.mark.parametrize("encoding", ["Z16", "16SC1", "32SC1", "mono16"])
+def test_depth_of_another_encoding_is_called_by_it(tmp_path, encoding):
+    pixels = MILLIMETRES[0].astype({"16SC1": np.int16, "32SC1": np.int32}.get(encoding, np.uint16))
+    recorder = Recorder(tmp_path / "z", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/camera/rgb/image", stamp, BGRS[0], "bgr8")
+        recorder.image("/camera/depth/image", stamp, pixels, encoding)
+    recorder.close()
+    if encoding in ("Z16", "mono16"):
+        np.testing.assert_array_equal(open_source(tmp_path / "z", Reading(camera=CAMERA))[0].depth, pixels)
+        return
+    told = rf"no depth images: /camera/depth/image has '{encoding}', and not 16UC1, .*say --depth-topic"
+    with pytest.raises(GavoError, match=told):
+        open_source(tmp_path / "z", Reading(camera=CAMERA))
 
 
 def test_brightness_of_16_bits_is_no_depth(tmp_path):
@@ -695,6 +712,29 @@ def test_a_torn_recording_names_what_mends_it(tmp_path, kind, tool):
             open_source(place)
 
 
+@pytest.mark.parametrize(
+    ("profile", "words"),
+    [
+        ("", "names no profile, .*ros2 bag convert"),
+        ("ros1", r"its profile is 'ros1', .*name the \.bag"),
+        ("x", "its profile is 'x', and the library reads 'ros2' alone"),
+    ],
+)
+def test_an_mcap_of_another_profile_is_not_called_torn(tmp_path, profile, words):
+    path = record(tmp_path / "walk", "mcap", "raw", shots(), CAMERA)
+    file = next(path.glob("*.mcap"))
+    whole = file.read_bytes()
+    (size,) = struct.unpack_from("<I", whole, 17)
+    (length,) = struct.unpack_from("<I", whole, 21 + size)
+    library = whole[25 + size : 25 + size + length].decode().ljust(length + size - len(profile))
+    header = b"".join(struct.pack("<I", len(text)) + text.encode() for text in (profile, library))
+    file.write_bytes(whole[:17] + header + whole[17 + len(header) :])
+    for place in (file, path):
+        with pytest.raises(GavoError, match=f"not a bag that can be read: .*{words}") as caught:
+            open_source(place)
+        assert "recover" not in str(caught.value)
+
+
 def test_without_the_library_it_is_said_what_to_install(bags, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(GavoError, match=r"\[bag\]"):
@@ -764,6 +804,39 @@ def test_a_mosaic_that_was_compressed_as_it_is_becomes_bgr():
     plain = cv2.imencode(".png", PLAIN)[1].tobytes()
     for words in ("bgr8; png compressed bgr8", "png", ""):
         np.testing.assert_array_equal(color_of(COMPRESSED, SimpleNamespace(format=words, data=plain), "x"), PLAIN)
+
+
+@pytest.mark.parametrize("words", ["bayer_rggb8; jpeg compressed bgr8", "bayer_grbg8; png compressed bgr8"])
+def test_a_mosaic_that_became_bgr_before_it_was_compressed_is_none(words):
+    data = cv2.imencode(".png", PLAIN)[1].tobytes()
+    np.testing.assert_array_equal(color_of(COMPRESSED, SimpleNamespace(format=words, data=data), "x"), PLAIN)
+    tile = np.tile(np.array([[200, 90], [90, 30]], np.uint8), (4, 6))
+    mosaic = SimpleNamespace(
+        format="bayer_rggb8; png compressed bayer_rggb8", data=cv2.imencode(".png", tile)[1].tobytes()
+    )
+    assert np.abs(color_of(COMPRESSED, mosaic, "x")[2:-2, 2:-2].astype(int) - (30, 90, 200)).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("form", "slope", "inverse"),
+    [
+        ("32FC1; compressedDepth png", 10000.0, True),
+        ("compressedDepth png", 10000.0, True),
+        ("compressedDepth", 10000.0, True),
+        ("compressedDepth png", 0.0, False),
+        ("16UC1; compressedDepth png", 10000.0, False),
+        ("compressedDepth png", float("nan"), False),
+    ],
+)
+def test_inverse_depth_is_known_by_its_coefficients_where_the_format_is_silent(form, slope, inverse):
+    metres = np.linspace(0.5, 4, 96).reshape(8, 12)
+    stored = np.round(10000.0 / metres - 100.0).astype(np.uint16)
+    data = np.frombuffer(struct.pack("<iff", 0, slope, -100.0) + cv2.imencode(".png", stored)[1].tobytes(), np.uint8)
+    found = depth_of(COMPRESSED, SimpleNamespace(format=form, data=data), "x")
+    if inverse:
+        np.testing.assert_allclose(found, metres, atol=0.002)
+    else:
+        np.testing.assert_array_equal(found, stored)
 
 
 def test_rows_may_be_padded_and_numbers_of_either_end():
