@@ -1,4 +1,4 @@
-"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because topics, clocks and streams share a reader of rosbags.
+"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because cameras and streams share a reader of rosbags.
 
 They are read as a stream.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, overload
+from typing import Any, ClassVar, Self, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +34,7 @@ from gavo_jax.datasets.messages import (
     depth_of,
     is_calibrated,
 )
+from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
 from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
 from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
@@ -72,46 +73,6 @@ RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """In the name of a topic whose images are free of distortion."""
 
 
-class _Topic(NamedTuple):
-    """The messages of one topic, in the order in which they were received."""
-
-    name: str
-    kind: str
-    received: np.ndarray
-    """Nanoseconds."""
-    stamps: np.ndarray
-    """Seconds, of their headers; 0 where they have none."""
-    repeated: int = 0
-    """How many have the stamp of one before them."""
-
-
-def _once(topic: _Topic) -> _Topic:
-    """A topic of which a message that comes twice, by its stamp, counts the first time.
-
-    Two publishers of one topic leave such, or a recording that was played while it was recorded again.
-    """
-    is_first = np.zeros(len(topic.stamps), bool)
-    is_first[np.unique(topic.stamps, return_index=True)[1]] = True
-    again = ~is_first & np.isfinite(topic.stamps)
-    return topic._replace(stamps=np.where(again, np.nan, topic.stamps), repeated=int(again.sum()))
-
-
-def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
-    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival.
-
-    Stamps that stand still are none.
-    """
-    if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
-        return tuple(topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
-    return tuple(topic._replace(stamps=topic.received * 1e-9) for topic in topics)
-
-
-def _span(topic: _Topic) -> str:
-    if not len(topic.stamps):
-        return f"{topic.name} has no message"
-    return f"{topic.name} goes from {np.nanmin(topic.stamps):.3f} to {np.nanmax(topic.stamps):.3f}"
-
-
 class BagSequence:
     """Frames of a recording: a topic of colour and one of depth images, paired by the stamps of their headers.
 
@@ -137,19 +98,22 @@ class BagSequence:
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
         self.ground_truth: Trajectory | None = None
         color, depth = self._bag.choose(reading)
-        self._topics = tuple(map(_once, _in_one_time(self._bag.topic(color), self._bag.topic(depth))))
+        topics = of_one_run(*in_one_time(self._bag.topic(color), self._bag.topic(depth)))
+        self._topics = tuple(map(once, topics))
         i, j = associate(self._topics[0].stamps, self._topics[1].stamps, reading.max_difference)
         if len(i) == 0:
-            spans = " and ".join(_span(topic) for topic in self._topics)
+            spans = " and ".join(topic.span for topic in self._topics)
             raise GavoError(f"{path}: no stamps within {reading.max_difference:g} s of each other: {spans}")
         order = np.argsort(self._topics[0].stamps[i], kind="stable")
         self._pairs = np.stack([i, j], 1)[order]
         self._timestamps = self._topics[0].stamps[i][order]
         self.left_out = []
         for topic, other in zip(self._topics, (depth, color), strict=True):
+            unpaired = len(topic.stamps) - topic.aside - topic.repeated - len(i)
             for count, why in (
+                (topic.aside, topic.why),
                 (topic.repeated, "the stamp of one before it"),
-                (len(topic.stamps) - topic.repeated - len(i), f"none of {other} within {reading.max_difference:g} s"),
+                (unpaired, f"none of {other} within {reading.max_difference:g} s"),
             ):
                 self.left_out += [f"{count} of {topic.name}: {why}"] * (count > 0)
         self.calibration = self._calibrate(path, reading)
@@ -283,7 +247,7 @@ def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> fl
 class _Stream:
     """Gives the messages of frame after frame; each is read once while frames are asked for in order."""
 
-    def __init__(self, bag: "_Bag", topics: tuple[_Topic, ...]) -> None:
+    def __init__(self, bag: "_Bag", topics: tuple[Topic, ...]) -> None:
         self._bag, self._topics, self._lock = bag, topics, threading.Lock()
         self._numbers = {topic.name: at for at, topic in enumerate(topics)}
         self._coming: Iterator[tuple[str, bytes, str]] = iter(())
@@ -361,7 +325,7 @@ class _Bag:
         with _legible(self.path, FrameError):
             return self._reader.deserialize(raw, kind)
 
-    def topic(self, name: str) -> _Topic:
+    def topic(self, name: str) -> Topic:
         """Go over the messages of a topic for their stamps."""
         connections = [connection for connection in self._reader.connections if connection.topic == name]
         received, stamps = [], []
@@ -369,7 +333,7 @@ class _Bag:
             for _, time, raw in self._reader.messages(connections):
                 received.append(time)
                 stamps.append(_stamp(raw, self._reader.is2))
-        return _Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
+        return Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
 
     def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
         """The first message of a topic, of the first few those that are good."""

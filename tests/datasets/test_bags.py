@@ -565,6 +565,50 @@ def test_messages_that_come_twice_count_once(tmp_path, kind):
         np.testing.assert_array_equal(frame.depth, shot.depth)
 
 
+def of_stamps(path: Path, kind: str, stamps: list[float], start: float = 100.0) -> BagSequence:
+    """A recording whose depth has the number of its message; colour and depth arrive every tenth of a second."""
+    recorder = Recorder(path.with_suffix(".bag") if kind == "ros1" else path, kind)
+    for number, stamp in enumerate(stamps):
+        for topic, encoding in ((COLOR, "mono16"), (DEPTH, "16UC1")):
+            recorder.image(topic, stamp, np.full((12, 16), number + 1, np.uint16), encoding, start + number / 10)
+    recorder.close()
+    camera = replace(CAMERA, width=16, height=12, cx=7.5, cy=5.5)
+    sequence = open_source(recorder.writer.path, Reading(camera=camera))
+    assert isinstance(sequence, BagSequence)
+    return sequence
+
+
+TENTHS = [1 + number / 10 for number in range(20)]
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize(
+    ("stamps", "kept", "back", "at"),
+    [
+        (TENTHS + TENTHS[:8], range(20), 1.9, 21),
+        (TENTHS[:8] + TENTHS, range(8, 28), 0.7, 9),
+        (TENTHS[:8] + [stamp + 0.02 for stamp in TENTHS], range(8, 28), 0.7, 9),
+        (TENTHS + [1.06, 1.16] + TENTHS[:5], range(20), 1.8, 21),
+        (TENTHS[:5] + [99.0] + TENTHS[6:], [*range(5), *range(6, 20)], 97.4, 7),
+        (TENTHS[:9] + [1.0] + TENTHS[10:], [*range(9), *range(10, 20)], 0.8, 10),
+    ],
+)
+def test_of_a_clock_that_is_set_back_one_run_is_used(tmp_path, kind, stamps, kept, back, at):
+    """They were sorted together: frames of one place amid those of another."""
+    sequence = of_stamps(tmp_path / "reset", kind, stamps)
+    assert [int(frame.depth[0, 0]) - 1 for frame in sequence] == list(kept)
+    count = len(stamps) - len(kept)
+    why = f"the stamps go back by {back:.1f} s at message {at}, and the longest stretch alone is used"
+    assert sequence.left_out == [f"{count} of {topic}: {why}" for topic in (COLOR, DEPTH)]
+
+
+def test_messages_that_arrive_out_of_order_are_sorted(tmp_path):
+    stamps = [*TENTHS[:5], *TENTHS[9:4:-1], *TENTHS[10:]]
+    sequence = of_stamps(tmp_path / "late", "mcap", stamps)
+    assert sequence.left_out == []
+    np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
+
+
 @pytest.mark.parametrize("stamp", [0.0, 77.0])
 def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     """Of both topics, even where one has stamps."""
