@@ -136,6 +136,12 @@ class BagSequence:
         return self._timestamps
 
     @property
+    def topics(self) -> tuple[str, str]:
+        """Names of those of colour and depth."""
+        color, depth = self._topics
+        return color.name, depth.name
+
+    @property
     def camera(self) -> Camera:
         """Of the frames as they come."""
         return self._shared.assembler.camera

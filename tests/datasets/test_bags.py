@@ -26,6 +26,7 @@ from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.messages import HALVED, LAYOUTS, color_of, depth_of
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import summary
 
 MILLIMETRES = [np.round(metres * 1000).astype(np.uint16) for metres in METRES]
 STAMPS = [1305031102.175304 + i / 30 for i in range(4)]
@@ -605,7 +606,8 @@ def test_of_a_clock_that_is_set_back_one_run_is_used(tmp_path, kind, stamps, kep
 def test_messages_that_arrive_out_of_order_are_sorted(tmp_path):
     stamps = [*TENTHS[:5], *TENTHS[9:4:-1], *TENTHS[10:]]
     sequence = of_stamps(tmp_path / "late", "mcap", stamps)
-    assert sequence.left_out == []
+    assert sequence.left_out == [] and sequence.topics == (COLOR, DEPTH)
+    assert summary(sequence).startswith(f"late: ROS bag of {COLOR} and {DEPTH}, 20 frames of 16x12; camera fx")
     np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
 
 
