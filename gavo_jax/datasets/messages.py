@@ -134,9 +134,10 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
         pixels = _pixels(message, name)
         return pixels if pixels.dtype == np.uint16 else to_float32(pixels)
     data = bytes(message.data)
-    if "compressedDepth" not in message.format:
+    has_header = data[DEPTH_HEADER:].startswith(PNG_SIGNATURE)
+    if "compressedDepth" not in message.format and not has_header:
         return decode_depth(data, name)
-    if len(data) < DEPTH_HEADER or not data[DEPTH_HEADER:].startswith(PNG_SIGNATURE):
+    if not has_header:
         raise FrameError(
             f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read: record "
             "that, or raw images"

@@ -869,6 +869,8 @@ def test_a_mosaic_that_became_bgr_before_it_was_compressed_is_none(words):
         ("32FC1; compressedDepth png", 10000.0, True),
         ("compressedDepth png", 10000.0, True),
         ("compressedDepth", 10000.0, True),
+        ("png", 10000.0, True),
+        ("png", 0.0, False),
         ("compressedDepth png", 0.0, False),
         ("16UC1; compressedDepth png", 10000.0, False),
         ("compressedDepth png", float("nan"), False),
