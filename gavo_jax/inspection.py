@@ -21,10 +21,14 @@ MAX_REASONS = 5
 
 
 def summary(sequence: Sequence) -> str:
-    """One line: what the source is, how many frames, which camera and where from, and what depth is counted in."""
+    """One line: what the source is, how many frames, which camera and where from, and what depth is counted in.
+
+    Of a recording it names the topics of colour and depth.
+    """
     camera, source = sequence.camera, _source(sequence)
+    topics = f" of {' and '.join(source['topics'])}" if source["topics"] else ""
     return (
-        f"{sequence.name}: {source['kind']}, {len(sequence)} frames of {camera.width}x{camera.height}; "
+        f"{sequence.name}: {source['kind']}{topics}, {len(sequence)} frames of {camera.width}x{camera.height}; "
         f"camera fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({source['camera_from']}); "
         f"depth in {name_of_unit(source['depth_units_per_metre'])}"
     )
@@ -67,6 +71,7 @@ def _source(sequence: Sequence) -> Facts:
     calibration, unit = getattr(sequence, "calibration", None), getattr(sequence, "depth_unit", None)
     return {
         "kind": getattr(sequence, "kind", type(sequence).__name__),
+        "topics": list(getattr(sequence, "topics", ())),
         "camera_from": getattr(calibration, "origin", "the sequence"),
         "depth_units_per_metre": sequence.camera.depth_scale if unit is None else unit.file,
     }

@@ -34,6 +34,8 @@ def inspect(options: Inspect) -> int:
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines = [("source", f"{facts['name']}, {facts['kind']}"), ("frames", str(facts["frames"]))]
+    if facts["topics"]:
+        lines.insert(1, ("topics", " and ".join(facts["topics"])))
     lines += [("left out", line) for line in facts["left_out"]]
     refused = "".join(f", {count} {status}" for status, count in facts["frames_not_used"].items())
     lines.append(("frames used", f"{facts['frames_used']} of {facts['frames']}{refused}"))

@@ -1,4 +1,4 @@
-"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because topics, clocks and streams share a reader of rosbags.
+"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because cameras and streams share a reader of rosbags.
 
 They are read as a stream.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, overload
+from typing import Any, ClassVar, Self, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -33,8 +33,9 @@ from gavo_jax.datasets.messages import (
     color_of,
     depth_of,
     is_calibrated,
-    is_depth,
 )
+from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
+from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
 from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 from gavo_jax.trajectory import Trajectory, associate
@@ -45,6 +46,16 @@ METADATA = "metadata.yaml"
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of what is compressed so."""
+
+MCAP = b"\x89MCAP0\r\n"
+"""First bytes of such a file."""
+
+FOREIGN = {
+    "": "its header names no profile, and the library reads 'ros2' alone: ros2 bag convert writes it so, if ROS 2's "
+    "messages are in it",
+    "ros1": "its profile is 'ros1', and the library reads 'ros2' alone: name the .bag that it was made from",
+}
+"""What to do about an MCAP by the profile in its header."""
 
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
@@ -60,52 +71,6 @@ ROUNDED = 0.05
 
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """In the name of a topic whose images are free of distortion."""
-
-COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered", "depth_to_rgb", "depth_to_color")
-"""Words in the names of topics that are chosen before others."""
-
-MOVED_COLOR = ("rgb_to_depth", "color_to_depth")
-"""In the names of topics of colour as the depth camera would see it, which are chosen last."""
-
-
-class _Topic(NamedTuple):
-    """The messages of one topic, in the order in which they were received."""
-
-    name: str
-    kind: str
-    received: np.ndarray
-    """Nanoseconds."""
-    stamps: np.ndarray
-    """Seconds, of their headers; 0 where they have none."""
-    repeated: int = 0
-    """How many have the stamp of one before them."""
-
-
-def _once(topic: _Topic) -> _Topic:
-    """A topic of which a message that comes twice, by its stamp, counts the first time.
-
-    Two publishers of one topic leave such, or a recording that was played while it was recorded again.
-    """
-    is_first = np.zeros(len(topic.stamps), bool)
-    is_first[np.unique(topic.stamps, return_index=True)[1]] = True
-    again = ~is_first & np.isfinite(topic.stamps)
-    return topic._replace(stamps=np.where(again, np.nan, topic.stamps), repeated=int(again.sum()))
-
-
-def _in_one_time(*topics: _Topic) -> tuple[_Topic, ...]:
-    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival.
-
-    Stamps that stand still are none.
-    """
-    if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
-        return tuple(topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
-    return tuple(topic._replace(stamps=topic.received * 1e-9) for topic in topics)
-
-
-def _span(topic: _Topic) -> str:
-    if not len(topic.stamps):
-        return f"{topic.name} has no message"
-    return f"{topic.name} goes from {np.nanmin(topic.stamps):.3f} to {np.nanmax(topic.stamps):.3f}"
 
 
 class BagSequence:
@@ -133,19 +98,22 @@ class BagSequence:
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
         self.ground_truth: Trajectory | None = None
         color, depth = self._bag.choose(reading)
-        self._topics = tuple(map(_once, _in_one_time(self._bag.topic(color), self._bag.topic(depth))))
+        topics = of_one_run(*in_one_time(self._bag.topic(color), self._bag.topic(depth)))
+        self._topics = tuple(map(once, topics))
         i, j = associate(self._topics[0].stamps, self._topics[1].stamps, reading.max_difference)
         if len(i) == 0:
-            spans = " and ".join(_span(topic) for topic in self._topics)
+            spans = " and ".join(topic.span for topic in self._topics)
             raise GavoError(f"{path}: no stamps within {reading.max_difference:g} s of each other: {spans}")
         order = np.argsort(self._topics[0].stamps[i], kind="stable")
         self._pairs = np.stack([i, j], 1)[order]
         self._timestamps = self._topics[0].stamps[i][order]
         self.left_out = []
         for topic, other in zip(self._topics, (depth, color), strict=True):
+            unpaired = len(topic.stamps) - topic.aside - topic.repeated - len(i)
             for count, why in (
+                (topic.aside, topic.why),
                 (topic.repeated, "the stamp of one before it"),
-                (len(topic.stamps) - topic.repeated - len(i), f"none of {other} within {reading.max_difference:g} s"),
+                (unpaired, f"none of {other} within {reading.max_difference:g} s"),
             ):
                 self.left_out += [f"{count} of {topic.name}: {why}"] * (count > 0)
         self.calibration = self._calibrate(path, reading)
@@ -166,6 +134,12 @@ class BagSequence:
     def timestamps(self) -> Float[np.ndarray, " frames"]:
         """Colour stamp of each frame, seconds."""
         return self._timestamps
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """Names of those of colour and depth."""
+        color, depth = self._topics
+        return color.name, depth.name
 
     @property
     def camera(self) -> Camera:
@@ -279,7 +253,7 @@ def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> fl
 class _Stream:
     """Gives the messages of frame after frame; each is read once while frames are asked for in order."""
 
-    def __init__(self, bag: "_Bag", topics: tuple[_Topic, ...]) -> None:
+    def __init__(self, bag: "_Bag", topics: tuple[Topic, ...]) -> None:
         self._bag, self._topics, self._lock = bag, topics, threading.Lock()
         self._numbers = {topic.name: at for at, topic in enumerate(topics)}
         self._coming: Iterator[tuple[str, bytes, str]] = iter(())
@@ -357,7 +331,7 @@ class _Bag:
         with _legible(self.path, FrameError):
             return self._reader.deserialize(raw, kind)
 
-    def topic(self, name: str) -> _Topic:
+    def topic(self, name: str) -> Topic:
         """Go over the messages of a topic for their stamps."""
         connections = [connection for connection in self._reader.connections if connection.topic == name]
         received, stamps = [], []
@@ -365,7 +339,7 @@ class _Bag:
             for _, time, raw in self._reader.messages(connections):
                 received.append(time)
                 stamps.append(_stamp(raw, self._reader.is2))
-        return _Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
+        return Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
 
     def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
         """The first message of a topic, of the first few those that are good."""
@@ -375,36 +349,21 @@ class _Bag:
             return next(filter(is_good, messages), None)
 
     def choose(self, reading: Reading) -> tuple[str, str]:
-        """The topics of colour and depth, those that are named or those that the messages' types speak for."""
-        depth = {}
+        """The topics of colour and depth, those that are named or those that messages and names speak for."""
+        images = {}
         for name, kind in sorted(self.kinds.items()):
             if (message := self.first(name)) is not None:
-                depth[name] = is_depth(kind, message, name)
-        found = []
-        for is_wanted, given, what, option, words in (
-            (True, reading.depth_topic, "depth", "--depth-topic", DEPTH_NAMES),
-            (False, reading.color_topic, "colour", "--colour-topic", COLOR_NAMES),
-        ):
-            if given is not None:
-                if given not in depth:
-                    raise GavoError(f"{self.path}: {option}: no images on {given!r}: those are on {_named(depth)}")
-                found.append(given)
-                continue
-            names = _without_copies([name for name, is_one in depth.items() if is_one == is_wanted])
-            names = [name for name in names if name not in found] or names
-            names = [name for name in names if not _is_named(name, MOVED_COLOR)] or names
-            best = [name for name in names if _is_named(name, words)] or names
-            if len(best) != 1:
-                if not depth:
-                    raise GavoError(f"{self.path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
-                what = f"no {what} images" if not best else f"{what} images on {_named(best)}"
-                raise GavoError(f"{self.path}: {what}; there are images on {_named(depth)}: say {option}")
-            found += best
-        if found[0] == found[1]:
-            raise GavoError(
-                f"{self.path}: {found[0]}: chosen as colour and as depth alike: there are images on {_named(depth)}"
-            )
-        return found[1], found[0]
+                images[name] = Images.of(kind, message, name)
+        color, depth = choose(self.path, images, reading.color_topic, reading.depth_topic)
+        are_named = reading.color_topic is not None and reading.depth_topic is not None
+        if are_of_two_cameras(color, depth) and not are_named:
+            frames = images[color].frame, images[depth].frame
+            if frames[0] == frames[1] or between(self._transforms(), *frames) is None:
+                raise GavoError(
+                    f"{self.path}: {color} and {depth} are of two cameras, by their names: "
+                    "say --colour-topic and --depth-topic if they are of one"
+                )
+        return color, depth
 
     def calibration(self, color: str, depth: str) -> Calibration:
         """The cameras of two topics, from the camera_info beside each."""
@@ -418,7 +377,7 @@ class _Bag:
         if other is None or moved is None:
             return self._alone(camera, name, (color, depth), info.header.frame_id)
         frames = (info.header.frame_id, other[1].header.frame_id)
-        says_so = _is_named(depth, DEPTH_NAMES)
+        says_so = says_registered(color, depth)
         is_one_place = frames[0] == frames[1] or not all(frames) or says_so
         are_placed = any(frames) or says_so  # two that have no name are not for that one frame
         color_T_depth = between(self._transforms(), *frames) if are_placed else None
@@ -505,9 +464,21 @@ def _legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
 def _mending(path: Path) -> str:
     """What may help with a recording that is torn."""
     files = [path] if path.is_file() else list(path.iterdir())
+    profiles = {_profile(file) for file in files if file.suffix.lower() == ".mcap"}
+    if (profile := next(iter(profiles - {"ros2", None}), None)) is not None:
+        return FOREIGN.get(profile, f"its profile is {profile[:40]!r}, and the library reads 'ros2' alone")
     kinds = {file.suffix.lower() for file in files}
     tool = "mcap recover" if ".mcap" in kinds else "rosbag reindex" if ".bag" in kinds else "ros2 bag reindex"
     return f"get it anew, or mend it with {tool}"
+
+
+def _profile(file: Path) -> str | None:
+    """The profile in the header of an MCAP, the first of its records; None where there is no such header."""
+    with contextlib.suppress(OSError, struct.error, UnicodeDecodeError), file.open("rb") as stream:
+        magic, kind, _, length = struct.unpack("<8sBQI", stream.read(21))
+        if (magic, kind) == (MCAP, 1) and len(profile := stream.read(min(length, 64))) == length:
+            return profile.decode()
+    return None
 
 
 def _close(reader: Any) -> None:
@@ -526,11 +497,6 @@ def _stamp(raw: Any, is_2: bool) -> float:
     return seconds + nanoseconds * 1e-9
 
 
-def _without_copies(names: list[str]) -> list[str]:
-    """Topics without those that hold the same images as another, compressed."""
-    return [name for name in names if name.rpartition("/")[0] not in names]
-
-
 def _is_same(a: Camera, b: Camera) -> bool:
     """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
     numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
@@ -540,12 +506,3 @@ def _is_same(a: Camera, b: Camera) -> bool:
 def _is_rectified(topic: str) -> bool:
     """Whether a topic's name says that its images are free of distortion."""
     return bool(RECTIFIED.search(topic))
-
-
-def _is_named(topic: str, words: tuple[str, ...]) -> bool:
-    """Whether a topic's name holds one of some words, small or capital."""
-    return any(word in topic.lower() for word in words)
-
-
-def _named(topics: Any) -> str:
-    return ", ".join(sorted(topics)) or "no topic"

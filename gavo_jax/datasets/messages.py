@@ -1,5 +1,6 @@
 """Images and cameras in the messages of ROS, whatever version: raw, compressed, and depth compressed its own way."""
 
+import math
 import re
 import struct
 from typing import Any
@@ -27,6 +28,7 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "16UC3": ("u2", 3, None),
     "mono16": ("u2", 1, cv2.COLOR_GRAY2BGR),
     "16UC1": ("u2", 1, cv2.COLOR_GRAY2BGR),
+    "Z16": ("u2", 1, cv2.COLOR_GRAY2BGR),
     "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
     "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
     "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
@@ -49,7 +51,8 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
 HALVED = ("nv12", "nv21")
 """Below the rows of brightness half as many of colour, at half the width."""
 
-DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16")
+DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16", "Z16")
+"""Of raw images; Z16 is what librealsense calls 16UC1."""
 
 FILM = re.compile(r"(?i)\b(?:[hx]\.?26[45]|hevc|avc|vp[89]|av1|theora)\b")
 """In the format of compressed images that are no images of their own."""
@@ -57,18 +60,25 @@ FILM = re.compile(r"(?i)\b(?:[hx]\.?26[45]|hevc|avc|vp[89]|av1|theora)\b")
 DEPTH_HEADER = 12
 """Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
 
+AS_COMPRESSED = re.compile(r"\bcompressed +(\w+)")
+"""In the format of compressed images: the encoding that they were given before they were compressed."""
 
 INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|disparity|confidence)\d*(?:[/_]|$)")
 """In the name of a topic of numbers that are brightness, pixels or a probability, and no depth."""
 
 
+def encoding_of(kind: str, message: Any) -> str:
+    """What an image message says that it holds: of a compressed one the format."""
+    return message.encoding if kind == IMAGE else message.format
+
+
 def is_depth(kind: str, message: Any, topic: str) -> bool:
     """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
-    encoding = message.encoding if kind == IMAGE else message.format
+    encoding = encoding_of(kind, message)
     is_named = "depth" in topic.lower()
     if INFRARED.search(topic) and not is_named:
         return False
-    if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding:
+    if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding or encoding == "Z16":
         return True
     return is_named and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
 
@@ -85,14 +95,19 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
                 f"{name}: a film ({message.format[:40]!r}), of which one image needs others: record JPEG or PNG"
             )
         image = decode_color(bytes(message.data), name)
-        taken = message.format.partition(";")[0].strip()
-        if not taken.startswith("bayer_") or taken not in LAYOUTS:
-            return image
-        return _converted(np.ascontiguousarray(image[..., 0]), taken, name)  # the mosaic is compressed as it is
+        mosaic = _mosaic(message.format)
+        return image if mosaic is None else _converted(np.ascontiguousarray(image[..., 0]), mosaic, name)
     pixels = _pixels(message, name)
     if pixels.dtype.kind == "f":
         raise FrameError(f"{name}: encoding {message.encoding} is no colour")
     return _converted(pixels, message.encoding, name)
+
+
+def _mosaic(form: str) -> str | None:
+    """Which mosaic of colours a format's images hold: it is compressed as it is, or what it was made into first."""
+    compressed = AS_COMPRESSED.search(form)
+    encoding = compressed.group(1) if compressed else form.partition(";")[0].strip()
+    return encoding if encoding.startswith("bayer_") and encoding in LAYOUTS else None
 
 
 def _converted(pixels: np.ndarray, encoding: str, name: str) -> np.ndarray:
@@ -119,19 +134,28 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
         pixels = _pixels(message, name)
         return pixels if pixels.dtype == np.uint16 else to_float32(pixels)
     data = bytes(message.data)
-    if "compressedDepth" not in message.format:
+    has_header = data[DEPTH_HEADER:].startswith(PNG_SIGNATURE)
+    if "compressedDepth" not in message.format and not has_header:
         return decode_depth(data, name)
-    if len(data) < DEPTH_HEADER or not data[DEPTH_HEADER:].startswith(PNG_SIGNATURE):
+    if not has_header:
         raise FrameError(
             f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read: record "
             "that, or raw images"
         )
     _, slope, offset = struct.unpack_from("<iff", data)
     stored = decode_depth(data[DEPTH_HEADER:], name)
-    if "32FC1" not in message.format:
+    if not _is_inverse(message.format, slope):
         return stored
     with np.errstate(divide="ignore"):  # inverse depth was rounded; 0 stands for no reading
         return np.where(stored > 0, np.float32(slope) / (stored.astype(np.float32) - np.float32(offset)), np.float32(0))
+
+
+def _is_inverse(form: str, slope: float) -> bool:
+    """Whether compressed depth counts 1 / z: of 32FC1, or where the format is silent and there is a slope.
+
+    Before 16UC1 the transport writes whatever lay in memory for a slope.
+    """
+    return "32FC1" in form or "16UC1" not in form and math.isfinite(slope) and slope > 0
 
 
 def _pixels(message: Any, name: str) -> np.ndarray:

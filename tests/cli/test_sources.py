@@ -206,8 +206,10 @@ def test_a_recording_runs_by_its_name_alone(gavo, tmp_path, kind):
     path = record(tmp_path / "walk", kind, "raw", some, CAMERA)
     done = gavo("run", path, *FAST, "--output", "out")
     assert done.status == 0, done.err
-    first = f"walk: ROS bag, 4 frames of 160x120; camera fx 131 fy 131 cx 79.5 cy 59.5 ({INFO}); depth in millimetres"
+    source = f"walk: ROS bag of {COLOR} and {DEPTH}, 4 frames of 160x120"
+    first = f"{source}; camera fx 131 fy 131 cx 79.5 cy 59.5 ({INFO}); depth in millimetres"
     assert done.out.splitlines()[0] == first
+    assert gavo("inspect", path).out.splitlines()[:2] == ["source: walk, ROS bag", f"topics: {COLOR} and {DEPTH}"]
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost_pairs"] == 0
     done = gavo("inspect", path, "--colour-topic", COLOR, "--depth-topic", DEPTH, "--camera", "fr1")
     assert is_refused(done, "walk", COLOR, "160x120", "640x480")

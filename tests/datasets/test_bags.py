@@ -3,6 +3,7 @@
 import gc
 import os
 import re
+import struct
 import sys
 import threading
 import tracemalloc
@@ -25,6 +26,7 @@ from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.messages import HALVED, LAYOUTS, color_of, depth_of
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import summary
 
 MILLIMETRES = [np.round(metres * 1000).astype(np.uint16) for metres in METRES]
 STAMPS = [1305031102.175304 + i / 30 for i in range(4)]
@@ -212,6 +214,134 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     )
     depth = sequence[0].depth
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
+
+
+def with_topics(path: Path, frames: dict[str, str], infos: bool = True) -> Path:
+    """A recording of topics, each in its frame, with depth where the name's last words say so and a camera_info."""
+    recorder = Recorder(path, "mcap")
+    for stamp in (1.0, 1.1):
+        for topic, frame in frames.items():
+            is_depth = "depth" in topic.replace("depth_camera", "") and not topic.endswith(
+                ("colored", "overlay", "rgb_to_depth/image_raw")
+            )
+            pixels, encoding = (MILLIMETRES[0], "16UC1") if is_depth else (BGRS[0], "bgr8")
+            recorder.image(topic, stamp, pixels, encoding, frame=frame)
+            if infos:
+                recorder.info(f"{topic.rpartition('/')[0]}/camera_info", stamp, CAMERA, frame=frame)
+    recorder.close()
+    return path
+
+
+def topics_of(path: Path, reading: Reading | None = None) -> list[str]:
+    sequence = open_source(path, reading or Reading(camera=CAMERA))
+    assert isinstance(sequence, BagSequence)
+    return [topic.name for topic in sequence._topics]
+
+
+@pytest.mark.parametrize("frames", [("front", "rear"), ("optical", "optical"), ("", "")])
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [
+        ("/front/color/image_raw", "/rear/aligned_depth_to_color/image_raw"),
+        ("/robot/front/image_raw", "/robot/rear/depth_registered/image"),
+        ("/device_0/sensor_1/Color_0/image/data", "/device_1/sensor_0/depth_0/image/data"),
+        ("/usb_cam/image_raw", "/camera/depth/image_raw"),
+        ("/front_rgb", "/rear_depth"),
+    ],
+)
+def test_colour_of_one_camera_and_depth_of_another_are_no_pair(tmp_path, color, depth, frames):
+    """The word aligned says of depth that it lies on the colour of its own camera."""
+    path = with_topics(tmp_path / "rig", dict(zip((color, depth), frames, strict=True)))
+    for reading in (Reading(), Reading(color_topic=color), Reading(depth_topic=depth), Reading(camera=CAMERA)):
+        with pytest.raises(
+            GavoError, match=f"{color} and {depth} are of two cameras.*--colour-topic and --depth-topic"
+        ):
+            open_source(path, reading)
+    both = Reading(color_topic=color, depth_topic=depth)
+    assert topics_of(path, replace(both, camera=CAMERA)) == [color, depth]
+    if color.count("/") > 1 and frames == ("front", "rear"):
+        with pytest.raises(GavoError, match=f"{depth} is of another camera than {color}"):
+            open_source(path, both)
+
+
+def test_two_cameras_that_the_recordings_transforms_join_are_a_pair(tmp_path):
+    color, depth = "/wide/color/image_raw", "/tof/aligned_depth/image_raw"
+    recorder = Recorder(tmp_path / "rig", "mcap")
+    recorder.fixed(1.0, {("wide", "tof"): ([0.1, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])})
+    for stamp in (1.0, 1.1):
+        for topic, pixels, encoding in ((color, BGRS[0], "bgr8"), (depth, MILLIMETRES[0], "16UC1")):
+            place = topic.split("/")[1]
+            recorder.image(topic, stamp, pixels, encoding, frame=place)
+            recorder.info(f"{topic.rpartition('/')[0]}/camera_info", stamp, CAMERA, frame=place)
+    recorder.close()
+    sequence = open_source(tmp_path / "rig")
+    assert isinstance(sequence, BagSequence) and sequence.calibration.color_T_depth is not None
+    assert sequence.calibration.color_T_depth[0, 3] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("front", "rear"),
+    [
+        (("/front/rgb/image_raw", "/front/depth/image_raw"), ("/rear/image_raw", "/rear/depth_registered/image_raw")),
+        (("/front_rgb", "/front_depth"), ("/rear_image", "/rear_depth_registered")),
+        (
+            ("/cam1/color/image_raw", "/cam1/aligned_depth_to_color/image_raw"),
+            ("/cam2/color/image", "/cam2/depth/image"),
+        ),
+    ],
+)
+def test_of_two_cameras_one_is_to_be_named(tmp_path, front, rear):
+    path = with_topics(tmp_path / "two", dict.fromkeys(front + rear, "camera"), infos=False)
+    told = f"2 cameras, {' with '.join(front)}; {' with '.join(rear)}: say --colour-topic or --depth-topic of one"
+    with pytest.raises(GavoError, match=re.escape(told)):
+        open_source(path, Reading(camera=CAMERA))
+    for pair in (front, rear):
+        assert topics_of(path, Reading(camera=CAMERA, color_topic=pair[0])) == list(pair)
+        assert topics_of(path, Reading(camera=CAMERA, depth_topic=pair[1])) == list(pair)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "others"),
+    [
+        ("/camera/image_raw", "/camera/depth/image_raw", ["/camera/depth/image_colored"]),
+        ("/camera/image_raw", "/camera/depth/image_raw", ["/detector/rgb_overlay"]),
+        ("/depth_camera/image_raw", "/depth_camera/depth/image_raw", ["/depth_camera/image_depth_colored"]),
+        ("/depth_camera/rgb/image", "/depth_camera/depth_image", ["/camera/image_raw", "/map/colored"]),
+        ("/cam/color/image_raw", "/cam/depth/image_rect", ["/cam/infra1/image_raw", "/cam/confidence/overlay"]),
+        ("/kinect/rgb_to_depth/image_raw", "/kinect/depth/image_raw", []),
+        ("/front/rgb", "/front/depth", ["/rear/aligned_depth_to_color/image_raw"]),
+    ],
+)
+def test_colour_is_that_of_the_depth_topics_camera(tmp_path, color, depth, others):
+    """A picture of depth, drawn in colours, is none; nor is one that another program has drawn upon."""
+    path = with_topics(tmp_path / "many", dict.fromkeys([color, depth, *others], "camera"), infos=False)
+    assert topics_of(path) == [color, depth]
+
+
+def test_a_picture_of_depth_is_colour_where_it_is_named(tmp_path):
+    picture, depth = "/camera/depth/image_colored", "/camera/depth/image_raw"
+    path = with_topics(tmp_path / "picture", {picture: "camera", depth: "camera"})
+    with pytest.raises(
+        GavoError, match=f"no colour images; there are images on {picture}, {depth}: say --colour-topic"
+    ):
+        open_source(path)
+    assert topics_of(path, Reading(color_topic=picture)) == [picture, depth]
+
+
+@pytest.mark.parametrize("encoding", ["Z16", "16SC1", "32SC1", "mono16"])
+def test_depth_of_another_encoding_is_called_by_it(tmp_path, encoding):
+    pixels = MILLIMETRES[0].astype({"16SC1": np.int16, "32SC1": np.int32}.get(encoding, np.uint16))
+    recorder = Recorder(tmp_path / "z", "mcap")
+    for stamp in (1.0, 1.1):
+        recorder.image("/camera/rgb/image", stamp, BGRS[0], "bgr8")
+        recorder.image("/camera/depth/image", stamp, pixels, encoding)
+    recorder.close()
+    if encoding in ("Z16", "mono16"):
+        np.testing.assert_array_equal(open_source(tmp_path / "z", Reading(camera=CAMERA))[0].depth, pixels)
+        return
+    told = rf"no depth images: /camera/depth/image has '{encoding}', and not 16UC1, .*say --depth-topic"
+    with pytest.raises(GavoError, match=told):
+        open_source(tmp_path / "z", Reading(camera=CAMERA))
 
 
 def test_brightness_of_16_bits_is_no_depth(tmp_path):
@@ -436,6 +566,51 @@ def test_messages_that_come_twice_count_once(tmp_path, kind):
         np.testing.assert_array_equal(frame.depth, shot.depth)
 
 
+def of_stamps(path: Path, kind: str, stamps: list[float], start: float = 100.0) -> BagSequence:
+    """A recording whose depth has the number of its message; colour and depth arrive every tenth of a second."""
+    recorder = Recorder(path.with_suffix(".bag") if kind == "ros1" else path, kind)
+    for number, stamp in enumerate(stamps):
+        for topic, encoding in ((COLOR, "mono16"), (DEPTH, "16UC1")):
+            recorder.image(topic, stamp, np.full((12, 16), number + 1, np.uint16), encoding, start + number / 10)
+    recorder.close()
+    camera = replace(CAMERA, width=16, height=12, cx=7.5, cy=5.5)
+    sequence = open_source(recorder.writer.path, Reading(camera=camera))
+    assert isinstance(sequence, BagSequence)
+    return sequence
+
+
+TENTHS = [1 + number / 10 for number in range(20)]
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize(
+    ("stamps", "kept", "back", "at"),
+    [
+        (TENTHS + TENTHS[:8], range(20), 1.9, 21),
+        (TENTHS[:8] + TENTHS, range(8, 28), 0.7, 9),
+        (TENTHS[:8] + [stamp + 0.02 for stamp in TENTHS], range(8, 28), 0.7, 9),
+        (TENTHS + [1.06, 1.16] + TENTHS[:5], range(20), 1.8, 21),
+        (TENTHS[:5] + [99.0] + TENTHS[6:], [*range(5), *range(6, 20)], 97.4, 7),
+        (TENTHS[:9] + [1.0] + TENTHS[10:], [*range(9), *range(10, 20)], 0.8, 10),
+    ],
+)
+def test_of_a_clock_that_is_set_back_one_run_is_used(tmp_path, kind, stamps, kept, back, at):
+    """They were sorted together: frames of one place amid those of another."""
+    sequence = of_stamps(tmp_path / "reset", kind, stamps)
+    assert [int(frame.depth[0, 0]) - 1 for frame in sequence] == list(kept)
+    count = len(stamps) - len(kept)
+    why = f"the stamps go back by {back:.1f} s at message {at}, and the longest stretch alone is used"
+    assert sequence.left_out == [f"{count} of {topic}: {why}" for topic in (COLOR, DEPTH)]
+
+
+def test_messages_that_arrive_out_of_order_are_sorted(tmp_path):
+    stamps = [*TENTHS[:5], *TENTHS[9:4:-1], *TENTHS[10:]]
+    sequence = of_stamps(tmp_path / "late", "mcap", stamps)
+    assert sequence.left_out == [] and sequence.topics == (COLOR, DEPTH)
+    assert summary(sequence).startswith(f"late: ROS bag of {COLOR} and {DEPTH}, 20 frames of 16x12; camera fx")
+    np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
+
+
 @pytest.mark.parametrize("stamp", [0.0, 77.0])
 def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     """Of both topics, even where one has stamps."""
@@ -583,6 +758,29 @@ def test_a_torn_recording_names_what_mends_it(tmp_path, kind, tool):
             open_source(place)
 
 
+@pytest.mark.parametrize(
+    ("profile", "words"),
+    [
+        ("", "names no profile, .*ros2 bag convert"),
+        ("ros1", r"its profile is 'ros1', .*name the \.bag"),
+        ("x", "its profile is 'x', and the library reads 'ros2' alone"),
+    ],
+)
+def test_an_mcap_of_another_profile_is_not_called_torn(tmp_path, profile, words):
+    path = record(tmp_path / "walk", "mcap", "raw", shots(), CAMERA)
+    file = next(path.glob("*.mcap"))
+    whole = file.read_bytes()
+    (size,) = struct.unpack_from("<I", whole, 17)
+    (length,) = struct.unpack_from("<I", whole, 21 + size)
+    library = whole[25 + size : 25 + size + length].decode().ljust(length + size - len(profile))
+    header = b"".join(struct.pack("<I", len(text)) + text.encode() for text in (profile, library))
+    file.write_bytes(whole[:17] + header + whole[17 + len(header) :])
+    for place in (file, path):
+        with pytest.raises(GavoError, match=f"not a bag that can be read: .*{words}") as caught:
+            open_source(place)
+        assert "recover" not in str(caught.value)
+
+
 def test_without_the_library_it_is_said_what_to_install(bags, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(GavoError, match=r"\[bag\]"):
@@ -652,6 +850,41 @@ def test_a_mosaic_that_was_compressed_as_it_is_becomes_bgr():
     plain = cv2.imencode(".png", PLAIN)[1].tobytes()
     for words in ("bgr8; png compressed bgr8", "png", ""):
         np.testing.assert_array_equal(color_of(COMPRESSED, SimpleNamespace(format=words, data=plain), "x"), PLAIN)
+
+
+@pytest.mark.parametrize("words", ["bayer_rggb8; jpeg compressed bgr8", "bayer_grbg8; png compressed bgr8"])
+def test_a_mosaic_that_became_bgr_before_it_was_compressed_is_none(words):
+    data = cv2.imencode(".png", PLAIN)[1].tobytes()
+    np.testing.assert_array_equal(color_of(COMPRESSED, SimpleNamespace(format=words, data=data), "x"), PLAIN)
+    tile = np.tile(np.array([[200, 90], [90, 30]], np.uint8), (4, 6))
+    mosaic = SimpleNamespace(
+        format="bayer_rggb8; png compressed bayer_rggb8", data=cv2.imencode(".png", tile)[1].tobytes()
+    )
+    assert np.abs(color_of(COMPRESSED, mosaic, "x")[2:-2, 2:-2].astype(int) - (30, 90, 200)).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("form", "slope", "inverse"),
+    [
+        ("32FC1; compressedDepth png", 10000.0, True),
+        ("compressedDepth png", 10000.0, True),
+        ("compressedDepth", 10000.0, True),
+        ("png", 10000.0, True),
+        ("png", 0.0, False),
+        ("compressedDepth png", 0.0, False),
+        ("16UC1; compressedDepth png", 10000.0, False),
+        ("compressedDepth png", float("nan"), False),
+    ],
+)
+def test_inverse_depth_is_known_by_its_coefficients_where_the_format_is_silent(form, slope, inverse):
+    metres = np.linspace(0.5, 4, 96).reshape(8, 12)
+    stored = np.round(10000.0 / metres - 100.0).astype(np.uint16)
+    data = np.frombuffer(struct.pack("<iff", 0, slope, -100.0) + cv2.imencode(".png", stored)[1].tobytes(), np.uint8)
+    found = depth_of(COMPRESSED, SimpleNamespace(format=form, data=data), "x")
+    if inverse:
+        np.testing.assert_allclose(found, metres, atol=0.002)
+    else:
+        np.testing.assert_array_equal(found, stored)
 
 
 def test_rows_may_be_padded_and_numbers_of_either_end():
