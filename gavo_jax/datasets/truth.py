@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.names import clock_unit, unit_of
+from gavo_jax.datasets.clocks import clock_unit, unit_of
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 

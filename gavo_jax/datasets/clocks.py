@@ -1,0 +1,105 @@
+"""What numbers of frames count: seconds since 1970 or since a device was switched on, or the frames themselves."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Seconds of what whole numbers may count."""
+
+EPOCH = (946684800.0, 4102444800.0)
+"""Seconds since 1970 of the years 2000 to 2100, from which stamps of a clock are."""
+
+INTERVALS = (2e-3, 10.0)
+"""Seconds between two frames."""
+
+DEVICE_INTERVALS = (2e-3, 1.0)
+"""The same, where nothing but the steps speaks for a unit: of stamps since a device was switched on."""
+
+MILLISECONDS, JITTER = (5, 200), 0.3
+"""Steps between whole numbers that may be milliseconds, if they have no common factor and most lie within this share
+of the median: of every so many frames the numbers have one, and of frames that somebody chose the steps differ more."""
+
+MOST_STEPS = 0.7
+"""Share of the steps that are most of them."""
+
+FEWEST_OF_A_CLOCK = 6
+"""Stamps that can be even by more than chance."""
+
+
+def clock_unit(stamps: Sequence[float]) -> float | None:
+    """Seconds of what stamps since 1970 count; None where they are no such stamps."""
+    low, high = min(stamps), max(stamps)
+    return next((unit for unit in UNITS if EPOCH[0] < unit * low and unit * high < EPOCH[1]), None)
+
+
+def unit_of(counts: Sequence[float]) -> float | None:
+    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
+    if not counts or len(set(map(float, counts))) < len(set(counts)):
+        return None
+    of_clock = clock_unit(counts)
+    if of_clock and is_between([of_clock * count for count in counts], INTERVALS):
+        return of_clock
+    device = [unit for unit in UNITS[2:] if is_between([unit * count for count in counts], DEVICE_INTERVALS)]
+    if _are_milliseconds(np.diff(sorted(counts))):
+        device.append(UNITS[1])
+    return device[0] if device else of_clock
+
+
+def _are_milliseconds(steps: np.ndarray) -> bool:
+    if len(steps) < 2:
+        return False
+    usual = steps[_are_usual(steps)]
+    is_rate = MILLISECONDS[0] <= steps.min() <= np.median(steps) <= MILLISECONDS[1]
+    if len(usual) < MOST_STEPS * len(steps) or not is_rate:
+        return False
+    return np.gcd.reduce(usual.astype(np.int64)) == 1
+
+
+def decimal_unit(numbers: Sequence[float]) -> float | None:
+    """Seconds of what numbers with decimals count: one, or a thousandth, as RealSense's tools have it; else None."""
+    if is_between(numbers, INTERVALS):
+        return UNITS[0]
+    is_thousandth = clock_unit(numbers) != UNITS[0] and is_between([UNITS[1] * n for n in numbers], DEVICE_INTERVALS)
+    return UNITS[1] if is_thousandth else None
+
+
+def filled_in(numbers: Sequence[str]) -> list[float]:
+    """Numbers with decimals as seconds, with zeros filled in where they are missing after the point, see `_with_zeros`.
+
+    They are where this makes a clock of enough numbers and, as elsewhere zeros are missing at the end, some of them end
+    in one.
+    """
+    seconds, filled = [float(number) for number in numbers], _with_zeros(numbers)
+    if len(numbers) < FEWEST_OF_A_CLOCK or not any(re.search(r"\.\d+0$", number) for number in numbers):
+        return seconds
+    return filled if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)) else seconds
+
+
+def _with_zeros(numbers: Sequence[str]) -> list[float]:
+    """Seconds, where what follows the point counts its last place, and zeros are missing before it.
+
+    Programs that print whole seconds and nanoseconds one after the other write 5.021 s as 5.21000000.
+    """
+    parts = [number.split(".") for number in numbers]
+    width = max(len(decimals) for _, decimals in parts)
+    return [float(f"{whole}.{decimals.zfill(width)}") for whole, decimals in parts]
+
+
+def _even_share(seconds: Sequence[float]) -> float:
+    """How many of the steps from stamp to stamp are about as long as their median."""
+    steps = np.diff(sorted(seconds))
+    return float(np.mean(_are_usual(steps))) if len(steps) else 0.0
+
+
+def _are_usual(steps: np.ndarray) -> np.ndarray:
+    """Which steps are about as long as their median."""
+    middle = np.median(steps)
+    return np.abs(steps - middle) <= JITTER * middle
+
+
+def is_between(seconds: Sequence[float], bounds: tuple[float, float]) -> bool:
+    """Whether most stamps lie so far apart."""
+    steps = np.diff(sorted(set(seconds)))
+    return not len(steps) or bool(bounds[0] <= np.percentile(steps, 50, method="lower") <= bounds[1])
