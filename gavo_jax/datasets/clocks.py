@@ -8,6 +8,15 @@ import numpy as np
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Seconds of what whole numbers may count."""
 
+TICK = 1e-7
+"""Seconds of what Windows counts: 100 ns, see `TICKS_BEFORE`."""
+
+TICKS_BEFORE = (116444736000000000, 621355968000000000)
+"""Ticks up to 1970, where a clock of Windows counts from the year 1601, or of .NET from the year 1."""
+
+USUAL = (0.008, 0.21)
+"""Seconds between two frames of nearly every camera: 120 to 5 a second."""
+
 EPOCH = (946684800.0, 4102444800.0)
 """Seconds since 1970 of the years 2000 to 2100, from which stamps of a clock are."""
 
@@ -29,22 +38,51 @@ FEWEST_OF_A_CLOCK = 6
 
 
 def clock_unit(stamps: Sequence[float]) -> float | None:
-    """Seconds of what stamps since 1970 count; None where they are no such stamps."""
+    """Seconds of what stamps of a calendar's clock count; None where they are no such stamps."""
     low, high = min(stamps), max(stamps)
-    return next((unit for unit in UNITS if EPOCH[0] < unit * low and unit * high < EPOCH[1]), None)
+    known = next((unit for unit in (*UNITS, TICK) if EPOCH[0] < unit * low and unit * high < EPOCH[1]), None)
+    return known or (TICK if _ticks_before(stamps) else None)
+
+
+def in_seconds(counts: Sequence[float], unit: float) -> list[float]:
+    """Seconds, of a calendar's clock since 1970, by what whole numbers count."""
+    before = _ticks_before(counts) if unit == TICK else 0
+    return [unit * (count - before) for count in counts]
+
+
+def _ticks_before(counts: Sequence[float]) -> int:
+    """Ticks up to 1970 in numbers that count them from an earlier year; else 0."""
+    low, high = min(counts), max(counts)
+    starts = (start for start in TICKS_BEFORE if EPOCH[0] < TICK * (low - start) and TICK * (high - start) < EPOCH[1])
+    return next(starts, 0)
 
 
 def unit_of(counts: Sequence[float]) -> float | None:
-    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
+    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames.
+
+    Ticks of 100 ns are told from micro- and nanoseconds by the rate alone: they are what has a camera's usual one where
+    the others have not.
+    """
     if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
     of_clock = clock_unit(counts)
     if of_clock and is_between([of_clock * count for count in counts], INTERVALS):
         return of_clock
-    device = [unit for unit in UNITS[2:] if is_between([unit * count for count in counts], DEVICE_INTERVALS)]
+    device = [unit for unit in UNITS[2:] if _steps_are(DEVICE_INTERVALS, unit, counts)]
     if _are_milliseconds(np.diff(sorted(counts))):
         device.append(UNITS[1])
+    if _steps_are(USUAL, TICK, counts) and not any(_steps_are(USUAL, unit, counts) for unit in device):
+        return TICK
     return device[0] if device else of_clock
+
+
+def may_count(unit: float, counts: Sequence[float]) -> bool:
+    """Whether whole numbers, of which nothing else tells it, may count what other images' do."""
+    return len(set(counts)) > 1 and _steps_are((USUAL[0], DEVICE_INTERVALS[1]), unit, counts)
+
+
+def _steps_are(bounds: tuple[float, float], unit: float, counts: Sequence[float]) -> bool:
+    return is_between([unit * count for count in counts], bounds)
 
 
 def _are_milliseconds(steps: np.ndarray) -> bool:

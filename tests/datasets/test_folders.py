@@ -212,6 +212,49 @@ def test_an_image_without_a_number_changes_no_stamp(folder, unit):
     assert sequence.left_out == ("1 images: no number in their names, as preview.png",)
 
 
+def stamped(folder: Path, color: list[str], depth: list[str]) -> Sequence:
+    """A folder of images of these names, opened."""
+    for part, stems in (("rgb", color), ("depth", depth)):
+        for stem in stems:
+            image(folder / f"{part}/{stem}.png", GREYS[0] if part == "rgb" else raw(METRES[0], 1000))
+    return open_source(folder, Reading(camera=CAMERA))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-7])
+@pytest.mark.parametrize("first", [1305031102.175, 123.456])
+@pytest.mark.parametrize("stray", ["preview1", "{} (1)", "{} - Copy", "{}_vis", "a_{}"])
+def test_a_few_names_of_another_form_change_no_stamp(folder, unit, first, stray):
+    """All became numbers of frames by one of them: years, and of some no frame was left."""
+    names = [str(round((first + i / 30) / unit)) for i in range(12)]
+    sequence = stamped(folder, [*names, stray.format(names[3])], names)
+    assert isinstance(sequence, PlainFolder) and len(sequence) == 12
+    np.testing.assert_allclose(sequence.timestamps, first + np.arange(12) / 30, atol=1e-3)
+    assert sequence.left_out == (f"1 images: names of another form than most, as {stray.format(names[3])}.png",)
+
+
+def test_many_names_of_another_form_are_refused(folder):
+    names = [f"{'ab'[i > 5]}_{1305031102175 + 33 * i}" for i in range(12)]
+    with pytest.raises(GavoError, match=r"a_\d+\.png: its name is a time, and b_\d+\.png has another form, as 6 of 12"):
+        stamped(folder, names, names)
+
+
+def test_kinds_of_two_rates_count_the_same(folder):
+    """Even steps have a common factor; colour alone was times, so that both were numbers of frames."""
+    color = [f"{round(1000 * i / 30):06}" for i in range(30)]
+    sequence = stamped(folder, color, [f"{50 * i:06}" for i in range(20)])
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 0.05, atol=0.02)
+    assert len(sequence) == 20
+
+
+def test_times_beside_other_numbers_are_refused(folder):
+    color = [f"{1000 + round(1000 * i / 30):06}" for i in range(30)]
+    with pytest.raises(GavoError, match=r"clip: names as 001967\.png are times, and as 1039\.png, of the other kind "):
+        stamped(folder, color, [str(1000 + i) for i in range(40)])
+    chosen = ["3", "9", "15", "21", "28", "34"]  # of frames, as the other kind has them all
+    shutil.rmtree(folder / "rgb")
+    assert len(stamped(folder, chosen, [str(i) for i in range(40)])) == 6
+
+
 def test_folders_may_be_written_large_and_hold_what_systems_leave(folder):
     for i in range(4):
         image(folder / f"RGB/{i}.PNG", GREYS[i])
