@@ -24,7 +24,7 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.image_folders import plain_files
+from gavo_jax.datasets.image_folders import passed_over, plain_files
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
@@ -279,7 +279,7 @@ class PlainFolder(FileSequence):
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + unread + unread_truth(path, truth)
+        left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth)
         return cls(root.name, paired.entries, calibration, truth, reading, left_out)
 
     @classmethod

@@ -116,7 +116,7 @@ def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
         return None
     if (found := stamps([file.stem for file in usual], unit)) is None:
         return None
-    odd = [file for file in files if file not in set(usual)]
+    odd = [file for some in forms.values() if some is not usual for file in some]
     if len(odd) > MOST_ODD * len(usual):
         raise GavoError(
             f"{usual[0]}: its name is a time, and {odd[0].name} has another form, as {len(odd)} of {len(files)} have: "
