@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gavo_jax.cli.options import Evaluate
-from gavo_jax.datasets.names import INTERVALS
+from gavo_jax.datasets.clocks import INTERVALS
 from gavo_jax.datasets.truth import counted_in
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import (

@@ -3,12 +3,11 @@
 Each class says how its folder is recognised, where the images and poses lie, and which camera took them.
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -25,13 +24,14 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.image_folders import plain_files
+from gavo_jax.datasets.image_folders import passed_over, plain_files
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
-from gavo_jax.datasets.names import Found, by_number, images_among, nameless, stamps, unpaired
+from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
+from gavo_jax.datasets.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.truth import TRUTH, Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows
-from gavo_jax.trajectory import Trajectory, associate, inverse
+from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
@@ -206,7 +206,8 @@ class Replica(NumberedFolder):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """By the names of the images."""
-        return (path / "results").is_dir() and bool(_any(path / "results", "frame*")) and (path / "traj.txt").exists()
+        results = path / "results"
+        return results.is_dir() and all(_any(results, f"{kind}[0-9]*") for kind in ("frame", "depth"))
 
     @classmethod
     def find(cls, path: Path) -> Found:
@@ -225,6 +226,8 @@ class Replica(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame: by its number, or in order where there are as many as images."""
+        if not (path / "traj.txt").exists():
+            return {}
         rows = data_rows(path / "traj.txt")
         if not rows:
             raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
@@ -273,11 +276,13 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = plain_files(path)
-        paired = _by_stamp(path, color, depth, reading) or _by_number(path, color, depth, cls.clock(path, reading))
+        paired = paired_by_stamp(path, color, depth, reading) or paired_by_number(
+            path, color, depth, cls.clock(path, reading)
+        )
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + unread + unread_truth(path, truth)
+        left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth)
         return cls(root.name, paired.entries, calibration, truth, reading, left_out)
 
     @classmethod
@@ -287,7 +292,7 @@ class PlainFolder(FileSequence):
         return lambda numbers: numbers / rate
 
     @classmethod
-    def truth(cls, path: Path, paired: "Paired") -> tuple[Trajectory | None, list[str]]:
+    def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
         """The true trajectory that lies in the folder, if one does; why poses that lie there are none, a line each.
 
         Raises:
@@ -328,51 +333,6 @@ def _any(folder: Path, pattern: str) -> Path | None:
 
 def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
-
-
-class Paired(NamedTuple):
-    """Frames of a plain folder."""
-
-    entries: list[Entry]
-    left_out: list[str]
-    times: dict[int, float]
-    """Of each depth image, by the number in its name, else by its place, from 1."""
-    seconds: Seconds | None
-    """Times by numbers, where the names are those."""
-
-
-def _by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired | None:
-    """Frames by the stamps that all names are; None where they are none, or the rate is said."""
-    others = [file for file in (*color, *depth) if not re.search(r"\d", file.stem)]
-    color, depth = ([file for file in files if re.search(r"\d", file.stem)] for files in (color, depth))
-    found = [None if reading.rate else stamps([file.stem for file in files]) for files in (color, depth)]
-    if found[0] is None or found[1] is None:
-        return None
-    first, second = (np.array(some, float) for some in found)
-    i, j = associate(first, second, reading.max_difference)
-    if len(i) == 0:
-        raise GavoError(
-            f"{path}: by their names no colour and depth image lie within {reading.max_difference:g} s of each other: "
-            "say --rate if the names are no stamps"
-        )
-    entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
-    left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s") + nameless(others)
-    of_frames = second.copy()
-    of_frames[j] = first[i]
-    times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
-    return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
-
-
-def _by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
-    """Frames by the numbers in the names, whose times a clock says."""
-    found = by_number(color, depth)
-    numbers = sorted(found.color.keys() & found.depth.keys())
-    if not numbers:
-        counts = f"{len(color)} colour and {len(depth)} depth images"
-        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
-    times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
-    entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
-    return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)
 
 
 def _millimetres(calibration: Calibration) -> Calibration:

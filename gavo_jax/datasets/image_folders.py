@@ -6,22 +6,82 @@ from pathlib import Path
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from gavo_jax.datasets.names import images_among
 
-COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide")
-DEPTH_FOLDERS = ("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth")
-"""The first one counts: beside depth that is registered to colour another one is that of its own camera."""
+COLOR_FOLDERS = (
+    *("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide"),
+    *("color_images", "colour_images", "rgb_images", "rgb_raw", "color_raw"),
+)
+DEPTH_FOLDERS = (
+    *("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth"),
+    *("depth_images", "depth_raw", "depth_rect"),
+)
+"""The first one counts, after those whose names say that they are registered, see `_is_registered`."""
+
+REGISTERED = {"aligned", "align", "registered", "to"}
+"""Words of which one stands in the name of a folder of depth that is registered to colour: beside such a one, another
+is that of its own camera."""
+
+ALL_SUFFIXES = tuple({*COLOR_SUFFIXES, *DEPTH_SUFFIXES})
+
+COLOR_NAMES = {"color", "colour", "rgb"}
+DEPTH_NAMES = {"depth", "depths"}
+PLAIN_WORDS = {"image", "images", "raw"}
+"""What else may stand in the name of such a folder."""
+
+PAIR = re.compile(r"(.+[-_])colou?r", re.IGNORECASE)
+"""A folder of colour named as its scene is, as Redwood has it; depth's begins with the same."""
+
+DEPTH_WORD = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
+"""In the names of depth images that lie beside colour, as a part of its own, where some have it so."""
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img", r"^\d+\.")
 """In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
 say nothing."""
 
 
-def _folders(path: Path) -> tuple[Path | None, Path | None]:
-    """Those of colour and of depth images, as far as a folder has them."""
+def _is_registered(name: str) -> bool:
+    """Whether a folder's name speaks of depth that is registered to colour; colour, if named, stands last."""
+    words = re.split(r"[-_. ]+", name)
+    said = set(words)
+    if not said & DEPTH_NAMES or not said & REGISTERED or said - REGISTERED - COLOR_NAMES - DEPTH_NAMES - PLAIN_WORDS:
+        return False
+    return not said & COLOR_NAMES or words[-1] in COLOR_NAMES
+
+
+def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
+    """Folders of colour and of depth images, as far as a folder has them, the one that counts first."""
     children = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
-    color, depth = (
-        next((children[name] for name in names if name in children), None) for names in (COLOR_FOLDERS, DEPTH_FOLDERS)
-    )
-    return color, depth
+    registered = sorted(filter(_is_registered, children), key=lambda name: (name not in DEPTH_FOLDERS, name))
+    names = COLOR_FOLDERS, dict.fromkeys((*registered, *DEPTH_FOLDERS))
+    color, depth = ([children[name] for name in some if name in children] for some in names)
+    return (color, depth) if color or depth else _named_as_their_scene(children)
+
+
+def _named_as_their_scene(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
+    """The same, of one scene whose name both begin with."""
+    scenes = {match[1]: child for name, child in children.items() if (match := PAIR.fullmatch(name))}
+    if len(scenes) != 1:
+        return [], []
+    ((scene, color),) = scenes.items()
+    depth = [child for name, child in children.items() if name.startswith(f"{scene}depth")]
+    return ([color], depth) if depth else ([], [])
+
+
+def _folders(path: Path) -> tuple[Path | None, Path | None]:
+    """Those of colour and of depth images that count."""
+    color, depth = _candidates(path)
+    return next(iter(color), None), next(iter(depth), None)
+
+
+def passed_over(path: Path) -> list[str]:
+    """A line for each other folder of images whose name speaks of depth or colour, of a folder with folders of both."""
+    candidates = _candidates(path)
+    if not all(candidates):
+        return []
+    words = []
+    for kind, some, suffixes in zip(("colour", "depth"), candidates, (COLOR_SUFFIXES, DEPTH_SUFFIXES), strict=True):
+        others = [child for child in some[1:] if images_among(child.glob("*"), suffixes)]
+        words += [f"{other.name}/: not read, {kind} is that of {some[0].name}/" for other in others]
+    return words
 
 
 def missing_images(path: Path) -> str | None:
@@ -55,7 +115,22 @@ def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
         some = images_among(files, COLOR_SUFFIXES) or images_among(files, (".npy",))
         return some, images_among(depth.glob("*"), DEPTH_SUFFIXES)
     files = list(path.glob("*"))
-    depths = [file for file in images_among(files, DEPTH_SUFFIXES) if "depth" in file.name.lower()]
-    others = [file for file in images_among(files, COLOR_SUFFIXES) if "depth" not in file.name.lower()]
+    depths = _with_depth(images_among(files, DEPTH_SUFFIXES))
+    others = sorted(set(images_among(files, COLOR_SUFFIXES)) - set(_with_depth(images_among(files, ALL_SUFFIXES))))
     named = ([file for file in others if re.search(word, file.name, re.IGNORECASE)] for word in COLOR_WORDS)
     return next(filter(None, named), []), depths
+
+
+def _with_depth(files: list[Path]) -> list[Path]:
+    """Files whose names speak of depth: as a part of its own, else within a word."""
+    return [file for file in files if DEPTH_WORD.search(file.name)] or [
+        file for file in files if "depth" in file.name.lower()
+    ]
+
+
+def missing_word(path: Path) -> str | None:
+    """What the images of a folder lack that all speak of depth."""
+    files = images_among(path.glob("*"), ALL_SUFFIXES)
+    if not files or len(_with_depth(files)) < len(files):
+        return None
+    return f"all images have depth in their names, as {files[0].name[:60]}: those without it are colour"

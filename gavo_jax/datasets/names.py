@@ -9,41 +9,40 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gavo_jax.datasets.clocks import (
+    INTERVALS,
+    UNITS,
+    USUAL,
+    clock_unit,
+    decimal_unit,
+    filled_in,
+    in_seconds,
+    is_between,
+    may_count,
+    unit_of,
+)
 from gavo_jax.errors import GavoError
-
-UNITS = (1.0, 1e-3, 1e-6, 1e-9)
-"""Seconds of what whole numbers may count."""
-
-EPOCH = (946684800.0, 4102444800.0)
-"""Seconds since 1970 of the years 2000 to 2100, from which stamps of a clock are."""
-
-INTERVALS = (2e-3, 10.0)
-"""Seconds between two frames."""
-
-DEVICE_INTERVALS = (2e-3, 1.0)
-"""The same, where nothing but the steps speaks for a unit: of stamps since a device was switched on."""
-
-MILLISECONDS, JITTER = (5, 200), 0.3
-"""Steps between whole numbers that may be milliseconds, if they have no common factor and most lie within this share
-of the median: of every so many frames the numbers have one, and of frames that somebody chose the steps differ more."""
-
-MOST_STEPS = 0.7
-"""Share of the steps that are most of them."""
 
 MOST_DIGITS = 15
 """What is longer is no number of a frame: floats do not tell it from its neighbours."""
 
+DIGITS_OF_A_CLOCK = 10
+"""Those of seconds since 1970; finer ones have more."""
+
 FEWEST = 10
 """Images of each kind, numbered without a gap, of which it is told that the two count from different numbers."""
-
-FEWEST_OF_A_CLOCK = 6
-"""Stamps that can be even by more than chance."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
     r"(?:(?:[.,_-]|(?=(?:\d{3}){1,3}$))(\d{3,9}))?$"
 )
 """Day and time of day, to the second or finer; what is finer follows a mark, or in 3, 6 or 9 digits at once."""
+
+SECONDS_AND_REST = re.compile(r"(.*?)(\d+)[-_,: ](\d{9}|\d{6})", re.DOTALL)
+"""Whole seconds and, with their zeros, the nano- or microseconds beside them."""
+
+FASTEST_COUNT = 1 / 60
+"""Seconds: even fractions of one second in shorter steps are the numbers of every so many frames, and no camera's."""
 
 REDWOOD = re.compile(r"\d{6,7}-(\d{12})$")
 """A number and microseconds, as Redwood and SUN3D have it."""
@@ -143,25 +142,44 @@ def _fault(files: Sequence[Path]) -> str | None:
     return None
 
 
-def stamps(names: Sequence[str]) -> list[float] | None:
-    """Seconds, where all names are stamps; None where they are not.
+class Stamps(NamedTuple):
+    """What names say of time."""
 
-    Stamps are seconds or milliseconds with decimals, day and time, or whole numbers: since 1970 in s, ms, µs or ns, or
-    since a device was switched on in ms, µs or ns. Nothing else may change from name to name but an index before them
-    that grows with them, and the rate has to be that of a camera.
+    seconds: list[float]
+    unit: float | None = None
+    """Seconds of what they count, where they are whole numbers."""
+
+
+def stamps(names: Sequence[str], unit: float | None = None) -> Stamps | None:
+    """Times, where all names are stamps; None where they are not.
+
+    Stamps are seconds or milliseconds with decimals, day and time, seconds beside nano- or microseconds, or whole
+    numbers: since 1970 in s, ms, µs or ns, since a device was switched on in ms, µs or ns, or Windows' ticks. Nothing
+    else may change from name to name but an index before them that grows with them, and the rate has to be that of a
+    camera.
+
+    Args:
+        names: of one kind of images, without their endings.
+        unit: seconds of what the other kind's names count: these may count it, too, where nothing else is seen in them.
     """
     bare = _without_tail(names)
-    found = _stamps(names) or _stamps(bare)
+    found = _stamps(names, unit) or _stamps(bare, unit)
     if found or (split := _without_index(bare)) is None:
         return found
     indices, rest = split
-    found = _stamps(rest)
-    return found if found and (np.argsort(indices) == np.argsort(found, kind="stable")).all() else None
+    found = _stamps(rest, unit)
+    return found if found and (np.argsort(indices) == np.argsort(found.seconds, kind="stable")).all() else None
 
 
-def _stamps(names: Sequence[str]) -> list[float] | None:
+def _stamps(names: Sequence[str], unit: float | None) -> Stamps | None:
     """The same of names that stamps end."""
-    return next((found for read in (_redwood, _dates, _decimals, _counts) if (found := read(names))), None)
+    seconds = next((found for read in (_redwood, _dates, _pairs, _decimals) if (found := read(names))), None)
+    return Stamps(seconds) if seconds else _counts(names, unit)
+
+
+def form(name: str) -> str:
+    """What a name has beside its numbers, of which long ones count by their length: stamps of a clock have one form."""
+    return re.sub(r"\d+", lambda digits: "0" * (len(digits[0]) if len(digits[0]) >= DIGITS_OF_A_CLOCK else 1), name)
 
 
 def _without_tail(names: Sequence[str]) -> list[str]:
@@ -195,7 +213,39 @@ def _dates(names: Sequence[str]) -> list[float] | None:
         ]
     except ValueError:
         return None
-    return seconds if len(found) == len(names) and _is_between(seconds, INTERVALS) else None
+    if len(found) < len(names) or not is_between(seconds, INTERVALS):
+        return None
+    are_of_one_second = len({match.groups()[:6] for match in found}) == 1
+    return None if are_of_one_second and _are_frames(found) else seconds
+
+
+def _are_frames(dates: Sequence[re.Match[str]]) -> bool:
+    """Whether what seem to be fractions of one second are the numbers of every so many frames.
+
+    After a point they are fractions. Those of a camera's clock are uneven in their last place, as 033, 067, 100 are.
+    """
+    fractions = [date[7] or "" for date in dates]
+    widths, counts = set(map(len, fractions)), sorted({int(digits or 0) for digits in fractions})
+    if len(widths) > 1 or len(counts) < 2 or any(date.string[date.start(7) - 1] in ".," for date in dates):
+        return False
+    steps = np.diff(counts)
+    usual = int(np.percentile(steps, 50, method="lower"))
+    return 1 < usual == np.gcd.reduce(steps) and usual < FASTEST_COUNT * 10 ** widths.pop()
+
+
+def _pairs(names: Sequence[str]) -> list[float] | None:
+    """Seconds beside nano- or microseconds: since 1970, or in steps from one second to the next at a camera's rate."""
+    found = [match for name in names if (match := SECONDS_AND_REST.fullmatch(name))]
+    forms = {(match[1], len(match[3])) for match in found}
+    if not found or len(found) < len(names) or len(forms) > 1 or max(len(match[2]) for match in found) > MOST_DIGITS:
+        return None
+    whole = [int(match[2]) for match in found]
+    seconds = [second + float(f"0.{match[3]}") for second, match in zip(whole, found, strict=True)]
+    if clock_unit(whole) == UNITS[0]:
+        is_rate = is_between(seconds, INTERVALS)
+    else:
+        is_rate = len(set(whole)) > 1 and set(np.diff(sorted(whole))) <= {0, 1} and is_between(seconds, USUAL)
+    return seconds if is_rate else None
 
 
 def _decimals(names: Sequence[str]) -> list[float] | None:
@@ -208,81 +258,10 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     return None if unit is None else [unit * number for number in seconds]
 
 
-def decimal_unit(numbers: Sequence[float]) -> float | None:
-    """Seconds of what numbers with decimals count: one, or a thousandth, as RealSense's tools have it; else None."""
-    if _is_between(numbers, INTERVALS):
-        return UNITS[0]
-    is_thousandth = clock_unit(numbers) != UNITS[0] and _is_between([UNITS[1] * n for n in numbers], DEVICE_INTERVALS)
-    return UNITS[1] if is_thousandth else None
-
-
-def filled_in(numbers: Sequence[str]) -> list[float]:
-    """Numbers with decimals as seconds, with zeros filled in where they are missing after the point, see `_with_zeros`.
-
-    They are where this makes a clock of enough numbers and, as elsewhere zeros are missing at the end, some of them end
-    in one.
-    """
-    seconds, filled = [float(number) for number in numbers], _with_zeros(numbers)
-    if len(numbers) < FEWEST_OF_A_CLOCK or not any(re.search(r"\.\d+0$", number) for number in numbers):
-        return seconds
-    return filled if _even_share(filled) > max(MOST_STEPS, _even_share(seconds)) else seconds
-
-
-def _with_zeros(numbers: Sequence[str]) -> list[float]:
-    """Seconds, where what follows the point counts its last place, and zeros are missing before it.
-
-    Programs that print whole seconds and nanoseconds one after the other write 5.021 s as 5.21000000.
-    """
-    parts = [number.split(".") for number in numbers]
-    width = max(len(decimals) for _, decimals in parts)
-    return [float(f"{whole}.{decimals.zfill(width)}") for whole, decimals in parts]
-
-
-def _even_share(seconds: Sequence[float]) -> float:
-    """How many of the steps from stamp to stamp are about as long as their median."""
-    steps = np.diff(sorted(seconds))
-    return float(np.mean(_are_usual(steps))) if len(steps) else 0.0
-
-
-def _are_usual(steps: np.ndarray) -> np.ndarray:
-    """Which steps are about as long as their median."""
-    middle = np.median(steps)
-    return np.abs(steps - middle) <= JITTER * middle
-
-
-def _counts(names: Sequence[str]) -> list[float] | None:
+def _counts(names: Sequence[str], other: float | None) -> Stamps | None:
     counts = [int(number) for number in _at_the_end(names, r"\d+")]
-    unit = unit_of(counts)
-    return None if unit is None else [unit * count for count in counts]
-
-
-def clock_unit(stamps: Sequence[float]) -> float | None:
-    """Seconds of what stamps since 1970 count; None where they are no such stamps."""
-    low, high = min(stamps), max(stamps)
-    return next((unit for unit in UNITS if EPOCH[0] < unit * low and unit * high < EPOCH[1]), None)
-
-
-def unit_of(counts: Sequence[float]) -> float | None:
-    """Seconds of what whole numbers count, if that is time; None where they seem to be the numbers of frames."""
-    if not counts or len(set(map(float, counts))) < len(set(counts)):
-        return None
-    of_clock = clock_unit(counts)
-    if of_clock and _is_between([of_clock * count for count in counts], INTERVALS):
-        return of_clock
-    device = [unit for unit in UNITS[2:] if _is_between([unit * count for count in counts], DEVICE_INTERVALS)]
-    if _are_milliseconds(np.diff(sorted(counts))):
-        device.append(UNITS[1])
-    return device[0] if device else of_clock
-
-
-def _are_milliseconds(steps: np.ndarray) -> bool:
-    if len(steps) < 2:
-        return False
-    usual = steps[_are_usual(steps)]
-    is_rate = MILLISECONDS[0] <= steps.min() <= np.median(steps) <= MILLISECONDS[1]
-    if len(usual) < MOST_STEPS * len(steps) or not is_rate:
-        return False
-    return np.gcd.reduce(usual.astype(np.int64)) == 1
+    unit = unit_of(counts) or (other if other and may_count(other, counts) else None)
+    return None if unit is None else Stamps(in_seconds(counts, unit), unit)
 
 
 def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:
@@ -290,9 +269,3 @@ def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:
     found = [re.fullmatch(rf"(.*?)({pattern})", name) for name in names]
     heads = {match[1] for match in found if match}
     return [match[2] for match in found if match] if all(found) and len(heads) == 1 else []
-
-
-def _is_between(seconds: Sequence[float], bounds: tuple[float, float]) -> bool:
-    """Whether most stamps lie so far apart."""
-    steps = np.diff(sorted(set(seconds)))
-    return not len(steps) or bool(bounds[0] <= np.percentile(steps, 50, method="lower") <= bounds[1])

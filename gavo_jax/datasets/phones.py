@@ -15,10 +15,11 @@ from gavo_jax.camera_exports import common_camera
 from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.folders import NumberedFolder, Paired, PlainFolder
+from gavo_jax.datasets.folders import NumberedFolder, PlainFolder
 from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.names import Found, by_number
+from gavo_jax.datasets.pairing import Paired
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError, data_rows, number, read_text
 from gavo_jax.trajectory import SHORTEST_QUATERNION, Trajectory, inverse, rotation_from_quaternion

@@ -9,7 +9,7 @@ from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
-from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images
+from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images, missing_word
 from gavo_jax.datasets.phones import ArkitScenes, Record3D, StrayScan
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
@@ -200,7 +200,7 @@ def _contents(path: Path) -> str:
     if source := source_around(path):
         return f"a folder inside a source: name the source, {source}"
     there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}"
-    if (words := missing_folder(path)) is not None:
+    if (words := missing_folder(path) or missing_word(path)) is not None:
         return f"{there}, and {words}"
     here = f"{there}: not one of: {known}"
     if not any(child.is_dir() for child in inside):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.names import clock_unit, unit_of
+from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 
@@ -36,6 +36,9 @@ MAX_POSE_BYTES = 4096
 MILLISECOND = 1e-3
 """Seconds."""
 
+FEWEST = 10
+"""Poses and images without a gap, of which it is told that the two count from different numbers."""
+
 MAX_NUMBER = 10**18
 """Of a frame."""
 
@@ -60,21 +63,21 @@ def truth_in(
         GavoError: it cannot be read.
     """
     if (folder / TRUTH).exists():
-        return _timed(Trajectory.read_tum(folder / TRUTH), list(frames), seconds)
+        return _timed(Trajectory.read_tum(folder / TRUTH), folder / TRUTH, list(frames), seconds)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
 
 
-def _timed(truth: Trajectory, frames: list[float], seconds: Seconds | None) -> Trajectory:
+def _timed(truth: Trajectory, place: Path, frames: list[float], seconds: Seconds | None) -> Trajectory:
     """A truth with its stamps in seconds."""
     stamps = truth.timestamps
     known = clock_unit(stamps.tolist())
-    readings = [counted_in(truth) * stamps]
+    readings = [np.array(in_seconds(stamps.tolist(), counted_in(truth)))]
     if _are_whole(truth) and seconds:
-        readings.insert(1 if known else 0, seconds(stamps))
+        readings.insert(1 if known else 0, seconds(stamps + _behind(stamps, place, frames, seconds)))
     if not known:
-        readings.append(MILLISECOND * stamps)
+        readings += [unit * stamps for unit in (*UNITS[1:], TICK)]
     low, high = min(frames), max(frames)
 
     def met(reading: np.ndarray) -> float:
@@ -82,6 +85,43 @@ def _timed(truth: Trajectory, frames: list[float], seconds: Seconds | None) -> T
         return round(float(min(high, reading.max()) - max(low, reading.min())) / max(high - low, MILLISECOND), 1)
 
     return replace(truth, timestamps=max(readings, key=lambda reading: max(met(reading), 0.0)))
+
+
+def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seconds) -> int:
+    """By how much the numbers of a truth are behind those of the images.
+
+    As many poses as images, each without a gap, are those of the images in their order.
+
+    Raises:
+        GavoError: one counts from 0 and the other from 1, and no end is alike: which pose is an image's is open.
+    """
+    images = _numbers(frames, seconds)
+    if images is None or not (_is_without_gap(numbers) and _is_without_gap(images)):
+        return 0
+    (a, b), (c, d) = ((round(min(some)), round(max(some))) for some in (images, numbers))
+    if len(images) == len(numbers):
+        return a - c
+    if {a, c} == {0, 1} and b != d and min(len(images), len(numbers)) >= FEWEST:
+        raise GavoError(
+            f"{place}: counts {c} to {d}, the images {a} to {b}: give the poses the numbers of their images"
+        )
+    return 0
+
+
+def _numbers(frames: list[float], seconds: Seconds) -> np.ndarray | None:
+    """Those of frames with these times, where one number is as long as the other."""
+    stamps = np.sort(frames)
+    try:
+        start, second = seconds(np.array([0.0, 1.0]))
+        numbers = np.round((stamps - start) / (second - start))
+        is_even = np.allclose(seconds(numbers), stamps, rtol=0, atol=(second - start) / 10)
+    except GavoError:  # a clock that ends before
+        return None
+    return numbers if is_even else None
+
+
+def _is_without_gap(numbers: np.ndarray) -> bool:
+    return len(numbers) > 1 and bool((np.diff(np.sort(numbers)) == 1).all())
 
 
 def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:

@@ -85,13 +85,79 @@ def test_poses_of_a_room_that_is_numbered_from_one_begin_with_its_first_image(fo
     np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
 
 
-def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder):
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("aligned_depth", "depth_registered", "aligned_depth_to_color", "Depth_Aligned", "depth_to_color"),
+        *("registered_depth", "depth_aligned_to_rgb", "depth-to-colour", "depth_registered_images"),
+    ],
+)
+def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder, name):
     wrote(folder, "plain")
-    (folder / "aligned_depth").mkdir()
+    (folder / name).mkdir()
     for file in (folder / "depth").iterdir():
-        image(folder / "aligned_depth" / file.name, np.full((120, 160), 2.0, np.float32))
+        image(folder / name / file.name, np.full((120, 160), 2.0, np.float32))
     sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder)
     assert (sequence[0].depth == 2.0 * sequence.camera.depth_scale).all()
+    assert sequence.left_out == (f"depth/: not read, depth is that of {name}/",)
+
+
+@pytest.mark.parametrize("name", ["color_to_depth", "depth_to_color_vis", "rgb_aligned", "depth_mask", "depth_rect"])
+def test_other_folders_do_not_go_before_depth(folder, name):
+    wrote(folder, "plain")
+    (folder / name).mkdir()
+    for file in (folder / "depth").iterdir():
+        image(folder / name / file.name, np.full((120, 160), 2.0, np.float32))
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder)
+    assert all(entry.depth and entry.depth.parent.name == "depth" for entry in sequence.entries)
+    assert sequence.left_out == (("depth_rect/: not read, depth is that of depth/",) if name == "depth_rect" else ())
+
+
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [
+        *[(name, "depth") for name in ("rgb_raw", "color_images", "rgb_images", "Colour_images")],
+        *[("rgb", name) for name in ("depth_raw", "depth_images", "aligned_depth_to_color", "depth_rect")],
+        ("livingroom1-color", "livingroom1-depth-clean"),
+        ("office_color", "office_depth"),
+    ],
+)
+def test_folders_of_images_have_many_names(folder, color, depth):
+    wrote(folder, "plain")
+    for old, new in (("rgb", "x"), ("depth", "y"), ("x", color), ("y", depth)):
+        (folder / old).rename(folder / new)
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder) and len(sequence) == 4 and sequence.left_out == ()
+
+
+def test_of_two_scenes_in_one_folder_none_is_taken(folder):
+    wrote(folder, "plain")
+    for new in ("a-color", "b-color", "b-depth"):
+        shutil.copytree(folder / ("rgb" if "color" in new else "depth"), folder / new)
+    shutil.rmtree(folder / "rgb")
+    (folder / "depth").rename(folder / "a-depth")
+    with pytest.raises(GavoError, match="not one of"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("name", ["oak_depthai_{}_{:04}", "indepth_{1:04}_{0}", "{}_{:04}", "scene{}{:04}"])
+def test_the_word_depth_counts_as_a_part_of_its_own(folder, name):
+    for i in range(2):
+        image(folder / f"{name.format('rgb', i)}.png", GREYS[i])
+        image(folder / f"{name.format('depth', i)}.png", raw(METRES[i], 1000))
+    sequence = open_source(folder, Reading(camera=CAMERA))
+    assert len(sequence) == 2
+    np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
+
+
+def test_images_that_all_speak_of_depth_are_refused(folder):
+    for i in range(2):
+        for kind in ("rgb", "map"):
+            image(folder / f"sunderdepth_{kind}_{i}.png", GREYS[i])
+    with pytest.raises(GavoError, match=r"all images have depth in their names, as sunderdepth_map_0\.png: those "):
+        open_source(folder, Reading(camera=CAMERA))
 
 
 @pytest.mark.parametrize("factor", [20, 40])
@@ -212,6 +278,49 @@ def test_an_image_without_a_number_changes_no_stamp(folder, unit):
     assert sequence.left_out == ("1 images: no number in their names, as preview.png",)
 
 
+def stamped(folder: Path, color: list[str], depth: list[str]) -> Sequence:
+    """A folder of images of these names, opened."""
+    for part, stems in (("rgb", color), ("depth", depth)):
+        for stem in stems:
+            image(folder / f"{part}/{stem}.png", GREYS[0] if part == "rgb" else raw(METRES[0], 1000))
+    return open_source(folder, Reading(camera=CAMERA))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("first", [1305031102.175, 123.456])
+@pytest.mark.parametrize("stray", ["preview1", "{} (1)", "{} - Copy", "{}_vis", "a_{}"])
+def test_a_few_names_of_another_form_change_no_stamp(folder, unit, first, stray):
+    """All became numbers of frames by one of them: years, and of some no frame was left."""
+    names = [str(round((first + i / 30) / unit)) for i in range(12)]
+    sequence = stamped(folder, [*names, stray.format(names[3])], names)
+    assert isinstance(sequence, PlainFolder) and len(sequence) == 12
+    np.testing.assert_allclose(sequence.timestamps, first + np.arange(12) / 30, atol=1e-3)
+    assert sequence.left_out == (f"1 images: names of another form than most, as {stray.format(names[3])}.png",)
+
+
+def test_many_names_of_another_form_are_refused(folder):
+    names = [f"{'ab'[i > 5]}_{1305031102175 + 33 * i}" for i in range(12)]
+    with pytest.raises(GavoError, match=r"a_\d+\.png: its name is a time, and b_\d+\.png has another form, as 6 of 12"):
+        stamped(folder, names, names)
+
+
+def test_kinds_of_two_rates_count_the_same(folder):
+    """Even steps have a common factor; colour alone was times, so that both were numbers of frames."""
+    color = [f"{round(1000 * i / 30):06}" for i in range(30)]
+    sequence = stamped(folder, color, [f"{50 * i:06}" for i in range(20)])
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 0.05, atol=0.02)
+    assert len(sequence) == 20
+
+
+def test_times_beside_other_numbers_are_refused(folder):
+    color = [f"{1000 + round(1000 * i / 30):06}" for i in range(30)]
+    with pytest.raises(GavoError, match=r"clip: names as 001967\.png are times, and as 1039\.png, of the other kind "):
+        stamped(folder, color, [str(1000 + i) for i in range(40)])
+    chosen = ["3", "9", "15", "21", "28", "34"]  # of frames, as the other kind has them all
+    shutil.rmtree(folder / "rgb")
+    assert len(stamped(folder, chosen, [str(i) for i in range(40)])) == 6
+
+
 def test_folders_may_be_written_large_and_hold_what_systems_leave(folder):
     for i in range(4):
         image(folder / f"RGB/{i}.PNG", GREYS[i])
@@ -260,6 +369,42 @@ def test_truth_by_the_numbers_of_frames_has_their_times(folder):
         sequence = open_source(folder, Reading(rate=rate))
         assert sequence.ground_truth is not None
         np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps)
+
+
+def counted(folder: Path, images: range, poses: range) -> Sequence:
+    """A folder of images of these numbers, whose truth has those, opened."""
+    rows = "".join(f"{i} {0.01 * i:.2f} 0 0 0 0 0 1\n" for i in poses)
+    (folder / "groundtruth.txt").write_text(rows)
+    return stamped(folder, [f"{i:06}" for i in images], [f"{i:06}" for i in images])
+
+
+@pytest.mark.parametrize("first", [(1, 0), (0, 1), (100, 0), (5, 5)])
+def test_as_many_poses_as_images_are_theirs_in_order(folder, first):
+    """Counted from 0 beside images from 1, each pose was that of the next image."""
+    sequence = counted(folder, *(range(start, start + 12) for start in first))
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.timestamps, sequence.timestamps)
+
+
+@pytest.mark.parametrize(
+    ("images", "poses", "refused"),
+    [
+        (range(1, 21), range(15), "counts 0 to 14, the images 1 to 20: give"),
+        (range(20), range(1, 31), "counts 1 to 30, the images 0 to 19: give"),
+        (range(1, 21), range(21), None),
+        (range(100, 120), range(300), None),
+        (range(20), range(5, 20), None),
+        (range(0, 40, 2), range(1, 30), None),
+    ],
+)
+def test_a_truth_that_may_be_one_frame_off_is_refused(folder, images, poses, refused):
+    if refused:
+        with pytest.raises(GavoError, match=rf"groundtruth\.txt: {refused}"):
+            counted(folder, images, poses)
+        return
+    truth = counted(folder, images, poses).ground_truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.timestamps, np.array(poses) / 30)
 
 
 def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
@@ -392,6 +537,14 @@ def test_a_camera_that_is_named_goes_before_the_folders_own(folder):
     mine = Camera(130.0, 130.0, 80.0, 60.0, 160, 120, depth_scale=1000.0)
     assert open_source(wrote(folder, "open3d"), Reading(camera=mine)).camera == mine
     assert open_source(folder, Reading(camera=mine, depth_scale=2000)).camera.depth_scale == 2000
+
+
+def test_a_room_of_replica_needs_no_truth(folder):
+    wrote(folder, "replica")
+    frames = len(open_source(folder))
+    (folder / "traj.txt").unlink()
+    sequence = open_source(folder)
+    assert recognise(folder).kind == "Replica room" and len(sequence) == frames and sequence.ground_truth is None
 
 
 @pytest.mark.parametrize("name", ["plain", "replica", "seven_scenes"])

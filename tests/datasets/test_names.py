@@ -5,12 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.datasets.names import Found, by_number, images_among, stamps
+from gavo_jax.datasets.names import Found, by_number, form, images_among
+from gavo_jax.datasets.names import stamps as read
 from gavo_jax.errors import GavoError
 
 STEP = 33.333e-3
 TIMES = np.arange(6) * STEP
 CLOCK = 1305031102.175304
+
+
+def stamps(names: list[str], unit: float | None = None) -> list[float] | None:
+    """Seconds alone."""
+    found = read(names, unit)
+    return found and found.seconds
 
 
 def at(seconds: float, unit: float) -> list[str]:
@@ -43,6 +50,18 @@ STAMPS = {
     "microseconds since switched on before a word": [f"{name}_color" for name in at(77.0, 1e-6)],
     "milliseconds after an index": [f"color_{i:05}_{name}" for i, name in enumerate(at(CLOCK, 1e-3), 8)],
     "seconds after an index": [f"{i}_{CLOCK + time:.6f}_v2" for i, time in enumerate(TIMES, 8)],
+    "ticks since 1970": at(CLOCK, 1e-7),
+    "ticks of Windows": [str(116444736000000000 + int(name)) for name in at(CLOCK, 1e-7)],
+    "ticks of .NET": [f"color_{621355968000000000 + int(name)}" for name in at(CLOCK, 1e-7)],
+    "microseconds with a zero, after an index": [f"{i}_077{round(1e6 * time):06}" for i, time in enumerate(TIMES)],
+    "seconds and nanoseconds": [f"rgb_{int(CLOCK + time)}_{int((CLOCK + time) % 1 * 1e9):09}" for time in TIMES],
+    "seconds and microseconds": [f"{int(CLOCK + time)}-{int((CLOCK + time) % 1 * 1e6):06}" for time in TIMES],
+    "seconds and microseconds after an index": [
+        f"{i}_{int(CLOCK + time)}_{int((CLOCK + time) % 1 * 1e6):06}" for i, time in enumerate(TIMES, 8)
+    ],
+    "seconds and nanoseconds since switched on": [
+        f"{int(7.9 + time)}_{int((7.9 + time) % 1 * 1e9):09}" for time in TIMES
+    ],
     "over a minute": ["20240501T123059,900", "20240501T123059,933", "20240501T123059,967", "20240501T123100,000"],
 }
 
@@ -94,6 +113,10 @@ def test_a_frame_that_is_missing_changes_no_unit():
         [f"{i}_{5 * i}_color" for i in range(20)],
         ["scan1.0001", "scan1.0002", "scan1.0003"],
         ["20240501_123059_000", "20240501_123059_001"],
+        [f"20240101_120000_{5 * i:03}" for i in range(20)],
+        [f"20240101_120000_{50 * i:04}" for i in (0, 1, 2, 4, 5, 6)],
+        [f"2024-01-01_12-00-00-{100 + 10 * i:03}_color" for i in range(20)],
+        [f"{i // 10}_{i:06}" for i in range(30)],
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
         ["20249901123059", "20249901123060"],
         ["a", "b"],
@@ -103,6 +126,45 @@ def test_a_frame_that_is_missing_changes_no_unit():
 )
 def test_what_is_no_stamp_is_not_taken_for_one(names):
     assert stamps(names) is None
+
+
+@pytest.mark.parametrize("rate", [5, 20, 25, 30])
+def test_a_burst_within_one_second_keeps_its_fractions(rate):
+    found = stamps([f"20240101_120000_{round(1000 * i / rate):03}" for i in range(5)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1 / rate, atol=2e-3)
+
+
+def test_a_point_says_that_fractions_are_those():
+    found = stamps([f"20240101_120000.{10 * i:03}" for i in range(5)])
+    assert found is not None and found[1] - found[0] == pytest.approx(0.01) and found[0] > CLOCK
+
+
+@pytest.mark.parametrize("step", [5000, 33333, 83334, 200000, 333333])
+def test_since_a_device_was_switched_on_microseconds_may_be_of_every_tenth_frame(step):
+    """Ticks of 100 ns would give the usual rate, and nothing tells."""
+    found = stamps([str(77000000 + step * i) for i in range(8)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1e-6 * step)
+
+
+def test_stamps_of_windows_count_from_1970():
+    for name in ("ticks of Windows", "ticks of .NET"):
+        found = stamps(STAMPS[name])
+        assert found is not None
+        np.testing.assert_allclose(found, CLOCK + TIMES, rtol=0, atol=2e-6)
+
+
+def test_even_numbers_count_what_the_other_kind_counts():
+    even = [f"{50 * i:06}" for i in range(20)]
+    assert stamps(even) is None
+    np.testing.assert_allclose(stamps(even, 1e-3) or [], np.arange(20) / 20)
+    assert stamps([str(i) for i in range(20)], 1e-3) is None and stamps(["50"], 1e-3) is not None
+
+
+def test_the_form_of_a_name_is_what_its_numbers_leave():
+    assert form("a_5") == form("a_17") != form("b_5")
+    assert form("1305031102175") != form("17") and form("a_1305031102175") == form("a_1305031102209")
 
 
 def test_a_stray_file_changes_no_unit():

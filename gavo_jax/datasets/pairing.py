@@ -1,0 +1,137 @@
+"""Frames of a folder whose images are nothing but files: which colour and which depth image are one, and when."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gavo_jax.datasets.clocks import MOST_STEPS
+from gavo_jax.datasets.files import Entry, Reading
+from gavo_jax.datasets.names import by_number, form, nameless, stamps, unpaired
+from gavo_jax.datasets.truth import Seconds
+from gavo_jax.errors import GavoError
+from gavo_jax.trajectory import associate
+
+FEWEST_FOR_A_RATE = 3
+"""Images whose steps tell more than chance."""
+
+MOST_ODD = 1 / 3
+"""Images whose names have another form than the rest, for each of the rest: so many may have come in by chance."""
+
+
+class Paired(NamedTuple):
+    """Frames of a plain folder."""
+
+    entries: list[Entry]
+    left_out: list[str]
+    times: dict[int, float]
+    """Of each depth image, by the number in its name, else by its place, from 1."""
+    seconds: Seconds | None
+    """Times by numbers, where the names are those."""
+
+
+class _Timed(NamedTuple):
+    """Images whose names are stamps."""
+
+    files: list[Path]
+    seconds: list[float]
+    unit: float | None
+    """Of whole numbers, see `names.Stamps`."""
+    others: tuple[Path, ...] = ()
+    """Whose names have another form."""
+
+
+def paired_by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired | None:
+    """Frames by the stamps that the names are, but for a few; None where they are none, or the rate is said.
+
+    Raises:
+        GavoError: which images are of one time is open.
+    """
+    others = [file for file in (*color, *depth) if not re.search(r"\d", file.stem)]
+    color, depth = ([file for file in files if re.search(r"\d", file.stem)] for files in (color, depth))
+    timed = None if reading.rate else _both_timed(path, color, depth)
+    if timed is None:
+        return None
+    first, second = (np.array(some.seconds, float) for some in timed)
+    color, depth = (some.files for some in timed)
+    i, j = associate(first, second, reading.max_difference)
+    if len(i) == 0:
+        raise GavoError(
+            f"{path}: by their names no colour and depth image lie within {reading.max_difference:g} s of each other: "
+            "say --rate if the names are no stamps"
+        )
+    entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
+    left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s") + nameless(others)
+    if odd := [file for some in timed for file in some.others]:
+        left_out.append(f"{len(odd)} images: names of another form than most, as {odd[0].name}")
+    of_frames = second.copy()
+    of_frames[j] = first[i]
+    times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
+    return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
+
+
+def _both_timed(path: Path, color: list[Path], depth: list[Path]) -> tuple[_Timed, _Timed] | None:
+    """Times of both kinds; where one has none of its own accord, in what the other one counts."""
+    first, second = _timed(color), _timed(depth)
+    if first and not second:
+        second = _timed(depth, first.unit)
+    elif second and not first:
+        first = _timed(color, second.unit)
+    if first and second:
+        return first, second
+    if known := first or second:
+        _check_numbers(path, known, color, depth)
+    return None
+
+
+def _check_numbers(path: Path, known: _Timed, color: list[Path], depth: list[Path]) -> None:
+    """Refuse names that are times in one kind of images alone, unless their numbers are those of the other kind."""
+    fewer = min(len(color), len(depth))
+    if len(known.files) < FEWEST_FOR_A_RATE or not fewer:
+        return
+    found = by_number(color, depth)
+    if len(found.color.keys() & found.depth.keys()) >= MOST_STEPS * fewer:
+        return
+    ours, other = (color, depth) if known.files[0] in color else (depth, color)
+    raise GavoError(
+        f"{path}: names as {ours[-1].name} are times, and as {other[-1].name}, of the other kind of images, none: "
+        "name both by their times, or say --rate if they are numbers of frames"
+    )
+
+
+def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
+    """Images by their stamps; a few whose names have another form than most do not count.
+
+    Raises:
+        GavoError: these are many.
+    """
+    if found := stamps([file.stem for file in files], unit):
+        return _Timed(files, *found)
+    forms: dict[str, list[Path]] = {}
+    for file in files:
+        forms.setdefault(form(file.stem), []).append(file)
+    usual = max(forms.values(), key=len, default=[])
+    if len(usual) in (len(files), *range(FEWEST_FOR_A_RATE)):
+        return None
+    if (found := stamps([file.stem for file in usual], unit)) is None:
+        return None
+    odd = [file for some in forms.values() if some is not usual for file in some]
+    if len(odd) > MOST_ODD * len(usual):
+        raise GavoError(
+            f"{usual[0]}: its name is a time, and {odd[0].name} has another form, as {len(odd)} of {len(files)} have: "
+            "name all alike, or say --rate if the names are numbers of frames"
+        )
+    return _Timed(usual, *found, tuple(odd))
+
+
+def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
+    """Frames by the numbers in the names, whose times a clock says."""
+    found = by_number(color, depth)
+    numbers = sorted(found.color.keys() & found.depth.keys())
+    if not numbers:
+        counts = f"{len(color)} colour and {len(depth)} depth images"
+        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
+    times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
+    entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
+    return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)
