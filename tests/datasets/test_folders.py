@@ -85,6 +85,17 @@ def test_poses_of_a_room_that_is_numbered_from_one_begin_with_its_first_image(fo
     np.testing.assert_allclose(truth.world_T_camera, POSES, atol=1e-6)
 
 
+def beside_depth(folder: Path, name: str) -> PlainFolder:
+    """A folder with another one of depth, of 2 m everywhere, beside that of depth."""
+    wrote(folder, "plain")
+    (folder / name).mkdir()
+    for file in (folder / "depth").iterdir():
+        image(folder / name / file.name, np.full((120, 160), 2.0, np.float32))
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder)
+    return sequence
+
+
 @pytest.mark.parametrize(
     "name",
     [
@@ -93,24 +104,14 @@ def test_poses_of_a_room_that_is_numbered_from_one_begin_with_its_first_image(fo
     ],
 )
 def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder, name):
-    wrote(folder, "plain")
-    (folder / name).mkdir()
-    for file in (folder / "depth").iterdir():
-        image(folder / name / file.name, np.full((120, 160), 2.0, np.float32))
-    sequence = open_source(folder)
-    assert isinstance(sequence, PlainFolder)
+    sequence = beside_depth(folder, name)
     assert (sequence[0].depth == 2.0 * sequence.camera.depth_scale).all()
     assert sequence.left_out == (f"depth/: not read, depth is that of {name}/",)
 
 
 @pytest.mark.parametrize("name", ["color_to_depth", "depth_to_color_vis", "rgb_aligned", "depth_mask", "depth_rect"])
 def test_other_folders_do_not_go_before_depth(folder, name):
-    wrote(folder, "plain")
-    (folder / name).mkdir()
-    for file in (folder / "depth").iterdir():
-        image(folder / name / file.name, np.full((120, 160), 2.0, np.float32))
-    sequence = open_source(folder)
-    assert isinstance(sequence, PlainFolder)
+    sequence = beside_depth(folder, name)
     assert all(entry.depth and entry.depth.parent.name == "depth" for entry in sequence.entries)
     assert sequence.left_out == (("depth_rect/: not read, depth is that of depth/",) if name == "depth_rect" else ())
 

@@ -87,18 +87,29 @@ def test_frames_of_a_log_that_were_lost_have_no_pose(folder):
     np.testing.assert_allclose(truth_of(folder).timestamps, (1 + np.array([0, 1, 3])) / 30)
 
 
+def named_by_stamps(folder: Path, names: list[str]) -> None:
+    """Four frames of these names, and their camera."""
+    (folder / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
+    for part, pixels in (("rgb", GREYS), ("depth", DEPTHS)):
+        for name, one in zip(names, pixels, strict=True):
+            image(folder / f"{part}/{name}.png", one)
+
+
+def listed(folder: Path, stamps: dict[str, str]) -> None:
+    """TUM's lists of images, by their names."""
+    for part in ("rgb", "depth"):
+        rows = [f"{stamp} {part}/{name}.png" for name, stamp in stamps.items()]
+        (folder / f"{part}.txt").write_text("\n".join(rows) + "\n")
+
+
 @pytest.mark.parametrize("unit", [1, 1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("layout", ["plain", "tum"])
 def test_the_stamps_of_a_truth_may_count_what_a_clock_does(tmp_path, layout, unit):
     """As of a recording that was taken apart: images named by nanoseconds, poses written as they come."""
     nanoseconds = [1305031102175304000 + 33333333 * i for i in range(4)]
-    (tmp_path / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
-    for kind, pixels in (("rgb", GREYS), ("depth", DEPTHS)):
-        for stamp, one in zip(nanoseconds, pixels, strict=True):
-            image(tmp_path / f"{kind}/{stamp}.png", one)
-        if layout == "tum":
-            rows = [f"{stamp / 1e9:.6f} {kind}/{stamp}.png" for stamp in nanoseconds]
-            (tmp_path / f"{kind}.txt").write_text("\n".join(rows) + "\n")
+    named_by_stamps(tmp_path, [str(stamp) for stamp in nanoseconds])
+    if layout == "tum":
+        listed(tmp_path, {f"{stamp}": f"{stamp / 1e9:.6f}" for stamp in nanoseconds})
     rows = [f"{stamp * 1e-9 / unit:.6f} 0 0 0 0 0 0 1" for stamp in nanoseconds]
     (tmp_path / "groundtruth.txt").write_text("\n".join(rows) + "\n")
     sequence = open_source(tmp_path)
@@ -125,13 +136,9 @@ def test_a_truth_counts_what_its_images_do_since_a_device_was_switched_on(tmp_pa
     times = [60 * minutes + 0.0333 * i for i in range(4)]
     unit, digits = {"microseconds": (1e-6, 0), "nanoseconds": (1e-9, 0)}.get(kind, (1e-3, 3))
     stamps = [f"{time / unit:.{digits}f}" for time in times]
-    (tmp_path / "intrinsics.txt").write_text("131 131 79.5 59.5\n")
-    for part, pixels in (("rgb", GREYS), ("depth", DEPTHS)):
-        for stamp, one in zip(stamps, pixels, strict=True):
-            image(tmp_path / f"{part}/{stamp}.png", one)
-        if layout == "tum":
-            rows = [f"{stamp} {part}/{stamp}.png" for stamp in stamps]
-            (tmp_path / f"{part}.txt").write_text("\n".join(rows) + "\n")
+    named_by_stamps(tmp_path, stamps)
+    if layout == "tum":
+        listed(tmp_path, dict(zip(stamps, stamps, strict=True)))
     rows = [f"{time / unit:.{digits}f} 0 0 0 0 0 0 1" for time in np.arange(times[0], times[-1] + 0.01, 0.01)]
     (tmp_path / "groundtruth.txt").write_text("\n".join(rows) + "\n")
     sequence = open_source(tmp_path)
