@@ -117,6 +117,13 @@ def read_toml(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, An
     return parse_toml(path, read_text(path, max_bytes))
 
 
+COLUMN = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+"""The name of a column; paths and numbers are none."""
+
+TIME = re.compile(r"time|stamp|^t$", re.IGNORECASE)
+"""In the name of a column of times."""
+
+
 def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[str, list[str]]]:
     """Split a TUM text file into rows of fields; blank lines and `#` comments are skipped, commas count as blanks.
 
@@ -137,6 +144,16 @@ def rows_of(text: str, path: str | Path) -> list[tuple[str, list[str]]]:
         if fields and not fields[0].startswith("#"):
             rows.append((f"{path}:{number}", fields))
     return rows
+
+
+def without_heading(rows: list[tuple[str, list[str]]]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """The names of the columns, of which the first is a time, where the first row is such, and the rows below; else no
+    names, and all rows.
+    """
+    heading = rows[0][1] if rows else []
+    if len(heading) < 2 or not (TIME.search(heading[0]) and all(map(COLUMN.fullmatch, heading))):
+        return [], rows
+    return heading, rows[1:]
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, GavoWarning, number, read_text, rows_of, write_bytes
+from gavo_jax.errors import GavoError, GavoWarning, number, read_text, rows_of, without_heading, write_bytes
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -43,6 +43,9 @@ W_FIRST = re.compile(
     rf"^#.*\bq\w*w{_APART}q\w*x{_APART}q\w*y{_APART}q\w*z[^\w\n]*$", re.MULTILINE | re.IGNORECASE | re.ASCII
 )
 """A comment that ends with the names of the last columns, as EuRoC's does: w before x."""
+
+
+W_FIRST_ORDER = "wxyz"
 
 
 def segment_comment(segment: int, before: float | None, after: float) -> str:
@@ -105,7 +108,7 @@ class Trajectory:
     def read_tum(path: str | Path) -> "Trajectory":
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
-        Where a comment names the columns with qw before qx, as EuRoC's does, quaternions are read so.
+        Where a comment, or a first row, names the columns with qw before qx, as EuRoC's does, quaternions are read so.
         After a comment of `segment_comment` rows are of that segment. Rows come back in the order of their stamps; of
         rows with equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of
         a zero quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
@@ -115,7 +118,8 @@ class Trajectory:
                 row has a pose.
         """
         text = read_text(path)
-        all_places = rows_of(text, path)
+        heading, all_places = without_heading(rows_of(text, path))
+        order = _order_of(heading, path)
         parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
         if not parsed:
             raise GavoError(f"{path}: holds no trajectory (no rows)")
@@ -127,7 +131,7 @@ class Trajectory:
             warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
         segments = _segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
-        if W_FIRST.search(text):
+        if order == W_FIRST_ORDER or W_FIRST.search(text):
             table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
         _, first = np.unique(table[:, 0], return_index=True)
         table = table[first]
@@ -314,6 +318,19 @@ def _slerp(
     weight_start = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / safe)
     weight_end = np.where(small, fraction, np.sin(fraction * angle) / safe)
     return weight_start * start + weight_end * end
+
+
+def _order_of(heading: list[str], path: str | Path) -> str:
+    """The order of a quaternion's numbers by the names of the columns; empty where there are none.
+
+    Raises:
+        GavoError: they are not those of a pose in one of the two orders.
+    """
+    ends = "".join(word[-1].lower() for word in heading[1:])
+    turn_first = any(word.lower().startswith("q") for word in heading[1:4])
+    if heading and (turn_first or ends not in ("xyzxyzw", "xyz" + W_FIRST_ORDER)):
+        raise GavoError(f"{path}: columns {' '.join(heading)[:100]}: expected timestamp tx ty tz qx qy qz qw")
+    return ends[3:]
 
 
 def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:

@@ -277,3 +277,22 @@ def test_a_comment_that_ends_with_the_names_of_columns_says_where_w_stands(
     (tmp_path / "poses.txt").write_text(f"{comment}\n0.0 0 0 0 0 0 0 1\n")
     turned = np.diag([-1.0, -1.0, 1.0]) if w_first else np.eye(3)
     np.testing.assert_allclose(Trajectory.read_tum(tmp_path / "poses.txt").world_T_camera[0, :3, :3], turned)
+
+
+@pytest.mark.parametrize("heading", ["timestamp,tx,ty,tz,qx,qy,qz,qw", "t x y z qw qx qy qz"])
+def test_a_first_row_may_name_the_columns(tmp_path, heading):
+    w_first = heading.endswith("qz")
+    quaternion = "0.8 0.6 0 0" if w_first else "0.6 0 0 0.8"
+    (tmp_path / "t.txt").write_text(f"{heading}\n1.0 1 2 3 {quaternion}\n")
+    read = Trajectory.read_tum(tmp_path / "t.txt")
+    np.testing.assert_allclose(read.world_T_camera[0, :3, 3], [1, 2, 3])
+    np.testing.assert_allclose(
+        read.world_T_camera[0, :3, :3], [[1, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("heading", ["timestamp qx qy qz qw tx ty tz", "time a b c d e f g"])
+def test_columns_in_another_order_are_refused(tmp_path, heading):
+    (tmp_path / "t.txt").write_text(f"{heading}\n1.0 1 2 3 0 0 0 1\n")
+    with pytest.raises(GavoError, match=r"t\.txt: columns .*: expected timestamp tx ty tz qx qy qz qw"):
+        Trajectory.read_tum(tmp_path / "t.txt")

@@ -26,7 +26,7 @@ from gavo_jax.datasets.files import (
 )
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.truth import truth_in, unread_truth
-from gavo_jax.errors import GavoError, data_rows, number
+from gavo_jax.errors import GavoError, data_rows, number, without_heading
 from gavo_jax.trajectory import associate
 
 MAX_DIFFERENCE = 0.02
@@ -217,7 +217,7 @@ def _unit(color: list[float], rate: float | None) -> float:
 def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
     """Read `stamp path stamp path` rows, depth first or last."""
     pairs = []
-    for place, fields in data_rows(path, MAX_LIST_BYTES):
+    for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 4:
             raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
@@ -229,7 +229,7 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
 def _read_list(root: Path, path: Path) -> list[_Row]:
     """Read `timestamp path` rows, in the order of their stamps; the images' paths stay below `root`."""
     rows: list[_Row] = []
-    for place, fields in data_rows(path, MAX_LIST_BYTES):
+    for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 2:
             raise GavoError(f"{place}: expected `timestamp path`, of no blanks, found {len(fields)} fields")
         rows.append(_row(root, path, place, *fields))

@@ -212,6 +212,14 @@ def test_a_stamp_out_of_order_in_a_list_of_pairs_puts_its_frame_in_doubt(folder)
         sequence[3]
 
 
+def test_lists_may_begin_with_the_names_of_their_columns(folder):
+    """As pandas writes them."""
+    for kind in ("rgb", "depth"):
+        rows = [row.replace(" ", ",") for row in (folder / f"{kind}.txt").read_text().splitlines()[1:]]
+        (folder / f"{kind}.txt").write_text("\n".join(["timestamp,filename", *rows]) + "\n")
+    np.testing.assert_allclose(TumSequence(folder, CAMERA).timestamps, STAMPS)
+
+
 @pytest.mark.parametrize("layout", ["two lists", "one list"])
 def test_zeros_that_are_missing_after_the_point_are_filled_in(folder, layout):
     """Whole seconds and the rest printed one after the other: 102.008 s is 102.8000."""
