@@ -206,7 +206,7 @@ def _is_vins(values: Table) -> bool:
 
 
 def _is_flat(values: Table) -> bool:
-    return "fx" in values and "ppx" not in values
+    return "fx" in values
 
 
 MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...] = (

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
+from gavo_jax.datasets.names import FEWEST
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
 
@@ -35,9 +36,6 @@ MAX_POSE_BYTES = 4096
 
 MILLISECOND = 1e-3
 """Seconds."""
-
-FEWEST = 10
-"""Poses and images without a gap, of which it is told that the two count from different numbers."""
 
 MAX_NUMBER = 10**18
 """Of a frame."""
