@@ -30,8 +30,8 @@ DIGITS_OF_A_CLOCK = 10
 """Those of seconds since 1970; finer ones have more."""
 
 FEWEST = 10
-"""Images of each kind, or poses and images, numbered without a gap, of which it is told that the two count from different
-numbers."""
+"""Images of each kind, or poses and images, without a gap in their numbers, of which it is told that the two count from
+different ones."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
