@@ -27,6 +27,7 @@ from jax import export
 from jax.core import Tracer
 
 from gavo_jax.errors import GavoError, write_bytes
+from gavo_jax.waits import counted_wait
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -88,6 +89,7 @@ class CachedProgram(Generic[P, R]):
 
     def __init__(self, function: Callable[P, R], static: tuple[str, ...] = (), returns: tuple[type, ...] = ()):
         self._function, self._jitted = function, jax.jit(function, static_argnames=static)
+        self._called: set[Any] = set()
         for node in returns:
             _register(node)
         update_wrapper(self, function)
@@ -96,15 +98,21 @@ class CachedProgram(Generic[P, R]):
         """Run it."""
         leaves, structure = jax.tree.flatten(args)
         is_traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-        if _folder is None or is_traced or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        if is_traced or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return self._jitted(*args, **kwargs)
         kinds = tuple(map(Kind.of, leaves))
         signature = self._signature(structure, kinds, kwargs)
+        if _folder is None:
+            if signature in self._called:
+                return self._jitted(*args, **kwargs)
+            self._called.add(signature)
+            with counted_wait():  # to compile takes longer than the call
+                return self._jitted(*args, **kwargs)
         program = _loaded.get(signature)
         if program is None:
             with _lock:
                 loading = _loading.setdefault(signature, threading.Lock())
-            with loading:  # once, whoever asks for it meanwhile; others side by side
+            with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
                 program = _loaded.get(signature)
                 if program is None:
                     program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)

@@ -1,5 +1,6 @@
 """Traced programs are kept between processes, and used again only where they would be traced the same."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,6 +20,7 @@ from gavo_jax.objective.losses import geman_mcclure, huber
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.presets import METHODS, PRESETS
 from gavo_jax.program_cache import CachedProgram, Foreign, identify, keep_programs_in
+from gavo_jax.waits import Stopwatch, told_of_waits
 
 OPTIONS = AlignmentOptions(points=100)
 NUMBERS = np.arange(4, dtype=np.float32)
@@ -251,3 +253,28 @@ def test_it_is_told_beforehand_whether_a_program_is_kept(folder: Path) -> None:
     assert program.is_kept(jnp.asarray(NUMBERS), OPTIONS) and traces == 1
     keep_programs_in(None)
     assert not program.is_kept(NUMBERS, OPTIONS)
+
+
+def test_waiting_for_a_program_is_told_and_is_no_time_of_the_work(folder: Path) -> None:
+    told: list[Path | None] = []
+    for kept in (folder, None):  # kept between processes, and not
+        start_anew(folder)
+        keep_programs_in(kept)
+        slow: Any = CachedProgram(slowly_traced)
+        stopwatch = Stopwatch()
+        with told_of_waits(partial(told.append, kept)):
+            slow(NUMBERS)
+            waited = stopwatch.waited
+            slow(NUMBERS + 1)
+        assert told.count(kept) == 1
+        assert waited >= 0.3
+        assert stopwatch.waited == waited
+        assert stopwatch.seconds < 0.25
+    slow(NUMBERS[:2])
+    assert len(told) == 2, "nobody listens any more"
+
+
+def slowly_traced(numbers: jax.Array) -> jax.Array:
+    """A program that takes its time to trace."""
+    time.sleep(0.3)
+    return numbers + 1.0

@@ -1,6 +1,5 @@
 """`gavo run` over a camera's frames as they come, until Ctrl-C, the camera's end or `--frames`."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +31,7 @@ from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
+from gavo_jax.waits import Stopwatch
 
 NOT_LIVE = "not with the live source '{}': record it and run over that"
 
@@ -54,11 +54,12 @@ def run_live(options: Run) -> int:
     with Newest(device) as newest, RunFolder(path) as folder, make_viewer(options.viewer, path / RECORDING) as viewer:
         odometry = Odometry(camera.rectified(), settings, seed=options.seed, record=viewer.wants_populations)
         with waiting(f"{device.name}: compiling …"):
-            compile_seconds = interruptible(odometry.warm_up)
+            compile_seconds = interruptible(lambda: odometry.warm_up(wholly=True))
         remove_trajectories(folder.path)
         say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
         scene = None if options.map is None else LiveMap(MapBuilder(odometry.camera, options.voxel))
         end = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
+        seconds = end.stopwatch.seconds
         if odometry.progress.last_index < 1:
             tracked = odometry.progress.last_index + 1
             seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
@@ -68,7 +69,7 @@ def run_live(options: Run) -> int:
         metrics: dict[str, Any] = {
             **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed},
             "complete": end.fault is None,
-            **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds).figures,
+            **conclude(first, folder.steps(), None, None, seconds, compile_seconds + end.stopwatch.waited).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
@@ -88,8 +89,8 @@ def run_live(options: Run) -> int:
 class _End(NamedTuple):
     """How tracking came to its end."""
 
-    seconds: float
-    """It took."""
+    stopwatch: Stopwatch
+    """Since the first frame."""
     interrupted: bool = False
     """By Ctrl-C."""
     fault: GavoError | None = None
@@ -107,7 +108,7 @@ def _track(
     scene: LiveMap | None,
 ) -> _End:
     """Track until there is no more. Images that are unlike the first ones make a lost frame."""
-    count, start = 0, time.perf_counter()
+    count, stopwatch = 0, Stopwatch()
     images: LiveImages
     try:
         for images in newest:
@@ -127,7 +128,7 @@ def _track(
                     },
                     images.timestamp,
                 )
-                start = time.perf_counter()
+                stopwatch = Stopwatch()
             step = odometry.register(frame, images.timestamp)
             viewer.watch(frame if isinstance(frame, Frame) else None, step, odometry.candidates)
             if scene is not None and isinstance(frame, Frame):
@@ -143,12 +144,12 @@ def _track(
         if count < 2:
             raise
         tell(f"{newest.device.name}: interrupted after {count} frames")
-        return _End(time.perf_counter() - start, interrupted=True)
+        return _End(stopwatch, interrupted=True)
     except GavoError as error:  # what was tracked counts
         if count < 2:
             raise
-        return _End(time.perf_counter() - start, fault=error)
-    return _End(time.perf_counter() - start)
+        return _End(stopwatch, fault=error)
+    return _End(stopwatch)
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:

@@ -25,6 +25,7 @@ from gavo_jax.odometry.run import run_odometry, trajectory_of
 from gavo_jax.output.files import environment
 from gavo_jax.peers import make_peer
 from gavo_jax.settings import Settings
+from gavo_jax.waits import Stopwatch
 
 Row = dict[str, Any]
 
@@ -152,9 +153,9 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
             return Outcome(batch, (_mapped(experiment, batch, sequence, settings, on_pairs),))
         tracker = _Tracker(batch, sequence)
         compile_seconds = tracker.warm_up()
-        start = time.perf_counter()
+        stopwatch = Stopwatch()
         steps = tracker.track(on_pairs)
-        seconds = (time.perf_counter() - start) / len(batch.runs)
+        seconds, compile_seconds = stopwatch.seconds / len(batch.runs), compile_seconds + stopwatch.waited
         first = float(sequence.timestamps[0])
         rows = []
         for run, own in zip(batch.runs, steps, strict=True):

@@ -7,7 +7,6 @@ solvers and options, the runs laid out over all local devices; a rate that diffe
 
 import math
 import os
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -33,6 +32,7 @@ from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings
+from gavo_jax.waits import Stopwatch
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
 
@@ -211,9 +211,9 @@ class _Stack:
             frame = rectified(frame, self._recorded)
             before = [lane.progress for lane in self.lanes]
             if all(progress.tracker is not None for progress in before):
-                start = time.perf_counter()
+                stopwatch = Stopwatch()
                 self._attempt(frame, before)
-                milliseconds = (time.perf_counter() - start) * 1e3
+                milliseconds = stopwatch.seconds * 1e3
         steps = [lane.register(frame, timestamp) for lane in self.lanes]
         for stacked in self._searches:
             stacked.made = None

@@ -7,6 +7,7 @@ knows of earlier frames is a state that the driver keeps and hands back, so that
 import gc
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +28,7 @@ from gavo_jax.evaluation import rotation_angle
 from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
+from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -212,17 +214,30 @@ class Recovering:
     Attributes:
         first: What is asked first.
         second: What is asked where that is unusable; made when it is needed.
-        kept: Of the second's programs one that `warm_up` loads, where it was compiled before; None: that waits, too.
+        wide: What the second one searches with; its program is made when it is needed,
+        is_loaded: or by `warm_up`, where it was compiled before.
     """
 
     first: Aligner
     second: Callable[[], Aligner]
-    kept: Search | None = None
+    wide: Search | None = None
+    is_loaded: bool = False
 
     def warm_up(self) -> float:
         """That of the first one; the second compiles when it is needed."""
         seconds = self.first.warm_up()
-        return seconds + self.kept.warm_up() if self.kept is not None and self.kept.is_kept() else seconds
+        return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
+
+    def warm_up_both(self) -> float:
+        """Of both, side by side."""
+        if self.wide is None:
+            return self.first.warm_up()
+        start = time.perf_counter()
+        with ThreadPoolExecutor(max_workers=1) as worker:
+            wide = worker.submit(in_32_bits(self.wide.warm_up))
+            self.first.warm_up()
+            wide.result()
+        return time.perf_counter() - start
 
     def start(self, frame: Frame) -> Any:
         """By the first one."""
@@ -374,12 +389,13 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
         return with_bodies(aligner, search)
     careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
 
+    wide = wide_search(search)
+
     def behind() -> Aligner:
-        wide = wide_search(search)
         return with_bodies(Polished(wide, search), wide)
 
     # loading it takes seconds, which a short run had better spare and a long one had better not stop for
-    return Recovering(careful, behind, wide_search(search) if search.settings.odometry.loops else None)
+    return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
 
 
 def blank_of(aligner: Any) -> Any:

@@ -3,7 +3,6 @@
 It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
 """
 
-import time
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
@@ -19,7 +18,7 @@ from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, requi
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
-from gavo_jax.odometry.aligners import Aligner, Attempt, make_aligner, without_depth
+from gavo_jax.odometry.aligners import Aligner, Attempt, Recovering, make_aligner, without_depth
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
@@ -31,6 +30,7 @@ from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
+from gavo_jax.waits import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,14 @@ class Odometry:
         self.candidates: tuple[Population, ...] = ()
 
     @in_32_bits
-    def warm_up(self) -> float:
-        """Compile the program for a frame (or load it from the cache); returns the seconds this took."""
+    def warm_up(self, wholly: bool = False) -> float:
+        """Compile the program for a frame (or load it from the cache); returns the seconds this took.
+
+        Args:
+            wholly: Also what only a doubtful pair needs: a camera would not wait while that is compiled.
+        """
+        if wholly and isinstance(self.aligner, Recovering):
+            return self.aligner.warm_up_both()
         return self.aligner.warm_up()
 
     @in_32_bits
@@ -191,7 +197,7 @@ class Odometry:
             raise frame or FrameError("the first frame could not be read")
         if isinstance(frame, Frame):
             frame = frame.at(timestamp)
-        start = time.perf_counter()
+        stopwatch = Stopwatch()
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
         usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
@@ -226,7 +232,7 @@ class Odometry:
         self.progress, self.candidates = after, outcome.candidates
         if before.last_index == 0:
             return None
-        milliseconds = (time.perf_counter() - start) * 1e3
+        milliseconds = stopwatch.seconds * 1e3
         return Step(
             before.last_index,
             reference_timestamp,

@@ -26,6 +26,7 @@ from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_se
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
+from gavo_jax.waits import Stopwatch
 
 if TYPE_CHECKING:
     from gavo_jax.scene_map import SceneMap
@@ -107,12 +108,12 @@ def run_odometry(
     odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
     compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []
-    start = time.perf_counter()
+    stopwatch = Stopwatch()
     for step in track(sequence, odometry=odometry, watch=mapper.watch if mapper else unwatched):
         steps.append(step)
         if on_step is not None:
             on_step(step)
-    seconds = time.perf_counter() - start
+    seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     outcome = conclude(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)
     metrics: Any = {
@@ -155,7 +156,7 @@ def conclude(
         steps: Of the run, as they came.
         ground_truth: The truth, or None.
         mapper: What kept the run's map: it is finished here.
-        seconds: Wall time of the tracking, decoding included.
+        seconds: Wall time of the tracking, decoding included, compilation left out.
         compile_seconds: Time of the compilation.
         frames: How many were tracked in that time, where it was not all: the run was resumed.
     """

@@ -39,10 +39,14 @@ def tell(line: str) -> None:
 
 
 class PairProgress:
-    """A bar that counts pairs; it says `compiling …` until the first one is done."""
+    """A bar that counts pairs; it says `compiling …` until the first one is done, and whenever that is so again."""
 
     def __init__(self, progress: Progress, task: TaskID, label: str) -> None:
         self._progress, self._task, self._label = progress, task, label
+
+    def compiling(self) -> None:
+        """Say that a program is compiled, until the next pair is done."""
+        self._progress.update(self._task, description=_compiling(self._label))
 
     def advance(self, pairs: int = 1) -> None:
         """Count a pair, or several."""
@@ -67,7 +71,11 @@ def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgres
     )
     label = printable(label)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        yield PairProgress(progress, progress.add_task(f"{label}: compiling …", total=pairs, completed=done), label)
+        yield PairProgress(progress, progress.add_task(_compiling(label), total=pairs, completed=done), label)
+
+
+def _compiling(label: str) -> str:
+    return f"{label}: compiling …"
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """A sequence through a driver under the eyes of a user, who may stop it with Ctrl-C."""
 
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import pair_progress, tell
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
+from gavo_jax.waits import Stopwatch, told_of_waits
 
 
 class Tracked(NamedTuple):
@@ -24,7 +24,7 @@ class Tracked(NamedTuple):
     """As `Metrics` names them."""
     interrupted: bool
     seconds: float
-    """Wall time after compilation, decoding included."""
+    """Wall time, decoding included, compilation left out."""
     compile_seconds: float
 
 
@@ -54,18 +54,19 @@ def track_visibly(
         compile_seconds = interruptible(odometry.warm_up)
         if mapper is not None:
             compile_seconds += interruptible(mapper.warm_up)
-        start = time.perf_counter()
+        stopwatch = Stopwatch()
         try:
-            for step in track(sequence, odometry=odometry, watch=watch):
-                if on_step is not None:
-                    on_step(step)
-                steps.append(step)
-                bar.advance()
+            with told_of_waits(bar.compiling):
+                for step in track(sequence, odometry=odometry, watch=watch):
+                    if on_step is not None:
+                        on_step(step)
+                    steps.append(step)
+                    bar.advance()
         except KeyboardInterrupt:
             if not steps:
                 raise
             interrupted = True
-        seconds = time.perf_counter() - start
+        seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     if interrupted:
         tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
     first, truth = float(sequence.timestamps[0]), sequence.ground_truth
