@@ -15,8 +15,12 @@ seeds:
 Then one row per method over all clips and over all rooms, whose clean drift is near nothing: their ratios are large.
 Dashes stand where a method knows no bodies.
 
+With `--bodies told` methods are told where the bodies are: depth is taken away there, a few pixels about them included,
+and nothing else is looked for. That is what finding them perfectly would give, from the frames before and after alone.
+
     python benchmarks/moving.py
     python benchmarks/moving.py --methods ga:fast,gauss-newton --bodies track --seeds 1 --json moving.json
+    python benchmarks/moving.py --rooms '' --methods ga:fast --bodies told
 
 On 2 cores the defaults take about half an hour.
 """
@@ -33,6 +37,7 @@ import numpy as np
 from moving_clips import LOOKS, CardClip
 
 from gavo_jax.bodies.records import Body
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.bodies_truth import WithBodies
 from gavo_jax.datasets.moving import body_of_part
@@ -54,6 +59,8 @@ EXACT = (0.008, 0.6)
 """and one that is nearer than this is exact: a body that moves by 30 cm/s takes the camera along by 10 mm a frame."""
 LEAST_SHARE = 0.01
 """Of the image: less of a body than this need not be found."""
+TOLD, ABOUT = "told", 4
+"""Mode in which bodies are taken out of the depth images, and pixels about them that are as well."""
 ROOM = "room"
 """Name of the rendered sequences; each seed has its own."""
 PEER_NAMES = ("opencv-rgbd", "opencv-depth", "open3d-color", "open3d-hybrid")
@@ -101,7 +108,7 @@ class Score:
 
 
 def with_bodies(settings: Settings, mode: str | None) -> Settings:
-    """Settings that treat bodies by a mode; None leaves them as they are.
+    """Settings that treat bodies by a mode, those that are told by none; None leaves them as they are.
 
     Raises:
         GavoError: these settings know no such thing.
@@ -111,8 +118,31 @@ def with_bodies(settings: Settings, mode: str | None) -> Settings:
     for part in ("odometry", "alignment"):
         options = getattr(settings, part)
         if hasattr(options, "bodies"):
-            return replace(settings, **{part: replace(options, bodies=mode)})
+            return replace(settings, **{part: replace(options, bodies="off" if mode == TOLD else mode)})
     raise GavoError("--bodies: the settings know no bodies")
+
+
+@dataclass(eq=False)
+class Told:
+    """A sequence without depth where its bodies are.
+
+    Attributes:
+        whole: the sequence with them.
+    """
+
+    whole: Any
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.whole, name)
+
+    def __len__(self) -> int:
+        return len(self.whole)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self.whole[index]
+        bodies = (self.whole.part_labels(index) > 0).astype(np.uint8)
+        about = cv2.dilate(bodies, np.ones((2 * ABOUT + 1, 2 * ABOUT + 1), np.uint8)) > 0
+        return replace(frame, depth=np.where(about, 0, frame.depth).astype(frame.depth.dtype))
 
 
 def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]:
@@ -267,8 +297,14 @@ def drift(trajectory: Trajectory, truth: Trajectory) -> float:
         return np.inf
 
 
-def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[Score]:
-    """Run every method on every case, and on its clean clip: once a seed, a peer once where that is the same clip."""
+def measure(chosen: Iterator[Case], contenders: list[common.Contender], told: bool = False) -> list[Score]:
+    """Run every method on every case, and on its clean clip: once a seed, a peer once where that is the same clip.
+
+    Args:
+        chosen: The cases.
+        contenders: The methods.
+        told: Whether these are told where the bodies are.
+    """
     clean: dict[tuple[str, str, int], float] = {}
     scores = []
     for case in chosen:
@@ -279,7 +315,8 @@ def measure(chosen: Iterator[Case], contenders: list[common.Contender]) -> list[
             if key not in clean:
                 clean[key] = drift(run(label, case.clean, contender, seed), case.clean.ground_truth)  # pyright: ignore[reportArgumentType]
             score = Score(case.clip, case.body, contender.name, case.seed, np.nan, clean[key])
-            trajectory = run(f"{label}, {case.body}", case.sequence, contender, seed, score)
+            sequence = Told(case.sequence) if told else case.sequence
+            trajectory = run(f"{label}, {case.body}", sequence, contender, seed, score)
             score.drift = drift(trajectory, case.sequence.ground_truth)
             whole = Trajectory(trajectory.timestamps, trajectory.world_T_camera)
             score.drift_across = drift(whole, case.sequence.ground_truth)
@@ -422,7 +459,8 @@ def main(
         shares: of the image that the card covers, median over the frames.
         rooms: numbers of bodies in the rendered room; none where empty.
         methods: METHOD, METHOD:PRESET or names of peers, with commas between.
-        bodies: how our own methods treat bodies: off, mask or track; their settings' own choice if left out.
+        bodies: how our own methods treat bodies: off, mask or track; their settings' own choice if left out. With told
+            all methods are told where they are.
         seeds: runs of each, each with a card, or a room, of its own.
         frames: of each clip, the first ones.
         json: file for the figures.
@@ -433,7 +471,7 @@ def main(
         else common.parse_methods(name)[0]
         for name in common.names(methods)
     ]
-    scores = measure(cases(clips, shares, rooms, seeds, frames), contenders)
+    scores = measure(cases(clips, shares, rooms, seeds, frames), contenders, told=bodies == TOLD)
     if not scores:
         raise GavoError("nothing to measure: no clips and no rooms, or no methods")
     parts = [summarise(group[0].clip, group[0].body, group) for group in groups(scores, "clip", "body", "method")]
