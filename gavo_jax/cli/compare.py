@@ -260,8 +260,8 @@ def _shown(metrics: dict[str, Any], key: str) -> float | None:
     """A figure as the table has it: errors per frame only where there is no drift over a second, segments only where
     there are several.
     """
-    is_told = metrics[DRIFT] is not None if key == DRIFT_PER_FRAME else key == "segments" and metrics[key] == 1
-    return None if is_told else metrics[key]
+    is_left_out = metrics[DRIFT] is not None if key == DRIFT_PER_FRAME else key == "segments" and metrics[key] == 1
+    return None if is_left_out else metrics[key]
 
 
 def _versions(entries: list[Entry]) -> dict[str, str]:
