@@ -29,7 +29,7 @@ from gavo_jax.camera_files import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import PlainFolder, SevenScenes
+from gavo_jax.datasets.folders import PlainFolder, ScanNet, SevenScenes
 from gavo_jax.datasets.registry import open_source, recognise, register_dataset
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
@@ -495,6 +495,31 @@ def test_an_info_of_a_scan_has_the_cameras(folder):
             open_source(folder)
 
 
+def test_an_info_of_a_scan_may_lie_one_folder_up(folder):
+    """As 12-Scenes has it; another file of the name says nothing."""
+    (folder / "data").mkdir()
+    wrote(folder / "data", "seven_scenes")
+    (folder / "data/camera-intrinsics.txt").unlink()
+    (folder / "info.txt").write_text(sens(CAMERA, dataclasses.replace(CAMERA, fx=140.0)))
+    sequence = open_source(folder / "data")
+    assert isinstance(sequence, SevenScenes) and sequence.calibration.depth is not None
+    assert (sequence.camera.fx, sequence.calibration.depth.fx) == (131, 140)
+    (folder / "info.txt").write_text("taken in the kitchen\n")
+    with pytest.raises(GavoError, match="the camera's images are 640x480"):
+        open_part(str(folder / "data"))
+
+
+@pytest.mark.parametrize("name", ["intrinsics", "intrinsic"])
+def test_frames_that_scannet_exports_have_their_cameras_beside_them(folder, name):
+    wrote(folder, "scannet")
+    for camera in ("color", "depth"):
+        (folder / f"intrinsic/intrinsic_{camera}.txt").rename(folder / f"{name}_{camera}.txt")
+    (folder / f"{name}_depth.txt").write_text("130 0 79.5 0\n0 130 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    sequence = open_source(folder)
+    assert isinstance(sequence, ScanNet) and sequence.ground_truth is not None
+    assert sequence.calibration.depth is not None and sequence.calibration.depth.fx == 130
+
+
 def test_the_folders_name_may_say_the_camera(tmp_path):
     """A benchmark's images without its lists."""
     for i in range(2):
@@ -709,6 +734,28 @@ def test_a_camera_file_is_found_by_any_of_its_usual_names(folder, name):
     (folder / name).write_text(json.dumps({"K": MATRIX.tolist(), "width": 160, "height": 120}))
     sequence = open_source(folder)
     assert sequence.camera.fx == 131 and sequence.calibration.origin.endswith(name)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("up", ["", "../"])
+@pytest.mark.parametrize("name", ["camera_intrinsics.txt", "intrinsics_color.txt", "intrinsic/intrinsic_color.txt"])
+def test_a_camera_of_colour_is_found_and_that_of_depth_has_to_agree(folder, name, up):
+    (folder / "scene").mkdir()
+    wrote(folder / "scene", "plain")
+    (folder / "scene/camera.yaml").unlink()
+    file = folder / "scene" / up / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("131 0 79.5 0\n0 131 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    assert open_source(folder / "scene").camera.fx == 131
+    if "color" not in name:
+        return
+    depth = file.with_name(file.name.replace("color", "depth"))
+    depth.write_text(file.read_text())
+    assert open_source(folder / "scene").camera.fx == 131
+    depth.write_text("140 0 79.5 0\n0 140 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    with pytest.raises(
+        GavoError, match=r"_color\.txt: intrinsics?_depth\.txt beside it is of another camera: say --cam"
+    ):
+        open_source(folder / "scene")
 
 
 def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):
