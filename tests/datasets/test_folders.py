@@ -123,6 +123,7 @@ def test_other_folders_do_not_go_before_depth(folder, name):
         *[("rgb", name) for name in ("depth_raw", "depth_images", "aligned_depth_to_color", "depth_rect")],
         ("livingroom1-color", "livingroom1-depth-clean"),
         ("office_color", "office_depth"),
+        *[("rgb_front", "depth_front"), ("front_rgb", "front_depth"), ("Colour0", "Depth0")],
     ],
 )
 def test_folders_of_images_have_many_names(folder, color, depth):
@@ -141,6 +142,9 @@ def test_of_two_scenes_in_one_folder_none_is_taken(folder):
     (folder / "depth").rename(folder / "a-depth")
     with pytest.raises(GavoError, match="not one of"):
         open_source(folder)
+    (folder / "b-depth").rename(folder / "c-depth")
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder) and sequence.entries[0].color.parent.name == "a-color"
 
 
 @pytest.mark.parametrize("name", ["oak_depthai_{}_{:04}", "indepth_{1:04}_{0}", "{}_{:04}", "scene{}{:04}"])

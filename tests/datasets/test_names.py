@@ -63,6 +63,11 @@ STAMPS = {
         f"{int(7.9 + time)}_{int((7.9 + time) % 1 * 1e9):09}" for time in TIMES
     ],
     "over a minute": ["20240501T123059,900", "20240501T123059,933", "20240501T123059,967", "20240501T123100,000"],
+    "time of day": ["12_30_05_900", "12_30_05_934", "12_30_05_967", "12_30_06_000"],
+    "time of day before a word": [f"cam1-09:59:59.{part}_rgb" for part in (900, 934, 967)] + ["cam1-10:00:00.000_rgb"],
+    "time of day in one number": ["123059900", "123059934", "123059967", "123100000"],
+    "a comma before four places": [f"{CLOCK + time:.4f}".replace(".", ",") for time in TIMES],
+    "a comma before three, since switched on": [f"rgb_{7.9 + time:.3f}".replace(".", ",") for time in TIMES],
 }
 
 
@@ -118,7 +123,10 @@ def test_a_frame_that_is_missing_changes_no_unit():
         [f"2024-01-01_12-00-00-{100 + 10 * i:03}_color" for i in range(20)],
         [f"{i // 10}_{i:06}" for i in range(30)],
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
+        [f"00_00_{i // 100:02}_{10 * (i % 100):03}" for i in range(150)],
+        ["23_59_59_900", "23_59_59_934", "23_59_59_967", "00_00_00_000"],
         ["20249901123059", "20249901123060"],
+        [],
         ["a", "b"],
         [f"9{i:017}" for i in range(4)],
         [f"9{i:030}" for i in range(4)],
