@@ -94,8 +94,19 @@ class Recorder:
         array = np.frombuffer(data, np.uint8)
         self.write(topic, "CompressedImage", stamp, header=self.header(stamp), format=form, data=array)
 
-    def info(self, topic: str, stamp: float, camera: Camera, model: str = "plumb_bob", frame: str = "camera") -> None:
-        region = self.store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    def info(
+        self,
+        topic: str,
+        stamp: float,
+        camera: Camera,
+        model: str = "plumb_bob",
+        frame: str = "camera",
+        roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+        binning: int = 0,
+    ) -> None:
+        """A region begins at x, y and has a width and height."""
+        x, y, width, height = roi
+        region = self.store.types["sensor_msgs/msg/RegionOfInterest"](x, y, height, width, False)
         matrix = np.hstack([camera.matrix, np.zeros((3, 1))])
         names = ("D", "K", "R", "P") if self.is_1 else ("d", "k", "r", "p")
         values = (np.array(camera.distortion), camera.matrix.ravel(), np.eye(3).ravel(), matrix.ravel())
@@ -107,8 +118,8 @@ class Recorder:
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning,
+            binning_y=binning,
             roi=region,
             **dict(zip(names, values, strict=True)),
         )

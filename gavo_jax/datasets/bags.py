@@ -29,10 +29,12 @@ from gavo_jax.datasets.messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
+    as_taken,
     camera_table,
     color_of,
     depth_of,
     is_calibrated,
+    is_depth,
 )
 from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
 from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
@@ -205,9 +207,7 @@ class BagSequence:
 
     def _size(self) -> Size:
         """Width and height of the first colour image."""
-        color = self._topics[0]
-        height, width = color_of(color.kind, self._bag.first(color.name), color.name).shape[:2]
-        return width, height
+        return self._bag.size(self._topics[0].name)
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
@@ -348,6 +348,15 @@ class _Bag:
             messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
             return next(filter(is_good, messages), None)
 
+    def size(self, name: str) -> Size:
+        """Width and height of the first image of a topic."""
+        kind, message = self.kinds[name], self.first(name)
+        if kind == IMAGE:
+            return int(message.width), int(message.height)  # pyright: ignore[reportOptionalMemberAccess]
+        read = depth_of if is_depth(kind, message, name) else color_of
+        height, width = read(kind, message, name).shape[:2]
+        return width, height
+
     def choose(self, reading: Reading) -> tuple[str, str]:
         """The topics of colour and depth, those that are named or those that messages and names speak for."""
         images = {}
@@ -432,7 +441,8 @@ class _Bag:
         if not is_calibrated(info):
             raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
         with blamed(place):
-            return camera_from_table(place, camera_table(info, _is_rectified(topic)), MILLIMETRES)
+            table = as_taken(place, camera_table(info, _is_rectified(topic)), info, partial(self.size, topic))
+            return camera_from_table(place, table, MILLIMETRES)
 
 
 class _File(io.BufferedReader):

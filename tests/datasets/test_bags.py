@@ -216,6 +216,44 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
 
 
+@pytest.mark.parametrize(
+    ("whole", "roi", "binning", "expected"),
+    [
+        (replace(CAMERA, fx=262.0, fy=264.0, cx=159.5, cy=119.5, width=320, height=240), (0, 0, 0, 0), 2, (131, 79.5)),
+        (replace(CAMERA, cx=159.5, cy=119.5, width=320, height=240), (80, 60, 160, 120), 1, (131, 79.5)),
+        (
+            replace(CAMERA, fx=262.0, cx=319.5, cy=239.5, width=640, height=480),
+            *((160, 120, 320, 240), 2, (131, 79.5)),
+        ),
+        (CAMERA, (0, 0, 160, 120), 0, (131, 79.5)),
+        (CAMERA, (0, 0, 0, 0), 2, (131, 79.5)),
+    ],
+)
+def test_a_camera_info_of_the_whole_sensor_becomes_that_of_the_images(tmp_path, whole, roi, binning, expected):
+    recorder = Recorder(tmp_path / "part", "mcap")
+    recorder.image(COLOR, 1.0, BGRS[0], "bgr8")
+    recorder.image(DEPTH, 1.0, MILLIMETRES[0], "16UC1")
+    for topic in (COLOR, DEPTH):
+        recorder.info(topic.replace("image_raw", "camera_info"), 1.0, whole, roi=roi, binning=binning)
+    recorder.close()
+    sequence = open_source(tmp_path / "part")
+    camera = sequence.camera
+    assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (*expected, 59.5, 160, 120)
+    assert isinstance(sequence, BagSequence) and sequence.calibration.depth is None and sequence[0].depth.any()
+
+
+def test_a_region_of_the_size_of_the_whole_is_refused(tmp_path):
+    recorder = Recorder(tmp_path / "part", "mcap")
+    recorder.image(COLOR, 1.0, BGRS[0], "bgr8")
+    recorder.image(DEPTH, 1.0, MILLIMETRES[0], "16UC1")
+    recorder.info(COLOR.replace("image_raw", "camera_info"), 1.0, CAMERA, roi=(0, 60, 160, 120))
+    recorder.close()
+    with pytest.raises(
+        GavoError, match=r"camera_info: a region \(roi\) that begins at 0 60, and images of .* 160x120: "
+    ):
+        open_source(tmp_path / "part")
+
+
 def with_topics(path: Path, frames: dict[str, str], infos: bool = True) -> Path:
     """A recording of topics, each in its frame, with depth where the name's last words say so and a camera_info."""
     recorder = Recorder(path, "mcap")
