@@ -124,7 +124,12 @@ class Recorder:
             **dict(zip(names, values, strict=True)),
         )
 
-    def fixed(self, stamp: float, frames: dict[tuple[str, str], tuple[list[float], list[float]]]) -> None:
+    def fixed(
+        self,
+        stamp: float,
+        frames: dict[tuple[str, str], tuple[list[float], list[float]]],
+        topic: str = "/tf_static",
+    ) -> None:
         """Transforms by parent and child: shift and quaternion (x, y, z, w)."""
         types, entries = self.store.types, []
         for (parent, child), (shift, turn) in frames.items():
@@ -133,7 +138,7 @@ class Recorder:
             )
             kind = types["geometry_msgs/msg/TransformStamped"]
             entries.append(kind(header=self.header(stamp, parent), child_frame_id=child, transform=transform))
-        self.write("/tf_static", "TFMessage", stamp, "tf2_msgs", transforms=entries)
+        self.write(topic, "TFMessage", stamp, "tf2_msgs", transforms=entries)
 
     def close(self) -> None:
         self.writer.close()

@@ -216,6 +216,47 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
 
 
+def with_transforms(path: Path, topic: str, transforms: list[tuple[list[float], list[float]]]) -> BagSequence:
+    """A recording of colour and of depth of another camera, whose place in colour's frame is said again and again."""
+    recorder = Recorder(path, "mcap")
+    for i, transform in enumerate(transforms):
+        stamp = 1 + i / 10
+        recorder.image("/cam/color/image_raw", stamp, GREYS[0], "mono8")
+        recorder.info("/cam/color/camera_info", stamp, CAMERA, frame="color")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/cam/depth/camera_info", stamp, replace(CAMERA, fx=120.0), frame="depth")
+        recorder.fixed(stamp, {("color", "depth"): transform, ("map", "color"): ([i, 0, 0], [0, 0, 0, 1])}, topic)
+    recorder.close()
+    sequence = open_source(path)
+    assert isinstance(sequence, BagSequence)
+    return sequence
+
+
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+def test_transforms_that_never_change_are_fixed_wherever_they_stand(tmp_path, topic):
+    sequence = with_transforms(tmp_path / "still", topic, [([0.02, 0.0, 0.0], UPRIGHT)] * 3)
+    moved = sequence.calibration.color_T_depth
+    assert moved is not None and moved[0, 3] == 0.02 and sequence.calibration.origin.endswith(topic)
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [([0.02, 0.0, 0.0], UPRIGHT), ([0.03, 0.0, 0.0], UPRIGHT), ([0.02, 0.0, 0.0], UPRIGHT)],
+        [([0.02, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0])] * 2,
+        [([0.02, 0.0, 0.0], [0.0, 0.0, np.nan, 1.0])] * 2,
+        [([np.nan, 0.0, 0.0], UPRIGHT)] * 2,
+    ],
+)
+def test_transforms_that_change_or_are_none_say_nothing(tmp_path, topic, transforms):
+    with pytest.raises(GavoError, match="and /tf_static does not say how they lie, nor does /tf without a change: say"):
+        with_transforms(tmp_path / "none", topic, transforms)
+
+
 @pytest.mark.parametrize(
     ("whole", "roi", "binning", "expected"),
     [
