@@ -671,6 +671,8 @@ TENTHS = [1 + number / 10 for number in range(20)]
         (TENTHS + [1.06, 1.16] + TENTHS[:5], range(20), 1.8, 21),
         (TENTHS[:5] + [99.0] + TENTHS[6:], [*range(5), *range(6, 20)], 97.4, 7),
         (TENTHS[:9] + [1.0] + TENTHS[10:], [*range(9), *range(10, 20)], 0.8, 10),
+        (TENTHS + [stamp + 1.55 for stamp in TENTHS[:15]], range(20), 0.4, 21),
+        (TENTHS[:8] + [stamp + 0.43 for stamp in TENTHS], range(8, 28), 0.3, 9),
     ],
 )
 def test_of_a_clock_that_is_set_back_one_run_is_used(tmp_path, kind, stamps, kept, back, at):
@@ -687,6 +689,18 @@ def test_messages_that_arrive_out_of_order_are_sorted(tmp_path):
     sequence = of_stamps(tmp_path / "late", "mcap", stamps)
     assert sequence.left_out == [] and sequence.topics == (COLOR, DEPTH)
     assert summary(sequence).startswith(f"late: ROS bag of {COLOR} and {DEPTH}, 20 frames of 16x12; camera fx")
+    np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "late", [[(5, 6), (6, 5)], [(5, 9), (6, 5), (7, 6), (8, 7), (9, 8)], [(5, 8), (6, 9), (8, 5), (9, 6)]]
+)
+def test_messages_that_come_late_set_no_clock_back(tmp_path, late):
+    stamps = list(TENTHS)
+    for place, number in late:
+        stamps[place] = TENTHS[number]
+    sequence = of_stamps(tmp_path / "late", "mcap", stamps)
+    assert sequence.left_out == []
     np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
 
 
