@@ -42,6 +42,9 @@ class DepthUnit(NamedTuple):
     """In the files."""
     frame: float
     """In frames: their camera's `depth_scale`."""
+    of_floats: bool | None = None
+    """Whether this is the unit of fractions, or of whole numbers, alone; None where it is of both, as somebody said, or
+    where nothing tells."""
 
 
 def recorded_as(sequence: Any) -> dict[str, Any]:
@@ -80,10 +83,9 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
-    whole = [image.name for image in samples if image.raw.dtype == np.uint16 and image.raw.any()]
-    if whole and given is None:
-        other = next(image.name for image in samples if image.raw.dtype != np.uint16)
-        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {other}: say --depth-scale, of both")
+    whole, floats = ([image.name for image in samples if _is_of_floats(image.raw) is kind] for kind in (False, True))
+    if whole and floats and given is None:
+        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     median = float(np.median(readings)) if readings.size else METRES
     file = given or _likely_unit(median, calibration)
@@ -93,7 +95,15 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
             "units per metre"
         )
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
-    return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE)
+    return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE, True if floats and given is None else None)
+
+
+def _is_of_floats(raw: np.ndarray) -> bool | None:
+    """Whether depth is in fractions; None where it has no reading. Whole numbers beyond 16 bits come as floats, too."""
+    readings = without_invalid(raw)
+    if not readings.any():
+        return None
+    return readings.dtype != np.uint16 and bool((readings % 1).any())
 
 
 def _likely_unit(median: float, calibration: Calibration) -> float | None:
@@ -184,6 +194,13 @@ class FrameAssembler:
         return np.where(self._with_grey, moved, np.uint16(0)) if self.undistort else moved
 
     def _in_frame_units(self, depth: DepthImage) -> UInt16[np.ndarray, "h w"]:
+        of_floats, is_float = self.unit.of_floats, depth.raw.dtype != np.uint16
+        if of_floats is not None and of_floats != is_float and _is_of_floats(depth.raw) is is_float:
+            kinds = ("whole numbers", "floats")
+            raise FrameError(
+                f"{depth.name}: depth in {kinds[is_float]}, and in {kinds[of_floats]} in the images that were "
+                "looked at first: say --depth-scale, of both"
+            )
         if depth.raw.dtype != np.uint16:
             farthest = NO_READING / self.unit.frame
             if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MUCH:

@@ -238,7 +238,7 @@ class _Shared:
             scale = calibration.color.depth_scale
             if calibration.preset is not None and reading.depth_scale is None:
                 scale = _scale_of_integers(depths, calibration)
-            unit = DepthUnit(scale, scale)
+            unit = DepthUnit(scale, scale, False if reading.depth_scale is None else None)
         return FrameAssembler(calibration, unit, common_white(colors), reading.color, reading.undistort)
 
 

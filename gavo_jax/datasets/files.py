@@ -365,7 +365,7 @@ class _Images:
         if self._scale_is_open and not self._calibration.states_depth_scale:
             sample = sample_depth([depth.raw for depth in depths])
             scale = sample and better_scale(sample, scale, self._calibration.color) or scale
-        unit = DepthUnit(scale, scale)
+        unit = DepthUnit(scale, scale, False if self._reading.depth_scale is None else None)
         if any(depth.raw.dtype != np.uint16 for depth in depths):
             unit = float_unit(depths, self._calibration, self._reading.depth_scale)
         return FrameAssembler(
