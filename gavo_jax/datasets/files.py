@@ -115,9 +115,11 @@ class FileSequence:
         ground_truth: the true trajectory, or None.
         entries: files of each frame, in the order of their stamps.
         calibration: the cameras as they record.
+        times_guessed: what the frames' times are taken from, where that is a guess; else empty.
     """
 
     kind: ClassVar[str] = "image files"
+    times_guessed: str = ""
     scale_is_open: ClassVar[bool] = False
     """Whether the kind of source leaves the unit of depth open: what depth looks like decides, if nobody says it."""
 

@@ -37,6 +37,9 @@ from gavo_jax.trajectory import Trajectory, inverse
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
+NUMBERS = "names are numbers"
+"""Of which frames per second are a guess."""
+
 
 class NumberedFolder(FileSequence):
     """Frames of which colour and depth have the same number; their time is that number over the rate."""
@@ -110,7 +113,9 @@ class NumberedFolder(FileSequence):
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
             truth = _trajectory(cls.poses(path), {number: times[number] for number in numbers}, posed_T_color)
-        return cls(root.name, entries, calibration, truth, reading, left_out)
+        sequence = cls(root.name, entries, calibration, truth, reading, left_out)
+        sequence.times_guessed = "" if is_stamped or reading.rate else NUMBERS
+        return sequence
 
 
 def _trajectory(
@@ -263,6 +268,8 @@ class PlainFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of colour and depth images"
     scale_is_open: ClassVar[bool] = True
+    has_clock: ClassVar[bool] = False
+    """Whether a file says when the frames were taken."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -297,7 +304,10 @@ class PlainFolder(FileSequence):
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth)
-        return cls(root.name, paired.entries, calibration, truth, reading, left_out)
+        sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
+        is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
+        sequence.times_guessed = NUMBERS if is_open else paired.guessed
+        return sequence
 
     @classmethod
     def clock(cls, path: Path, reading: Reading) -> Seconds:

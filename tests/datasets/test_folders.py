@@ -33,6 +33,7 @@ from gavo_jax.datasets.folders import PlainFolder, ScanNet, SevenScenes
 from gavo_jax.datasets.registry import open_source, recognise, register_dataset
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import summary
 
 
 @pytest.fixture
@@ -307,6 +308,24 @@ def test_many_names_of_another_form_are_refused(folder):
     names = [f"{'ab'[i > 5]}_{1305031102175 + 33 * i}" for i in range(12)]
     with pytest.raises(GavoError, match=r"a_\d+\.png: its name is a time, and b_\d+\.png has another form, as 6 of 12"):
         stamped(folder, names, names)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ((0, 12, 25, 37), " at 83.33 frames/s (names taken for milliseconds)"),
+        ((0, 33333, 66667, 100000), " at 30 frames/s (names taken for microseconds)"),
+        ((0, 10, 20, 30), " at 3 frames/s (names are numbers)"),
+        (("1700000000123", "1700000000156", "1700000000190", "1700000000223"), ""),
+    ],
+)
+def test_a_rate_that_is_a_guess_is_told(folder, numbers, words):
+    """Every so many frames, picked evenly, have names that may be milliseconds."""
+    for number in numbers:
+        image(folder / f"rgb/{number}.png", GREYS[0])
+        image(folder / f"depth/{number}.png", raw(METRES[0], 1000))
+    assert f", 4 frames of 160x120{words}; camera" in summary(open_source(folder, Reading(camera=CAMERA)))
+    assert "(" not in summary(open_source(folder, Reading(camera=CAMERA, rate=25.0))).partition("; camera")[0]
 
 
 def test_kinds_of_two_rates_count_the_same(folder):
