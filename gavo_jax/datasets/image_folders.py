@@ -33,9 +33,9 @@ PAIR = re.compile(r"(.*)(?<![a-z])(?:colou?r|rgb)(?![a-z])(.*)")
 DEPTH_WORD = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
 """In the names of depth images that lie beside colour, as a part of its own, where some have it so."""
 
-COLOR_WORDS = ("colou?r|rgb", "image|frame|img", r"^\d+\.")
+COLOR_WORDS = ("colou?r|rgb", "image|frame|img", "left", r"^\d+\.")
 """In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
-say nothing."""
+say nothing. Of a stereo camera depth is that of the left image."""
 
 
 def _is_registered(name: str) -> bool:

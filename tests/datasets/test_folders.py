@@ -366,6 +366,15 @@ def test_colour_is_what_is_named_so(folder):
     np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
 
 
+def test_colour_beside_depth_of_a_stereo_camera_is_left(folder):
+    """As ZED's export names both."""
+    for i in range(2):
+        image(folder / f"left{i:06}.png", GREYS[i])
+        image(folder / f"right{i:06}.png", GREYS[3])
+        image(folder / f"depth{i:06}.png", raw(METRES[i], 1000))
+    np.testing.assert_array_equal(open_source(folder, Reading(camera=CAMERA))[1].grey, GREYS[1])
+
+
 def test_colour_may_be_a_number_beside_depth(folder):
     for i in range(2):
         image(folder / f"{i:03}.jpg", GREYS[i])
