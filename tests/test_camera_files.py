@@ -386,6 +386,10 @@ FAULTS = {
         json.dumps({**REALSENSE, "fx": 0, "coeffs": [0.1] * 5}),
         "needs a focal length that is not 0",
     ),
+    "region.yaml": (
+        ros_echo(False, "plumb_bob", []).replace("---", "roi:\n  x_offset: 0\n  y_offset: 60"),
+        "roi: begins",
+    ),
     "transforms of lenses.json": (
         json.dumps({"frames": [NERF, {**NERF, "k1": 0.2}]}),
         "each frame has a camera of its",
