@@ -78,8 +78,8 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
         given: units per metre, if somebody says so.
 
     Raises:
-        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`; or some images
-            hold whole numbers, which may be in another unit.
+        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`, or were scaled to
+            the farthest; or some images hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
@@ -88,6 +88,12 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
         raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     median = float(np.median(readings)) if readings.size else METRES
+    is_open = given is None and not _states_unit(calibration)
+    if is_open and readings.size and readings.min() < readings.max() == 1:
+        raise GavoError(
+            f"{samples[0].name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "
+            "per metre: 0.1 where 1 stands for 10 m"
+        )
     file = given or _likely_unit(median, calibration)
     if file is None:
         raise GavoError(
@@ -106,9 +112,14 @@ def _is_of_floats(raw: np.ndarray) -> bool | None:
     return readings.dtype != np.uint16 and bool((readings % 1).any())
 
 
+def _states_unit(calibration: Calibration) -> bool:
+    """Whether a camera says the unit; that of a preset is of its own files."""
+    return calibration.preset is None and calibration.states_depth_scale
+
+
 def _likely_unit(median: float, calibration: Calibration) -> float | None:
     stated = calibration.color.depth_scale
-    if calibration.preset is None and calibration.states_depth_scale and _is_within(median / stated, STATED_MEDIANS):
+    if _states_unit(calibration) and _is_within(median / stated, STATED_MEDIANS):
         return stated
     if _is_within(median, METRE_MEDIANS):
         return METRES

@@ -270,6 +270,16 @@ def test_whole_numbers_beyond_16_bits_are_in_the_unit_of_the_others(tmp_path, co
         np.testing.assert_allclose(metres[1], metres[0], atol=1e-3)
 
 
+def test_floats_that_were_scaled_to_the_farthest_are_refused(tmp_path, color_file):
+    """As simulators give them, and tools that draw depth; in metres nothing was farther than one."""
+    scaled = write(tmp_path / "depth.npy", METRES / METRES.max())
+    silent = Calibration(CAMERA, states_depth_scale=False)
+    with pytest.raises(GavoError, match="depth.npy: depth of exactly 1 at most: scaled .*: say --depth-scale, units"):
+        open_pair([(color_file, scaled)], silent)[0]
+    sequence = open_pair([(color_file, scaled)], silent, Reading(depth_scale=1 / float(METRES.max())))
+    assert np.abs(sequence[0].depth / sequence.camera.depth_scale - METRES).max() < 1e-3
+
+
 def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
     frame, camera = read(color_file, write(tmp_path / "depth.npy", METRES * 8))
     assert camera.depth_scale == 1000
