@@ -31,7 +31,10 @@ DIGITS_OF_A_CLOCK = 10
 
 FEWEST = 10
 """Images of each kind, or poses and images, without a gap in their numbers, of which it is told that the two count from
-different ones."""
+different ones, or different ones."""
+
+RATES = (2, 3, 4, 5, 6)
+"""How many images of one kind may come for each of the other, where both are of all that their cameras took."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
@@ -114,13 +117,17 @@ def _check_start(found: Found) -> None:
     """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others.
 
     Whether one number or one place in the order is one frame is open then. Of a camera that started, or stopped, later
-    than the other one, the other ends are alike.
+    than the other one, the other ends are alike. But where there are twice as many of one kind, or three times, both
+    may be of the whole clip.
     """
     color, depth, _ = found
-    if min(len(color), len(depth)) < FEWEST:
+    few, many = sorted(map(len, (color, depth)))
+    if few < FEWEST:
         return
     (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
-    if a != c and b != d and b - a + 1 == len(color) and d - c + 1 == len(depth):
+    are_whole = b - a + 1 == len(color) and d - c + 1 == len(depth)
+    are_of_two_rates = a == c and any(abs(many - few * rate) <= rate for rate in RATES)
+    if are_whole and (a != c and b != d or are_of_two_rates):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
             "number, or leave those without a partner out"

@@ -237,6 +237,22 @@ def test_colour_and_depth_that_count_from_other_numbers_are_refused(first, refus
     assert by_number(color[:9], depth) and by_number(color[:5] + color[6:], depth)
 
 
+@pytest.mark.parametrize(
+    ("fewer", "refused"), [(30, True), (29, True), (31, True), (20, True), (40, False), (59, False)]
+)
+def test_twice_as_many_images_of_one_kind_may_be_of_two_rates(fewer, refused):
+    """A film's frames beside depth that was taken at half its rate: equal numbers are of other moments."""
+    many, few = (paths(*(f"{i:03}.png" for i in range(count))) for count in (60, fewer))
+    for color, depth in ((many, few), (few, many)):
+        if not refused:
+            assert len(by_number(color, depth).color.keys() & by_number(color, depth).depth.keys()) == fewer
+            continue
+        with pytest.raises(
+            GavoError, match=r"colour images are 0 to \d+, depth images 0 to \d+: give those of one frame"
+        ):
+            by_number(color, depth)
+
+
 def test_hidden_files_and_others_are_no_images():
     files = paths("._1.png", ".hidden.png", "Thumbs.db", "2.PNG", "1.png")
     assert images_among(files, (".png",)) == paths("1.png", "2.PNG")
