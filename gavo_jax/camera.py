@@ -19,6 +19,9 @@ MIN_SIDE, MAX_SIDE = 16, 8192
 RIM = 4
 """Depth that comes from within this many pixels of the raw image's border is dropped by undistortion."""
 
+OFF_AXIS = 10.0, 10001
+"""Up to where, as x / z, a lens is looked at, 84 degrees; and at how many places."""
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -111,6 +114,14 @@ class Camera:
         x, y = to_ray(self, pixels[..., 0], pixels[..., 1])
         return _stack(x * depth, y * depth, depth)
 
+    @property
+    def reach(self) -> float:
+        """How far off its axis, as x / z, the lens shows what it sees once; infinite where nothing ends that.
+
+        Beyond, the polynomial turns back: rays from there have the pixels of others, within the image.
+        """
+        return _reach(self.distortion, self.model)
+
     def rectified(self) -> "Camera":
         """Return the camera of undistorted images: the same intrinsics, no distortion."""
         return replace(self, distortion=(0.0,) * 5, model="pinhole")
@@ -137,7 +148,8 @@ class Camera:
         return cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistort_depth(self, depth: UInt16[np.ndarray, "height width"]) -> np.ndarray:
-        """Undistort raw depth, nearest (never mixed across an edge); 0 where its source lies outside or within `RIM`.
+        """Undistort raw depth, nearest (never mixed across an edge); 0 where its source lies outside, within `RIM`,
+        or beyond the lens's `reach`.
 
         Raises:
             ValueError: the depth is not of the camera's size.
@@ -243,6 +255,21 @@ def _stack(*arrays: Any) -> Any:
 
 
 @lru_cache(maxsize=8)
+def _reach(distortion: tuple[float, ...], model: str) -> float:
+    """`Camera.reach`: where the radius in the image stops growing, of radial terms alone."""
+    off = np.linspace(0, *OFF_AXIS)
+    if model == "fisheye":
+        angle = np.arctan(off)
+        seen = angle * np.polyval([*distortion[3::-1], 1.0], angle**2)
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = (*distortion, 0.0, 0.0, 0.0, 0.0)[:8]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = off * np.polyval([k3, k2, k1, 1.0], off**2) / np.polyval([k6, k5, k4, 1.0], off**2)
+    back = np.flatnonzero(~(np.diff(seen) > 0))
+    return float(off[back[0]]) if len(back) else float("inf")
+
+
+@lru_cache(maxsize=8)
 def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return fixed-point maps for cv2.remap: coordinates and fractions (bilinear), coordinates (nearest)."""
     matrix, distortion, size = camera.matrix, np.array(camera.distortion), (camera.width, camera.height)
@@ -250,6 +277,8 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarr
     u, v = make(matrix, distortion, np.eye(3), matrix, size, cv2.CV_32FC1)
     coordinates, fractions = cv2.convertMaps(u, v, cv2.CV_16SC2)
     inside = (u >= RIM) & (u <= camera.width - 1 - RIM) & (v >= RIM) & (v <= camera.height - 1 - RIM)
+    x, y = to_ray(camera, *np.meshgrid(np.arange(camera.width), np.arange(camera.height)))
+    inside &= np.hypot(x, y) <= camera.reach
     outside = np.float32(-1)
     nearest, _ = cv2.convertMaps(
         np.where(inside, u, outside), np.where(inside, v, outside), cv2.CV_16SC2, nninterpolation=True

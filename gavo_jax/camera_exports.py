@@ -138,6 +138,10 @@ def is_nerfstudio(values: Table) -> bool:
     return "fl_x" in values or isinstance(values.get("frames"), list)
 
 
+NERF_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
+"""Metres per unit of depth in whole numbers, as instant-ngp, NeRFCapture and nerfstudio call them."""
+
+
 def read_nerfstudio(path: Path, values: Table) -> Table:
     """Looks like NeRF's transforms."""
     if "fl_x" not in values and values["frames"]:
@@ -145,6 +149,7 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
         values = {**common_camera(str(path), own), **values}
     size = {ours: _whole(values[theirs]) for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
+    table |= next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
     model = values.get("camera_model", "OPENCV")
     if model == "OPENCV_FISHEYE":
         return {**table, **size, "model": "fisheye", "distortion": [values.get(f"k{i}", 0.0) for i in range(1, 5)]}

@@ -140,6 +140,11 @@ def _read_nested(path: Path, values: Table) -> Table:
 
 def _read_ros(path: Path, values: Table) -> Table:
     """Looks like a ROS camera_info."""
+    region = values.get("roi")
+    if isinstance(region, dict) and (region.get("x_offset") or region.get("y_offset")):
+        raise GavoError(
+            f"{path}: roi: begins within the image: write the numbers of what it cuts out, and leave it out"
+        )
     return {
         **of_matrix(str(path), numbers_of(first(values, MATRIX))),
         **beside(str(path), values),

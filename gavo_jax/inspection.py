@@ -23,12 +23,14 @@ MAX_REASONS = 5
 def summary(sequence: Sequence) -> str:
     """One line: what the source is, how many frames, which camera and where from, and what depth is counted in.
 
-    Of a recording it names the topics of colour and depth.
+    Of a recording it names the topics of colour and depth; where the rate of frames rests on a guess, it says so.
     """
     camera, source = sequence.camera, _source(sequence)
+    guess = source["times_guessed"] and f" at {_times(np.asarray(sequence.timestamps))['rate_hz'] or 0:.4g} frames/s"
+    rate = f"{guess} ({source['times_guessed']})" if guess else ""
     topics = f" of {' and '.join(source['topics'])}" if source["topics"] else ""
     return (
-        f"{sequence.name}: {source['kind']}{topics}, {len(sequence)} frames of {camera.width}x{camera.height}; "
+        f"{sequence.name}: {source['kind']}{topics}, {len(sequence)} frames of {camera.width}x{camera.height}{rate}; "
         f"camera fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({source['camera_from']}); "
         f"depth in {name_of_unit(source['depth_units_per_metre'])}"
     )
@@ -72,6 +74,7 @@ def _source(sequence: Sequence) -> Facts:
     return {
         "kind": getattr(sequence, "kind", type(sequence).__name__),
         "topics": list(getattr(sequence, "topics", ())),
+        "times_guessed": getattr(sequence, "times_guessed", ""),
         "camera_from": getattr(calibration, "origin", "the sequence"),
         "depth_units_per_metre": sequence.camera.depth_scale if unit is None else unit.file,
     }

@@ -94,8 +94,19 @@ class Recorder:
         array = np.frombuffer(data, np.uint8)
         self.write(topic, "CompressedImage", stamp, header=self.header(stamp), format=form, data=array)
 
-    def info(self, topic: str, stamp: float, camera: Camera, model: str = "plumb_bob", frame: str = "camera") -> None:
-        region = self.store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    def info(
+        self,
+        topic: str,
+        stamp: float,
+        camera: Camera,
+        model: str = "plumb_bob",
+        frame: str = "camera",
+        roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+        binning: int = 0,
+    ) -> None:
+        """A region begins at x, y and has a width and height."""
+        x, y, width, height = roi
+        region = self.store.types["sensor_msgs/msg/RegionOfInterest"](x, y, height, width, False)
         matrix = np.hstack([camera.matrix, np.zeros((3, 1))])
         names = ("D", "K", "R", "P") if self.is_1 else ("d", "k", "r", "p")
         values = (np.array(camera.distortion), camera.matrix.ravel(), np.eye(3).ravel(), matrix.ravel())
@@ -107,13 +118,18 @@ class Recorder:
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning,
+            binning_y=binning,
             roi=region,
             **dict(zip(names, values, strict=True)),
         )
 
-    def fixed(self, stamp: float, frames: dict[tuple[str, str], tuple[list[float], list[float]]]) -> None:
+    def fixed(
+        self,
+        stamp: float,
+        frames: dict[tuple[str, str], tuple[list[float], list[float]]],
+        topic: str = "/tf_static",
+    ) -> None:
         """Transforms by parent and child: shift and quaternion (x, y, z, w)."""
         types, entries = self.store.types, []
         for (parent, child), (shift, turn) in frames.items():
@@ -122,7 +138,7 @@ class Recorder:
             )
             kind = types["geometry_msgs/msg/TransformStamped"]
             entries.append(kind(header=self.header(stamp, parent), child_frame_id=child, transform=transform))
-        self.write("/tf_static", "TFMessage", stamp, "tf2_msgs", transforms=entries)
+        self.write(topic, "TFMessage", stamp, "tf2_msgs", transforms=entries)
 
     def close(self) -> None:
         self.writer.close()

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import RIM, Camera, preset_for_sequence, require_camera
+from gavo_jax.camera import PRESETS, RIM, Camera, preset_for_sequence, require_camera
 from gavo_jax.camera_files import load_camera
 from gavo_jax.errors import GavoError
 
@@ -108,6 +108,17 @@ def test_a_camera_of_jax_numbers_undistorts_like_one_of_pythons():
     np.testing.assert_array_equal(traced.undistort_image(image), camera.undistort_image(image))
     depth = image.astype(np.uint16)
     np.testing.assert_array_equal(traced.undistort_depth(depth), camera.undistort_depth(depth))
+
+
+def test_a_lens_reaches_to_where_its_polynomial_turns_back():
+    barrel = replace(Camera.preset("fr1"), distortion=(-0.6, 0.0, 0.0, 0.0, 0.0))
+    assert barrel.reach == pytest.approx(1.8**-0.5, abs=2e-3)
+    assert all(Camera.preset(name).reach > 1.2 for name in PRESETS)
+    assert replace(barrel, distortion=(0.0, 0.0, 0.0, 0.0), model="fisheye").reach == np.inf
+    depth = barrel.undistort_depth(np.full((480, 640), 5000, np.uint16))
+    v, u = np.mgrid[:480, :640]
+    off = np.hypot((u - barrel.cx) / barrel.fx, (v - barrel.cy) / barrel.fy)
+    assert (off > barrel.reach).any() and not depth[off > barrel.reach].any() and depth[off < 0.9 * barrel.reach].all()
 
 
 def test_undistortion_leaves_no_black_rim():

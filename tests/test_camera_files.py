@@ -188,6 +188,13 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
     assert name.endswith(".csv") or load_camera(tmp_path / name) == found.color
 
 
+@pytest.mark.parametrize("key", ["integer_depth_scale", "depth_unit_scale_factor"])
+def test_transforms_say_the_unit_of_depth_in_metres(tmp_path, key):
+    (tmp_path / "transforms.json").write_text(json.dumps({**NERF, key: 10 / 65535}))
+    found = load_calibration(tmp_path / "transforms.json")
+    assert found.states_depth_scale and found.color.depth_scale == pytest.approx(6553.5)
+
+
 K = {"K": MATRIX.tolist(), "width": 640, "height": 480}
 SDK = {key: value for key, value in REALSENSE.items() if key not in ("model", "coeffs")}
 FLAT = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5}
@@ -378,6 +385,10 @@ FAULTS = {
     "realsense of 0.json": (
         json.dumps({**REALSENSE, "fx": 0, "coeffs": [0.1] * 5}),
         "needs a focal length that is not 0",
+    ),
+    "region.yaml": (
+        ros_echo(False, "plumb_bob", []).replace("---", "roi:\n  x_offset: 0\n  y_offset: 60"),
+        "roi: begins",
     ),
     "transforms of lenses.json": (
         json.dumps({"frames": [NERF, {**NERF, "k1": 0.2}]}),

@@ -57,7 +57,8 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
 def _time(facts: dict[str, Any]) -> str:
     rate = "no rate" if facts["rate_hz"] is None else f"{facts['rate_hz']:.1f} frames/s"
     gaps = f"{facts['gaps']} gaps, the longest of {facts['longest_gap_s']:.2f} s" if facts["gaps"] else "no gap"
-    return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}, {gaps}"
+    guess = f" ({facts['times_guessed']})" if facts["times_guessed"] else ""
+    return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}{guess}, {gaps}"
 
 
 def _camera(camera: dict[str, Any]) -> str:

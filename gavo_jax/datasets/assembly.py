@@ -42,6 +42,9 @@ class DepthUnit(NamedTuple):
     """In the files."""
     frame: float
     """In frames: their camera's `depth_scale`."""
+    of_floats: bool | None = None
+    """Whether this is the unit of fractions, or of whole numbers, alone; None where it is of both, as somebody said, or
+    where nothing tells."""
 
 
 def recorded_as(sequence: Any) -> dict[str, Any]:
@@ -75,17 +78,22 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
         given: units per metre, if somebody says so.
 
     Raises:
-        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`; or some images
-            hold whole numbers, which may be in another unit.
+        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`, or were scaled to
+            the farthest; or some images hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
-    whole = [image.name for image in samples if image.raw.dtype == np.uint16 and image.raw.any()]
-    if whole and given is None:
-        other = next(image.name for image in samples if image.raw.dtype != np.uint16)
-        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {other}: say --depth-scale, of both")
+    whole, floats = ([image.name for image in samples if _is_of_floats(image.raw) is kind] for kind in (False, True))
+    if whole and floats and given is None:
+        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     median = float(np.median(readings)) if readings.size else METRES
+    is_open = given is None and not _states_unit(calibration)
+    if is_open and readings.size and readings.min() < readings.max() == 1:
+        raise GavoError(
+            f"{samples[0].name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "
+            "per metre: 0.1 where 1 stands for 10 m"
+        )
     file = given or _likely_unit(median, calibration)
     if file is None:
         raise GavoError(
@@ -93,12 +101,25 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
             "units per metre"
         )
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
-    return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE)
+    return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE, True if floats and given is None else None)
+
+
+def _is_of_floats(raw: np.ndarray) -> bool | None:
+    """Whether depth is in fractions; None where it has no reading. Whole numbers beyond 16 bits come as floats, too."""
+    readings = without_invalid(raw)
+    if not readings.any():
+        return None
+    return readings.dtype != np.uint16 and bool((readings % 1).any())
+
+
+def _states_unit(calibration: Calibration) -> bool:
+    """Whether a camera says the unit; that of a preset is of its own files."""
+    return calibration.preset is None and calibration.states_depth_scale
 
 
 def _likely_unit(median: float, calibration: Calibration) -> float | None:
     stated = calibration.color.depth_scale
-    if calibration.preset is None and calibration.states_depth_scale and _is_within(median / stated, STATED_MEDIANS):
+    if _states_unit(calibration) and _is_within(median / stated, STATED_MEDIANS):
         return stated
     if _is_within(median, METRE_MEDIANS):
         return METRES
@@ -184,6 +205,13 @@ class FrameAssembler:
         return np.where(self._with_grey, moved, np.uint16(0)) if self.undistort else moved
 
     def _in_frame_units(self, depth: DepthImage) -> UInt16[np.ndarray, "h w"]:
+        of_floats, is_float = self.unit.of_floats, depth.raw.dtype != np.uint16
+        if of_floats is not None and of_floats != is_float and _is_of_floats(depth.raw) is is_float:
+            kinds = ("whole numbers", "floats")
+            raise FrameError(
+                f"{depth.name}: depth in {kinds[is_float]}, and in {kinds[of_floats]} in the images that were "
+                "looked at first: say --depth-scale, of both"
+            )
         if depth.raw.dtype != np.uint16:
             farthest = NO_READING / self.unit.frame
             if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MUCH:

@@ -29,14 +29,16 @@ from gavo_jax.datasets.messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
+    as_taken,
     camera_table,
     color_of,
     depth_of,
     is_calibrated,
+    is_depth,
 )
 from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
 from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
-from gavo_jax.datasets.transforms import FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
+from gavo_jax.datasets.transforms import ANY_TOPIC, FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 from gavo_jax.trajectory import Trajectory, associate
 
@@ -205,9 +207,7 @@ class BagSequence:
 
     def _size(self) -> Size:
         """Width and height of the first colour image."""
-        color = self._topics[0]
-        height, width = color_of(color.kind, self._bag.first(color.name), color.name).shape[:2]
-        return width, height
+        return self._bag.size(self._topics[0].name)
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
@@ -238,7 +238,7 @@ class _Shared:
             scale = calibration.color.depth_scale
             if calibration.preset is not None and reading.depth_scale is None:
                 scale = _scale_of_integers(depths, calibration)
-            unit = DepthUnit(scale, scale)
+            unit = DepthUnit(scale, scale, False if reading.depth_scale is None else None)
         return FrameAssembler(calibration, unit, common_white(colors), reading.color, reading.undistort)
 
 
@@ -348,6 +348,15 @@ class _Bag:
             messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
             return next(filter(is_good, messages), None)
 
+    def size(self, name: str) -> Size:
+        """Width and height of the first image of a topic."""
+        kind, message = self.kinds[name], self.first(name)
+        if kind == IMAGE:
+            return int(message.width), int(message.height)  # pyright: ignore[reportOptionalMemberAccess]
+        read = depth_of if is_depth(kind, message, name) else color_of
+        height, width = read(kind, message, name).shape[:2]
+        return width, height
+
     def choose(self, reading: Reading) -> tuple[str, str]:
         """The topics of colour and depth, those that are named or those that messages and names speak for."""
         images = {}
@@ -358,7 +367,7 @@ class _Bag:
         are_named = reading.color_topic is not None and reading.depth_topic is not None
         if are_of_two_cameras(color, depth) and not are_named:
             frames = images[color].frame, images[depth].frame
-            if frames[0] == frames[1] or between(self._transforms(), *frames) is None:
+            if frames[0] == frames[1] or self._between(*frames)[0] is None:
                 raise GavoError(
                     f"{self.path}: {color} and {depth} are of two cameras, by their names: "
                     "say --colour-topic and --depth-topic if they are of one"
@@ -380,7 +389,7 @@ class _Bag:
         says_so = says_registered(color, depth)
         is_one_place = frames[0] == frames[1] or not all(frames) or says_so
         are_placed = any(frames) or says_so  # two that have no name are not for that one frame
-        color_T_depth = between(self._transforms(), *frames) if are_placed else None
+        color_T_depth, where = self._between(*frames) if are_placed else (None, "")
         if _is_same(moved, camera):
             color_T_depth = np.eye(4) if is_one_place else color_T_depth
             has_one_lens = moved.distortion == camera.distortion or _is_rectified(color) == _is_rectified(depth)
@@ -388,17 +397,18 @@ class _Bag:
                 return Calibration(camera, origin=name, states_depth_scale=False)
         if color_T_depth is None:
             raise GavoError(
-                f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie: "
+                f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie, "
+                f"nor does {ANY_TOPIC} without a change: "
                 "say --camera with a file of both cameras ([depth], colour_T_depth), or another --depth-topic"
             )
-        origin = f"{name}, {other[0]} and {FIXED_TOPIC}"
+        origin = f"{name}, {other[0]} and {where}"
         return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
 
     def _alone(self, camera: Camera, name: str, topics: tuple[str, str], frame: str) -> Calibration:
         """One camera for both topics, where nothing says that depth, without a camera_info, lies in another frame."""
         image = self.first(topics[1])
         other = frame if image is None else image.header.frame_id
-        color_T_depth = between(self._transforms(), frame, other)
+        color_T_depth, _ = self._between(frame, other)
         if frame and other and (color_T_depth is None or not np.allclose(color_T_depth, np.eye(4))):
             raise GavoError(
                 f"{self.path}: no camera_info for {topics[1]}, whose images lie in the frame {other[:60]!r} and not in "
@@ -407,11 +417,18 @@ class _Bag:
             )
         return Calibration(camera, origin=name, states_depth_scale=False)
 
-    def _transforms(self) -> dict[tuple[str, str], np.ndarray]:
-        """The fixed transforms of the recording."""
-        topics = [c.topic for c in self._reader.connections if (c.topic, c.msgtype) == (FIXED_TOPIC, TRANSFORMS)]
-        with blamed(f"{self.path}: {FIXED_TOPIC}"):
-            raw = list(self.stream(topics)) if topics else []
+    def _between(self, a: str, b: str) -> tuple[np.ndarray | None, str]:
+        """`a_T_b`, and the topic that says it; None where nothing does."""
+        found = between(self._transforms(FIXED_TOPIC), a, b)
+        if found is not None:
+            return found, FIXED_TOPIC
+        return between(self._transforms(FIXED_TOPIC, ANY_TOPIC), a, b), ANY_TOPIC
+
+    def _transforms(self, *names: str) -> dict[tuple[str, str], np.ndarray]:
+        """The transforms of some topics that never change."""
+        topics = [c.topic for c in self._reader.connections if c.topic in names and c.msgtype == TRANSFORMS]
+        with blamed(f"{self.path}: {' and '.join(names)}"):
+            raw = self.stream(topics) if topics else ()
             return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
 
     def _info(self, topic: str) -> tuple[str, Any] | None:
@@ -432,7 +449,8 @@ class _Bag:
         if not is_calibrated(info):
             raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
         with blamed(place):
-            return camera_from_table(place, camera_table(info, _is_rectified(topic)), MILLIMETRES)
+            table = as_taken(place, camera_table(info, _is_rectified(topic)), info, partial(self.size, topic))
+            return camera_from_table(place, table, MILLIMETRES)
 
 
 class _File(io.BufferedReader):

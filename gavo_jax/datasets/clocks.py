@@ -8,6 +8,9 @@ import numpy as np
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Seconds of what whole numbers may count."""
 
+NAMES = dict(zip(UNITS, ("seconds", "milliseconds", "microseconds", "nanoseconds"), strict=True))
+"""What they are called."""
+
 TICK = 1e-7
 """Seconds of what Windows counts: 100 ns, see `TICKS_BEFORE`."""
 

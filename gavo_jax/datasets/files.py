@@ -17,7 +17,7 @@ from gavo_jax.camera_files import DEPTH_SCALE, Calibration, Size, load_calibrati
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
-from gavo_jax.datasets.images import read_color, read_depth
+from gavo_jax.datasets.images import read_bytes, read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory
@@ -115,9 +115,11 @@ class FileSequence:
         ground_truth: the true trajectory, or None.
         entries: files of each frame, in the order of their stamps.
         calibration: the cameras as they record.
+        times_guessed: what the frames' times are taken from, where that is a guess; else empty.
     """
 
     kind: ClassVar[str] = "image files"
+    times_guessed: str = ""
     scale_is_open: ClassVar[bool] = False
     """Whether the kind of source leaves the unit of depth open: what depth looks like decides, if nobody says it."""
 
@@ -228,9 +230,13 @@ class FileSequence:
 CAMERA_FILES = (
     *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
     *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
-    *("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt"),
+    *("camera-intrinsics.txt", "camera_intrinsics.txt", "camera_intrinsic.txt", "intrinsics.txt", "calibration.txt"),
+    *("intrinsics_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic_color.txt"),
 )
 """Names by which a camera file in a folder, or in the one above, is known."""
+
+SCANS, OF_A_SCAN = ("info.txt", "_info.txt"), b"m_calibrationColorIntrinsic"
+"""Names of the file that comes with a scan, and what stands in it: others call theirs so, too."""
 
 EXPORTED_CAMERA_FILES = (
     *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
@@ -240,8 +246,27 @@ EXPORTED_CAMERA_FILES = (
 
 
 def own_camera_file(folder: Path) -> Path | None:
-    """The camera file that lies in a folder, if one does."""
-    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+    """The camera file that lies in a folder, if one does.
+
+    Raises:
+        GavoError: it is that of colour, and the one of depth beside it says something else.
+    """
+    file = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+    if file is None:
+        return info_of_scan(folder)
+    other = file.with_name(file.name.replace("_color", "_depth"))
+    if other.is_file() and read_text(other).split() != read_text(file).split():
+        raise GavoError(
+            f"{file}: {other.name} beside it is of another camera: say --camera with a file of both cameras "
+            "([depth], colour_T_depth), or of one if depth is registered to colour"
+        )
+    return file
+
+
+def info_of_scan(folder: Path) -> Path | None:
+    """The file that comes with a scan and holds both cameras, if it lies in a folder."""
+    files = (folder / name for name in SCANS)
+    return next((file for file in files if file.is_file() and OF_A_SCAN in read_bytes(file)), None)
 
 
 def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calibration:
@@ -342,7 +367,7 @@ class _Images:
         if self._scale_is_open and not self._calibration.states_depth_scale:
             sample = sample_depth([depth.raw for depth in depths])
             scale = sample and better_scale(sample, scale, self._calibration.color) or scale
-        unit = DepthUnit(scale, scale)
+        unit = DepthUnit(scale, scale, False if self._reading.depth_scale is None else None)
         if any(depth.raw.dtype != np.uint16 for depth in depths):
             unit = float_unit(depths, self._calibration, self._reading.depth_scale)
         return FrameAssembler(

@@ -19,6 +19,7 @@ from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
     Reading,
+    info_of_scan,
     own_camera_file,
     preset_or_export,
     resolve_folder,
@@ -35,6 +36,9 @@ from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
+
+NUMBERS = "names are numbers"
+"""Of which frames per second are a guess."""
 
 
 class NumberedFolder(FileSequence):
@@ -109,7 +113,9 @@ class NumberedFolder(FileSequence):
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)
             truth = _trajectory(cls.poses(path), {number: times[number] for number in numbers}, posed_T_color)
-        return cls(root.name, entries, calibration, truth, reading, left_out)
+        sequence = cls(root.name, entries, calibration, truth, reading, left_out)
+        sequence.times_guessed = "" if is_stamped or reading.rate else NUMBERS
+        return sequence
 
 
 def _trajectory(
@@ -126,8 +132,8 @@ def _trajectory(
 class SevenScenes(NumberedFolder):
     """A sequence of 7-Scenes (Shotton et al. 2013): `frame-000000.color.png`, `.depth.png`, `.pose.txt`.
 
-    Depth is in millimetres, 65535 where there is none, and not registered to colour. BundleFusion and 3RScan name their
-    files alike; their `info.txt` has the cameras.
+    Depth is in millimetres, 65535 where there is none, and not registered to colour. BundleFusion, 3RScan and 12-Scenes
+    name their files alike; their `info.txt` has the cameras.
     """
 
     kind: ClassVar[str] = "7-Scenes sequence"
@@ -147,9 +153,8 @@ class SevenScenes(NumberedFolder):
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera file beside the frames, or a scan's info.txt, else the dataset's."""
-        infos = (path / name for name in ("info.txt", "_info.txt"))
-        file = own_camera_file(path) or next((file for file in infos if file.is_file()), None)
+        """The camera file beside the frames, or a scan's info.txt, there or one folder up, else the dataset's."""
+        file = own_camera_file(path) or info_of_scan(path.parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
         return _millimetres(load_calibration(file, partial(size_of_most, entries), MILLIMETRES))
@@ -161,14 +166,27 @@ class SevenScenes(NumberedFolder):
 
 
 class ScanNet(NumberedFolder):
-    """A scan of ScanNet (Dai et al. 2017) as its reader exports it: `color/`, `depth/`, `pose/`, `intrinsic/`."""
+    """A scan of ScanNet (Dai et al. 2017) as its reader exports it: `color/`, `depth/`, `pose/`, `intrinsic/`.
+
+    The frames that the dataset has exported, one in a hundred, have the cameras' files beside these folders.
+    """
 
     kind: ClassVar[str] = "ScanNet scan"
+    INTRINSICS: ClassVar[tuple[str, ...]] = ("intrinsic/intrinsic_", "intrinsic_", "intrinsics_")
+    """How the names of the cameras' files begin."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the file of the colour camera, beside the images."""
-        return (path / "intrinsic" / "intrinsic_color.txt").is_file() and (path / "depth").is_dir()
+        """By the file of the colour camera, beside images and, unless it has a folder, poses."""
+        file = cls._intrinsics(path, "color")
+        if file is None or not all((path / name).is_dir() for name in ("color", "depth")):
+            return False
+        return file.parent != path or (path / "pose").is_dir()
+
+    @classmethod
+    def _intrinsics(cls, path: Path, camera: str) -> Path | None:
+        files = (path / f"{beginning}{camera}.txt" for beginning in cls.INTRINSICS)
+        return next((file for file in files if file.is_file()), None)
 
     @classmethod
     def find(cls, path: Path) -> Found:
@@ -178,12 +196,13 @@ class ScanNet(NumberedFolder):
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The files of both cameras, as far as they are two; the scans say that nothing is to be turned or shifted."""
-        color, depth = (path / "intrinsic" / f"intrinsic_{name}.txt" for name in ("color", "depth"))
+        color, depth = (cls._intrinsics(path, name) for name in ("color", "depth"))
+        assert color is not None
         found = _millimetres(load_calibration(color, partial(size_of_most, entries), MILLIMETRES))
-        if not depth.is_file() or entries[0].depth is None:
+        if depth is None or entries[0].depth is None:
             return found
         for name in ("color", "depth"):
-            _check_identity(path / "intrinsic" / f"extrinsic_{name}.txt")
+            _check_identity(color.with_name(f"extrinsic_{name}.txt"))
         height, width = read_depth(entries[0].depth).shape
         other = load_calibration(depth, (width, height), MILLIMETRES).color
         if other == found.color:
@@ -249,6 +268,8 @@ class PlainFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of colour and depth images"
     scale_is_open: ClassVar[bool] = True
+    has_clock: ClassVar[bool] = False
+    """Whether a file says when the frames were taken."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -283,7 +304,10 @@ class PlainFolder(FileSequence):
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth)
-        return cls(root.name, paired.entries, calibration, truth, reading, left_out)
+        sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
+        is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
+        sequence.times_guessed = NUMBERS if is_open else paired.guessed
+        return sequence
 
     @classmethod
     def clock(cls, path: Path, reading: Reading) -> Seconds:

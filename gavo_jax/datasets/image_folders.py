@@ -27,15 +27,15 @@ DEPTH_NAMES = {"depth", "depths"}
 PLAIN_WORDS = {"image", "images", "raw"}
 """What else may stand in the name of such a folder."""
 
-PAIR = re.compile(r"(.+[-_])colou?r", re.IGNORECASE)
-"""A folder of colour named as its scene is, as Redwood has it; depth's begins with the same."""
+PAIR = re.compile(r"(.*)(?<![a-z])(?:colou?r|rgb)(?![a-z])(.*)")
+"""A folder of colour named as its scene is, as Redwood has it, or its camera; depth's has the same around its word."""
 
 DEPTH_WORD = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
 """In the names of depth images that lie beside colour, as a part of its own, where some have it so."""
 
-COLOR_WORDS = ("colou?r|rgb", "image|frame|img", r"^\d+\.")
+COLOR_WORDS = ("colou?r|rgb", "image|frame|img", "left", r"^\d+\.")
 """In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
-say nothing."""
+say nothing. Of a stereo camera depth is that of the left image."""
 
 
 def _is_registered(name: str) -> bool:
@@ -53,17 +53,18 @@ def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
     registered = sorted(filter(_is_registered, children), key=lambda name: (name not in DEPTH_FOLDERS, name))
     names = COLOR_FOLDERS, dict.fromkeys((*registered, *DEPTH_FOLDERS))
     color, depth = ([children[name] for name in some if name in children] for some in names)
-    return (color, depth) if color or depth else _named_as_their_scene(children)
+    return (color, depth) if color or depth else _named_alike(children)
 
 
-def _named_as_their_scene(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
-    """The same, of one scene whose name both begin with."""
-    scenes = {match[1]: child for name, child in children.items() if (match := PAIR.fullmatch(name))}
-    if len(scenes) != 1:
-        return [], []
-    ((scene, color),) = scenes.items()
-    depth = [child for name, child in children.items() if name.startswith(f"{scene}depth")]
-    return ([color], depth) if depth else ([], [])
+def _named_alike(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
+    """The same, of the one scene or camera that the names of both speak of; depth's may say more at its end."""
+    matches = [match for name in children if (match := PAIR.fullmatch(name))]
+    found = [
+        ([children[match[0]]], depth)
+        for match in matches
+        if (depth := [child for name, child in children.items() if name.startswith(f"{match[1]}depth{match[2]}")])
+    ]
+    return found[0] if len(found) == 1 else ([], [])
 
 
 def _folders(path: Path) -> tuple[Path | None, Path | None]:

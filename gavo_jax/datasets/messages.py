@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 from gavo_jax.camera_words import camera_info_distortion
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth, to_float32
+from gavo_jax.errors import GavoError
 
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 
@@ -202,3 +204,40 @@ def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
         return {"fx": p[0], "fy": p[5], "cx": p[2], "cy": p[6], **size}
     lens = {} if rectified else camera_info_distortion(info.distortion_model, d if any(d) else [])
     return {"fx": k[0], "fy": k[4], "cx": k[2], "cy": k[5], **size, **lens}
+
+
+def as_taken(place: str, table: dict[str, Any], info: Any, find_size: Callable[[], tuple[int, int]]) -> dict[str, Any]:
+    """The camera of images that are a region of the sensor's, or hold its pixels in groups, as its camera_info says.
+
+    Where the images have the size that stands there all the same, its numbers are those of the groups: some drivers
+    have it so.
+
+    Args:
+        place: names the topic in messages.
+        table: of the whole sensor, as `camera_table` has it.
+        info: the message.
+        find_size: width and height of the images, asked where it counts.
+
+    Raises:
+        GavoError: the images are of the sensor's size, and a region of it begins elsewhere than at its corner.
+    """
+    region, whole = info.roi, (table["width"], table["height"])
+    offset, groups = (int(region.x_offset), int(region.y_offset)), (int(info.binning_x) or 1, int(info.binning_y) or 1)
+    sides = int(region.width) or whole[0], int(region.height) or whole[1]
+    if (*offset, *groups) == (0, 0, 1, 1) and sides == whole:
+        return table
+    size = find_size()
+    if size == whole:
+        if any(offset):
+            raise GavoError(
+                f"{place}: a region (roi) that begins at {offset[0]} {offset[1]}, and images of the size of the whole, "
+                f"{size[0]}x{size[1]}: whether its numbers are theirs is open: say --camera"
+            )
+        return table
+    if size != (sides[0] // groups[0], sides[1] // groups[1]):
+        return table
+    table = {**table, "width": size[0], "height": size[1]}
+    for focal, middle, start, group in zip(("fx", "fy"), ("cx", "cy"), offset, groups, strict=True):
+        table[focal] /= group
+        table[middle] = (table[middle] - start + 0.5) / group - 0.5
+    return table

@@ -31,13 +31,24 @@ DIGITS_OF_A_CLOCK = 10
 
 FEWEST = 10
 """Images of each kind, or poses and images, without a gap in their numbers, of which it is told that the two count from
-different ones."""
+different ones, or different ones."""
+
+RATES = (2, 3, 4, 5, 6)
+"""How many images of one kind may come for each of the other, where both are of all that their cameras took."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
     r"(?:(?:[.,_-]|(?=(?:\d{3}){1,3}$))(\d{3,9}))?$"
 )
 """Day and time of day, to the second or finer; what is finer follows a mark, or in 3, 6 or 9 digits at once."""
+
+TIME_OF_DAY = re.compile(
+    r"(.*?)(?<!\d)([01]\d|2[0-3])[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)([-_.,]?)(\d{3}|\d{6}|\d{9})", re.DOTALL
+)
+"""Hours, minutes and seconds without a day, a mark if there is one, and the milliseconds or finer."""
+
+HALF_A_DAY = 43200.0
+"""Seconds: times of a day further apart are of two."""
 
 SECONDS_AND_REST = re.compile(r"(.*?)(\d+)[-_,: ](\d{9}|\d{6})", re.DOTALL)
 """Whole seconds and, with their zeros, the nano- or microseconds beside them."""
@@ -106,13 +117,17 @@ def _check_start(found: Found) -> None:
     """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others.
 
     Whether one number or one place in the order is one frame is open then. Of a camera that started, or stopped, later
-    than the other one, the other ends are alike.
+    than the other one, the other ends are alike. But where there are twice as many of one kind, or three times, both
+    may be of the whole clip.
     """
     color, depth, _ = found
-    if min(len(color), len(depth)) < FEWEST:
+    few, many = sorted(map(len, (color, depth)))
+    if few < FEWEST:
         return
     (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
-    if a != c and b != d and b - a + 1 == len(color) and d - c + 1 == len(depth):
+    are_whole = b - a + 1 == len(color) and d - c + 1 == len(depth)
+    are_of_two_rates = a == c and any(abs(many - few * rate) <= rate for rate in RATES)
+    if are_whole and (a != c and b != d or are_of_two_rates):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
             "number, or leave those without a partner out"
@@ -154,10 +169,10 @@ class Stamps(NamedTuple):
 def stamps(names: Sequence[str], unit: float | None = None) -> Stamps | None:
     """Times, where all names are stamps; None where they are not.
 
-    Stamps are seconds or milliseconds with decimals, day and time, seconds beside nano- or microseconds, or whole
-    numbers: since 1970 in s, ms, µs or ns, since a device was switched on in ms, µs or ns, or Windows' ticks. Nothing
-    else may change from name to name but an index before them that grows with them, and the rate has to be that of a
-    camera.
+    Stamps are seconds or milliseconds with decimals, day and time or time alone, seconds beside nano- or microseconds,
+    or whole numbers: since 1970 in s, ms, µs or ns, since a device was switched on in ms, µs or ns, or Windows' ticks.
+    Nothing else may change from name to name but an index before them that grows with them, and the rate has to be that
+    of a camera.
 
     Args:
         names: of one kind of images, without their endings.
@@ -174,7 +189,8 @@ def stamps(names: Sequence[str], unit: float | None = None) -> Stamps | None:
 
 def _stamps(names: Sequence[str], unit: float | None) -> Stamps | None:
     """The same of names that stamps end."""
-    seconds = next((found for read in (_redwood, _dates, _pairs, _decimals) if (found := read(names))), None)
+    readers = (_redwood, _dates, _times_of_day, _pairs, _decimals)
+    seconds = next((found for read in readers if (found := read(names))), None)
     return Stamps(seconds) if seconds else _counts(names, unit)
 
 
@@ -186,7 +202,7 @@ def form(name: str) -> str:
 def _without_tail(names: Sequence[str]) -> list[str]:
     """Names without what follows the last number that changes, if that is the same in all."""
     tail = commonprefix([name[::-1] for name in names])[::-1] if len(set(names)) > 1 else ""
-    tail = re.sub(r"^\d*(\.\d+)?", "", tail)  # digits belong to the number
+    tail = re.sub(r"^\d*([.,]\d+)?", "", tail)  # digits belong to the number
     return [name.removesuffix(tail) for name in names]
 
 
@@ -234,6 +250,24 @@ def _are_frames(dates: Sequence[re.Match[str]]) -> bool:
     return 1 < usual == np.gcd.reduce(steps) and usual < FASTEST_COUNT * 10 ** widths.pop()
 
 
+def _times_of_day(names: Sequence[str]) -> list[float] | None:
+    """Times of one day in which a second ends, or a minute where nothing parts milliseconds from the rest.
+
+    Before that the digits at the end count as any others: they may be the numbers of frames.
+    """
+    found = [match for name in names if (match := TIME_OF_DAY.fullmatch(name))]
+    if len(found) < len(names) or len({(match[1], match[5], len(match[6])) for match in found}) != 1:
+        return None
+    ending = slice(1, 4) if found[0][5] else slice(1, 3)
+    seconds = [
+        3600.0 * int(hours) + 60 * int(minutes) + int(second) + float(f"0.{rest}")
+        for _, hours, minutes, second, _, rest in map(re.Match.groups, found)
+    ]
+    if len({match.groups()[ending] for match in found}) < 2 or max(seconds) - min(seconds) > HALF_A_DAY:
+        return None
+    return seconds if unit_of([round(second / UNITS[1]) for second in seconds]) == UNITS[1] else None
+
+
 def _pairs(names: Sequence[str]) -> list[float] | None:
     """Seconds beside nano- or microseconds: since 1970, or in steps from one second to the next at a camera's rate."""
     found = [match for name in names if (match := SECONDS_AND_REST.fullmatch(name))]
@@ -250,7 +284,7 @@ def _pairs(names: Sequence[str]) -> list[float] | None:
 
 
 def _decimals(names: Sequence[str]) -> list[float] | None:
-    found = _at_the_end(names, r"\d+\.\d+")
+    found = [number.replace(",", ".") for number in _at_the_end(names, r"\d+[.,]\d+")]
     seconds = [float(number) for number in found]
     if not found or len(set(seconds)) < len(set(found)):  # of 1.1 and 1.10 the second is the tenth of something
         return None

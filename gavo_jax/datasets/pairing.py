@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.datasets.clocks import MOST_STEPS
+from gavo_jax.datasets.clocks import MOST_STEPS, NAMES, clock_unit
 from gavo_jax.datasets.files import Entry, Reading
 from gavo_jax.datasets.names import by_number, form, nameless, stamps, unpaired
 from gavo_jax.datasets.truth import Seconds
@@ -29,6 +29,8 @@ class Paired(NamedTuple):
     """Of each depth image, by the number in its name, else by its place, from 1."""
     seconds: Seconds | None
     """Times by numbers, where the names are those."""
+    guessed: str = ""
+    """What names were taken for that are whole numbers, and no date says it."""
 
 
 class _Timed(NamedTuple):
@@ -68,7 +70,9 @@ def paired_by_stamp(path: Path, color: list[Path], depth: list[Path], reading: R
     of_frames = second.copy()
     of_frames[j] = first[i]
     times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
-    return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None)
+    units = [some.unit for some in timed if some.unit is not None and clock_unit(some.seconds) is None]
+    guessed = f"names taken for {NAMES[units[0]]}" if units else ""
+    return Paired(sorted(entries, key=lambda entry: entry.stamp), left_out, times, None, guessed)
 
 
 def _both_timed(path: Path, color: list[Path], depth: list[Path]) -> tuple[_Timed, _Timed] | None:

@@ -133,6 +133,7 @@ class Record3D(PlainFolder):
     """
 
     kind: ClassVar[str] = "export of Record3D"
+    has_clock: ClassVar[bool] = True
     FILE: ClassVar[str] = "metadata.json"
 
     @classmethod

@@ -62,7 +62,7 @@ class Registration:
         return [axis[seen] * metres + shift[i] for i, axis in enumerate(self._rays)]
 
     def _pixels(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows of the colour image."""
+        """Columns and rows of the colour image; NaN for what its lens does not show."""
         camera = self.color
         if not camera.is_distorted:
             return camera.fx * x / z + np.float32(camera.cx), camera.fy * y / z + np.float32(camera.cy)
@@ -72,6 +72,7 @@ class Registration:
             pixels = cv2.fisheye.projectPoints(points, still, still, camera.matrix, distortion)[0]
         else:
             pixels = cv2.projectPoints(points, still, still, camera.matrix, distortion)[0]
+        pixels[np.hypot(points[..., 0], points[..., 1]) > camera.reach] = np.nan
         return pixels[:, 0, 0].astype(np.float32), pixels[:, 0, 1].astype(np.float32)
 
     def _splat(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, sizes: list[np.ndarray]) -> np.ndarray:

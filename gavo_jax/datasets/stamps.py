@@ -1,11 +1,17 @@
 """The stamps of a recording's messages: by which clock they are paired, and which of them count."""
 
+from bisect import bisect, insort
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 JITTER = 0.5
 """Seconds by which stamps may go back in the order of arrival; by more, a clock was set back."""
+
+HOLE, AMID = 1.5, 2
+"""Times the usual step: the least that a message which comes late leaves open, into which its stamp belongs. So many
+stamps one after the other that belong into none are of a clock that was set back by less than `JITTER`."""
 
 
 class Topic(NamedTuple):
@@ -76,13 +82,27 @@ def _runs(stamps: np.ndarray) -> np.ndarray:
     stamped = np.flatnonzero(np.isfinite(stamps))
     before, here, after = (stamps[stamped[part]] for part in (slice(-2), slice(1, -1), slice(2, None)))
     is_stray = (before <= after + JITTER) & ((here > after + JITTER) | (here < before - JITTER))
-    runs, run, latest = np.full(len(stamps), -1), 0, -np.inf
-    for number in np.setdiff1d(stamped, stamped[1:-1][is_stray]):
-        if stamps[number] < latest - JITTER:
-            run, latest = run + 1, -np.inf
-        latest = max(latest, stamps[number])
+    runs, run, earlier = np.full(len(stamps), -1), 0, []
+    kept = np.setdiff1d(stamped, stamped[1:-1][is_stray])
+    steps = np.diff(stamps[kept])
+    hole = HOLE * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    for place, number in enumerate(kept):
+        if earlier and stamps[number] < earlier[-1]:
+            coming = stamps[kept[place : place + AMID]]
+            if stamps[number] < earlier[-1] - JITTER or _are_amid(coming, earlier, hole):
+                run, earlier = run + 1, []
+        insort(earlier, float(stamps[number]))
         runs[number] = run
     return runs
+
+
+def _are_amid(stamps: np.ndarray, earlier: Sequence[float], hole: float) -> bool:
+    """Whether stamps lie amid earlier ones, in order, that leave none of them open; those that come again do not."""
+    places = [bisect(earlier, float(stamp)) for stamp in stamps]
+    return len(stamps) == AMID and all(
+        0 < place < len(earlier) and earlier[place - 1] < stamp and earlier[place] - earlier[place - 1] < hole
+        for place, stamp in zip(places, stamps, strict=True)
+    )
 
 
 def _longest(runs: np.ndarray) -> int:

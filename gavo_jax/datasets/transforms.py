@@ -1,4 +1,4 @@
-"""How the frames of a device lie to each other, from the fixed transforms that ROS publishes."""
+"""How the frames of a device lie to each other, from the transforms that ROS publishes and that never change."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -9,21 +9,36 @@ from jaxtyping import Float
 from gavo_jax.trajectory import inverse, rotation_from_quaternion
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-FIXED_TOPIC = "/tf_static"
+FIXED_TOPIC, ANY_TOPIC = "/tf_static", "/tf"
+"""Of transforms that are published once, and of those that are published over and over, whether they change or not."""
+
+LONGEST_OFF = 0.01
+"""How far a quaternion's length may be off 1, as ROS's own library has it: zeros and what was never filled in are no
+rotation."""
+
+STILL = 1e-6
+"""Of the numbers of a transform, metres among them: what differs by more has changed."""
 
 
 def fixed_transforms(messages: Iterable[Any]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """Return `a_T_b` by the names (a, b) of frames, both ways, of messages of the type `TRANSFORMS`."""
-    found = {}
+    """Return `a_T_b` by the names (a, b) of frames, both ways, of messages of the type `TRANSFORMS`.
+
+    Those that change are left out, and those that are no transforms.
+    """
+    found, moving = {}, set()
     for message in messages:
         for entry in message.transforms:
             shift, turn = entry.transform.translation, entry.transform.rotation
+            quaternion, position = np.array([turn.x, turn.y, turn.z, turn.w]), np.array([shift.x, shift.y, shift.z])
+            if not abs(np.linalg.norm(quaternion) - 1) < LONGEST_OFF or not np.isfinite(position).all():
+                continue
             parent_T_child = np.eye(4)
-            parent_T_child[:3, :3] = rotation_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w]))
-            parent_T_child[:3, 3] = shift.x, shift.y, shift.z
+            parent_T_child[:3, :3], parent_T_child[:3, 3] = rotation_from_quaternion(quaternion), position
             parent, child = (name.strip("/") for name in (entry.header.frame_id, entry.child_frame_id))
-            found[parent, child], found[child, parent] = parent_T_child, inverse(parent_T_child)
-    return found
+            if not np.allclose(found.setdefault((parent, child), parent_T_child), parent_T_child, rtol=0, atol=STILL):
+                moving |= {(parent, child), (child, parent)}
+            found.setdefault((child, parent), inverse(parent_T_child))
+    return {names: transform for names, transform in found.items() if names not in moving}
 
 
 def between(

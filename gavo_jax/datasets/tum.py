@@ -126,6 +126,7 @@ class TumSequence(FileSequence):
             reading,
             unpaired((len(color_rows), len(depth_rows)), len(entries), why) + unread_truth(self.folder, truth),
         )
+        self.times_guessed = "stamps are numbers" if rate is None and unit == 1 / INDEX_RATE else ""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -216,6 +216,85 @@ def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_
     assert depth.shape == (120, 160) and 0.5 < (depth > 0).mean() < 1 and np.all(depth[depth > 0] == 2100)
 
 
+def with_transforms(path: Path, topic: str, transforms: list[tuple[list[float], list[float]]]) -> BagSequence:
+    """A recording of colour and of depth of another camera, whose place in colour's frame is said again and again."""
+    recorder = Recorder(path, "mcap")
+    for i, transform in enumerate(transforms):
+        stamp = 1 + i / 10
+        recorder.image("/cam/color/image_raw", stamp, GREYS[0], "mono8")
+        recorder.info("/cam/color/camera_info", stamp, CAMERA, frame="color")
+        recorder.image("/cam/depth/image_raw", stamp, MILLIMETRES[0], "16UC1")
+        recorder.info("/cam/depth/camera_info", stamp, replace(CAMERA, fx=120.0), frame="depth")
+        recorder.fixed(stamp, {("color", "depth"): transform, ("map", "color"): ([i, 0, 0], [0, 0, 0, 1])}, topic)
+    recorder.close()
+    sequence = open_source(path)
+    assert isinstance(sequence, BagSequence)
+    return sequence
+
+
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+def test_transforms_that_never_change_are_fixed_wherever_they_stand(tmp_path, topic):
+    sequence = with_transforms(tmp_path / "still", topic, [([0.02, 0.0, 0.0], UPRIGHT)] * 3)
+    moved = sequence.calibration.color_T_depth
+    assert moved is not None and moved[0, 3] == 0.02 and sequence.calibration.origin.endswith(topic)
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [([0.02, 0.0, 0.0], UPRIGHT), ([0.03, 0.0, 0.0], UPRIGHT), ([0.02, 0.0, 0.0], UPRIGHT)],
+        [([0.02, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0])] * 2,
+        [([0.02, 0.0, 0.0], [0.0, 0.0, np.nan, 1.0])] * 2,
+        [([np.nan, 0.0, 0.0], UPRIGHT)] * 2,
+    ],
+)
+def test_transforms_that_change_or_are_none_say_nothing(tmp_path, topic, transforms):
+    with pytest.raises(GavoError, match="and /tf_static does not say how they lie, nor does /tf without a change: say"):
+        with_transforms(tmp_path / "none", topic, transforms)
+
+
+@pytest.mark.parametrize(
+    ("whole", "roi", "binning", "expected"),
+    [
+        (replace(CAMERA, fx=262.0, fy=264.0, cx=159.5, cy=119.5, width=320, height=240), (0, 0, 0, 0), 2, (131, 79.5)),
+        (replace(CAMERA, cx=159.5, cy=119.5, width=320, height=240), (80, 60, 160, 120), 1, (131, 79.5)),
+        (
+            replace(CAMERA, fx=262.0, cx=319.5, cy=239.5, width=640, height=480),
+            *((160, 120, 320, 240), 2, (131, 79.5)),
+        ),
+        (CAMERA, (0, 0, 160, 120), 0, (131, 79.5)),
+        (CAMERA, (0, 0, 0, 0), 2, (131, 79.5)),
+    ],
+)
+def test_a_camera_info_of_the_whole_sensor_becomes_that_of_the_images(tmp_path, whole, roi, binning, expected):
+    recorder = Recorder(tmp_path / "part", "mcap")
+    recorder.image(COLOR, 1.0, BGRS[0], "bgr8")
+    recorder.image(DEPTH, 1.0, MILLIMETRES[0], "16UC1")
+    for topic in (COLOR, DEPTH):
+        recorder.info(topic.replace("image_raw", "camera_info"), 1.0, whole, roi=roi, binning=binning)
+    recorder.close()
+    sequence = open_source(tmp_path / "part")
+    camera = sequence.camera
+    assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (*expected, 59.5, 160, 120)
+    assert isinstance(sequence, BagSequence) and sequence.calibration.depth is None and sequence[0].depth.any()
+
+
+def test_a_region_of_the_size_of_the_whole_is_refused(tmp_path):
+    recorder = Recorder(tmp_path / "part", "mcap")
+    recorder.image(COLOR, 1.0, BGRS[0], "bgr8")
+    recorder.image(DEPTH, 1.0, MILLIMETRES[0], "16UC1")
+    recorder.info(COLOR.replace("image_raw", "camera_info"), 1.0, CAMERA, roi=(0, 60, 160, 120))
+    recorder.close()
+    with pytest.raises(
+        GavoError, match=r"camera_info: a region \(roi\) that begins at 0 60, and images of .* 160x120: "
+    ):
+        open_source(tmp_path / "part")
+
+
 def with_topics(path: Path, frames: dict[str, str], infos: bool = True) -> Path:
     """A recording of topics, each in its frame, with depth where the name's last words say so and a camera_info."""
     recorder = Recorder(path, "mcap")
@@ -592,6 +671,8 @@ TENTHS = [1 + number / 10 for number in range(20)]
         (TENTHS + [1.06, 1.16] + TENTHS[:5], range(20), 1.8, 21),
         (TENTHS[:5] + [99.0] + TENTHS[6:], [*range(5), *range(6, 20)], 97.4, 7),
         (TENTHS[:9] + [1.0] + TENTHS[10:], [*range(9), *range(10, 20)], 0.8, 10),
+        (TENTHS + [stamp + 1.55 for stamp in TENTHS[:15]], range(20), 0.4, 21),
+        (TENTHS[:8] + [stamp + 0.43 for stamp in TENTHS], range(8, 28), 0.3, 9),
     ],
 )
 def test_of_a_clock_that_is_set_back_one_run_is_used(tmp_path, kind, stamps, kept, back, at):
@@ -608,6 +689,18 @@ def test_messages_that_arrive_out_of_order_are_sorted(tmp_path):
     sequence = of_stamps(tmp_path / "late", "mcap", stamps)
     assert sequence.left_out == [] and sequence.topics == (COLOR, DEPTH)
     assert summary(sequence).startswith(f"late: ROS bag of {COLOR} and {DEPTH}, 20 frames of 16x12; camera fx")
+    np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "late", [[(5, 6), (6, 5)], [(5, 9), (6, 5), (7, 6), (8, 7), (9, 8)], [(5, 8), (6, 9), (8, 5), (9, 6)]]
+)
+def test_messages_that_come_late_set_no_clock_back(tmp_path, late):
+    stamps = list(TENTHS)
+    for place, number in late:
+        stamps[place] = TENTHS[number]
+    sequence = of_stamps(tmp_path / "late", "mcap", stamps)
+    assert sequence.left_out == []
     np.testing.assert_allclose(sequence.timestamps, TENTHS, atol=1e-9)
 
 

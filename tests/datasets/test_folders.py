@@ -29,10 +29,11 @@ from gavo_jax.camera_files import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import PlainFolder, SevenScenes
+from gavo_jax.datasets.folders import PlainFolder, ScanNet, SevenScenes
 from gavo_jax.datasets.registry import open_source, recognise, register_dataset
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
+from gavo_jax.inspection import summary
 
 
 @pytest.fixture
@@ -123,6 +124,7 @@ def test_other_folders_do_not_go_before_depth(folder, name):
         *[("rgb", name) for name in ("depth_raw", "depth_images", "aligned_depth_to_color", "depth_rect")],
         ("livingroom1-color", "livingroom1-depth-clean"),
         ("office_color", "office_depth"),
+        *[("rgb_front", "depth_front"), ("front_rgb", "front_depth"), ("Colour0", "Depth0")],
     ],
 )
 def test_folders_of_images_have_many_names(folder, color, depth):
@@ -141,6 +143,9 @@ def test_of_two_scenes_in_one_folder_none_is_taken(folder):
     (folder / "depth").rename(folder / "a-depth")
     with pytest.raises(GavoError, match="not one of"):
         open_source(folder)
+    (folder / "b-depth").rename(folder / "c-depth")
+    sequence = open_source(folder)
+    assert isinstance(sequence, PlainFolder) and sequence.entries[0].color.parent.name == "a-color"
 
 
 @pytest.mark.parametrize("name", ["oak_depthai_{}_{:04}", "indepth_{1:04}_{0}", "{}_{:04}", "scene{}{:04}"])
@@ -305,6 +310,24 @@ def test_many_names_of_another_form_are_refused(folder):
         stamped(folder, names, names)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ((0, 12, 25, 37), " at 83.33 frames/s (names taken for milliseconds)"),
+        ((0, 33333, 66667, 100000), " at 30 frames/s (names taken for microseconds)"),
+        ((0, 10, 20, 30), " at 3 frames/s (names are numbers)"),
+        (("1700000000123", "1700000000156", "1700000000190", "1700000000223"), ""),
+    ],
+)
+def test_a_rate_that_is_a_guess_is_told(folder, numbers, words):
+    """Every so many frames, picked evenly, have names that may be milliseconds."""
+    for number in numbers:
+        image(folder / f"rgb/{number}.png", GREYS[0])
+        image(folder / f"depth/{number}.png", raw(METRES[0], 1000))
+    assert f", 4 frames of 160x120{words}; camera" in summary(open_source(folder, Reading(camera=CAMERA)))
+    assert "(" not in summary(open_source(folder, Reading(camera=CAMERA, rate=25.0))).partition("; camera")[0]
+
+
 def test_kinds_of_two_rates_count_the_same(folder):
     """Even steps have a common factor; colour alone was times, so that both were numbers of frames."""
     color = [f"{round(1000 * i / 30):06}" for i in range(30)]
@@ -341,6 +364,15 @@ def test_colour_is_what_is_named_so(folder):
         image(folder / f"frame_depth_{i}.png", raw(METRES[i], 1000))
     sequence = open_source(folder, Reading(camera=CAMERA))
     np.testing.assert_array_equal(sequence[1].grey, GREYS[1])
+
+
+def test_colour_beside_depth_of_a_stereo_camera_is_left(folder):
+    """As ZED's export names both."""
+    for i in range(2):
+        image(folder / f"left{i:06}.png", GREYS[i])
+        image(folder / f"right{i:06}.png", GREYS[3])
+        image(folder / f"depth{i:06}.png", raw(METRES[i], 1000))
+    np.testing.assert_array_equal(open_source(folder, Reading(camera=CAMERA))[1].grey, GREYS[1])
 
 
 def test_colour_may_be_a_number_beside_depth(folder):
@@ -493,6 +525,31 @@ def test_an_info_of_a_scan_has_the_cameras(folder):
         (folder / "info.txt").write_text(text)
         with pytest.raises(GavoError, match=fault):
             open_source(folder)
+
+
+def test_an_info_of_a_scan_may_lie_one_folder_up(folder):
+    """As 12-Scenes has it; another file of the name says nothing."""
+    (folder / "data").mkdir()
+    wrote(folder / "data", "seven_scenes")
+    (folder / "data/camera-intrinsics.txt").unlink()
+    (folder / "info.txt").write_text(sens(CAMERA, dataclasses.replace(CAMERA, fx=140.0)))
+    sequence = open_source(folder / "data")
+    assert isinstance(sequence, SevenScenes) and sequence.calibration.depth is not None
+    assert (sequence.camera.fx, sequence.calibration.depth.fx) == (131, 140)
+    (folder / "info.txt").write_text("taken in the kitchen\n")
+    with pytest.raises(GavoError, match="the camera's images are 640x480"):
+        open_part(str(folder / "data"))
+
+
+@pytest.mark.parametrize("name", ["intrinsics", "intrinsic"])
+def test_frames_that_scannet_exports_have_their_cameras_beside_them(folder, name):
+    wrote(folder, "scannet")
+    for camera in ("color", "depth"):
+        (folder / f"intrinsic/intrinsic_{camera}.txt").rename(folder / f"{name}_{camera}.txt")
+    (folder / f"{name}_depth.txt").write_text("130 0 79.5 0\n0 130 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    sequence = open_source(folder)
+    assert isinstance(sequence, ScanNet) and sequence.ground_truth is not None
+    assert sequence.calibration.depth is not None and sequence.calibration.depth.fx == 130
 
 
 def test_the_folders_name_may_say_the_camera(tmp_path):
@@ -709,6 +766,28 @@ def test_a_camera_file_is_found_by_any_of_its_usual_names(folder, name):
     (folder / name).write_text(json.dumps({"K": MATRIX.tolist(), "width": 160, "height": 120}))
     sequence = open_source(folder)
     assert sequence.camera.fx == 131 and sequence.calibration.origin.endswith(name)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("up", ["", "../"])
+@pytest.mark.parametrize("name", ["camera_intrinsics.txt", "intrinsics_color.txt", "intrinsic/intrinsic_color.txt"])
+def test_a_camera_of_colour_is_found_and_that_of_depth_has_to_agree(folder, name, up):
+    (folder / "scene").mkdir()
+    wrote(folder / "scene", "plain")
+    (folder / "scene/camera.yaml").unlink()
+    file = folder / "scene" / up / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("131 0 79.5 0\n0 131 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    assert open_source(folder / "scene").camera.fx == 131
+    if "color" not in name:
+        return
+    depth = file.with_name(file.name.replace("color", "depth"))
+    depth.write_text(file.read_text())
+    assert open_source(folder / "scene").camera.fx == 131
+    depth.write_text("140 0 79.5 0\n0 140 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    with pytest.raises(
+        GavoError, match=r"_color\.txt: intrinsics?_depth\.txt beside it is of another camera: say --cam"
+    ):
+        open_source(folder / "scene")
 
 
 def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):

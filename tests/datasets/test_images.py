@@ -246,6 +246,40 @@ def test_floats_beside_whole_numbers_are_in_no_common_unit(tmp_path, color_file)
     assert open_pair(pair, Calibration(CAMERA))[0].depth.any()
 
 
+@pytest.mark.parametrize("is_float", [True, False])
+def test_one_image_of_another_kind_of_numbers_has_no_unit(tmp_path, color_file, is_float):
+    """It is not among those that are looked at first: metres counted as millimetres lay 3 mm before the camera."""
+    kinds = [write(tmp_path / "metres.npy", METRES + np.float32(0.0123)), write(tmp_path / "whole.png", RAW)]
+    pairs = [(color_file, kinds[is_float if i == 1 else not is_float]) for i in range(5)]
+    sequence = open_pair(pairs, Calibration(CAMERA))
+    assert sequence[0].depth.any()
+    with pytest.raises(
+        FrameError, match="(whole.png: depth in whole numbers, and in floats|metres.npy: .* in fl.*whole) "
+    ):
+        sequence[1]
+    assert open_pair(pairs, Calibration(CAMERA), Reading(depth_scale=1.0))[1].depth is not None
+
+
+def test_whole_numbers_beyond_16_bits_are_in_the_unit_of_the_others(tmp_path, color_file):
+    beyond = RAW.astype(np.int32)
+    beyond[0, :30] = 2**31 - 1
+    for first in (RAW.astype(np.int32), beyond):
+        arrays = [write(tmp_path / "a.npy", first), write(tmp_path / "b.npy", beyond)]
+        sequence = open_pair([(color_file, arrays[i == 1]) for i in range(5)], Calibration(CAMERA))
+        metres = [frame.depth[1:] / sequence.camera.depth_scale for frame in sequence]
+        np.testing.assert_allclose(metres[1], metres[0], atol=1e-3)
+
+
+def test_floats_that_were_scaled_to_the_farthest_are_refused(tmp_path, color_file):
+    """As simulators give them, and tools that draw depth; in metres nothing was farther than one."""
+    scaled = write(tmp_path / "depth.npy", METRES / METRES.max())
+    silent = Calibration(CAMERA, states_depth_scale=False)
+    with pytest.raises(GavoError, match="depth.npy: depth of exactly 1 at most: scaled .*: say --depth-scale, units"):
+        open_pair([(color_file, scaled)], silent)[0]
+    sequence = open_pair([(color_file, scaled)], silent, Reading(depth_scale=1 / float(METRES.max())))
+    assert np.abs(sequence[0].depth / sequence.camera.depth_scale - METRES).max() < 1e-3
+
+
 def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
     frame, camera = read(color_file, write(tmp_path / "depth.npy", METRES * 8))
     assert camera.depth_scale == 1000

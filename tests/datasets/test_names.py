@@ -63,6 +63,11 @@ STAMPS = {
         f"{int(7.9 + time)}_{int((7.9 + time) % 1 * 1e9):09}" for time in TIMES
     ],
     "over a minute": ["20240501T123059,900", "20240501T123059,933", "20240501T123059,967", "20240501T123100,000"],
+    "time of day": ["12_30_05_900", "12_30_05_934", "12_30_05_967", "12_30_06_000"],
+    "time of day before a word": [f"cam1-09:59:59.{part}_rgb" for part in (900, 934, 967)] + ["cam1-10:00:00.000_rgb"],
+    "time of day in one number": ["123059900", "123059934", "123059967", "123100000"],
+    "a comma before four places": [f"{CLOCK + time:.4f}".replace(".", ",") for time in TIMES],
+    "a comma before three, since switched on": [f"rgb_{7.9 + time:.3f}".replace(".", ",") for time in TIMES],
 }
 
 
@@ -118,7 +123,10 @@ def test_a_frame_that_is_missing_changes_no_unit():
         [f"2024-01-01_12-00-00-{100 + 10 * i:03}_color" for i in range(20)],
         [f"{i // 10}_{i:06}" for i in range(30)],
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
+        [f"00_00_{i // 100:02}_{10 * (i % 100):03}" for i in range(150)],
+        ["23_59_59_900", "23_59_59_934", "23_59_59_967", "00_00_00_000"],
         ["20249901123059", "20249901123060"],
+        [],
         ["a", "b"],
         [f"9{i:017}" for i in range(4)],
         [f"9{i:030}" for i in range(4)],
@@ -227,6 +235,22 @@ def test_colour_and_depth_that_count_from_other_numbers_are_refused(first, refus
         with pytest.raises(GavoError, match=words):
             by_number(some, depth)
     assert by_number(color[:9], depth) and by_number(color[:5] + color[6:], depth)
+
+
+@pytest.mark.parametrize(
+    ("fewer", "refused"), [(30, True), (29, True), (31, True), (20, True), (40, False), (59, False)]
+)
+def test_twice_as_many_images_of_one_kind_may_be_of_two_rates(fewer, refused):
+    """A film's frames beside depth that was taken at half its rate: equal numbers are of other moments."""
+    many, few = (paths(*(f"{i:03}.png" for i in range(count))) for count in (60, fewer))
+    for color, depth in ((many, few), (few, many)):
+        if not refused:
+            assert len(by_number(color, depth).color.keys() & by_number(color, depth).depth.keys()) == fewer
+            continue
+        with pytest.raises(
+            GavoError, match=r"colour images are 0 to \d+, depth images 0 to \d+: give those of one frame"
+        ):
+            by_number(color, depth)
 
 
 def test_hidden_files_and_others_are_no_images():

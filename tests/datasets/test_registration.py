@@ -97,6 +97,16 @@ def test_into_a_lens_with_distortion():
         assert both.mean() > 0.5 and np.percentile(np.abs(registered - truth)[both], 99) < 0.012
 
 
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_readings_beyond_the_reach_of_a_lens_do_not_fold_into_the_image(model):
+    """They landed amid what the lens does show: those 60 degrees off its axis near the centre."""
+    lens = replace(COLOR, distortion=(-0.4, 0.0, 0.0, 0.0, 0.0)[: 4 if model == "fisheye" else 5], model=model)
+    wide = Camera(40.0, 40.0, 79.5, 59.5, 160, 120)
+    rays = np.hypot(*(axis.reshape(120, 160) for axis in Registration(wide, wide, np.eye(4))._rays[:2]))
+    raw = np.where(rays > 1.5, 2000, 0).astype(np.uint16)
+    assert raw.any() and not Registration(wide, lens, np.eye(4))(raw, 1000.0).any()
+
+
 def test_rays_of_a_wide_lens_are_followed_to_the_end():
     """By OpenCV's usual five iterations those of a wide barrel lens were off by pixels."""
     lens = Camera(240.0, 240.0, 319.5, 239.5, 640, 480, (-0.26, 0.05, 0.0, 0.0, 0.0))
