@@ -4,6 +4,8 @@ Before a wall that repeats itself both ways may agree on a motion that is off by
 is no edge.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,6 +21,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
 from gavo_jax.mapping.candidates import MOST, Candidate
 from gavo_jax.mapping.motions import between, carried, size
+from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -39,6 +42,8 @@ MAX_DISAGREEMENT = (0.02, 0.02)
 FLOOR = 1e-3
 """Metres and radians that a pair of keyframes is off by beside what its covariance says: each keyframe's velocity,
 hence its rolling shutter, is known to a few per cent."""
+SIDE_BY_SIDE = min(os.cpu_count() or 1, 8)
+"""Lots of candidates."""
 SHARED = 4.0
 """On the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
 
@@ -77,11 +82,14 @@ class Verifier:
         self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
 
     def verify(self, candidates: list[Candidate]) -> list[Edge | None]:
-        """Edges of the candidates that stand; None for the others."""
-        edges: list[Edge | None] = []
-        for start in range(0, len(candidates), MOST):
-            edges += self._verify(candidates[start : start + MOST])
-        return edges
+        """Edges of the candidates that stand; None for the others. More than one keyframe's are asked about in the end,
+        when nothing else is computed: several lots of them are aligned side by side.
+        """
+        lots = [candidates[start : start + MOST] for start in range(0, len(candidates), MOST)]
+        if len(lots) < 2:
+            return self._verify(candidates)
+        with ThreadPoolExecutor(min(SIDE_BY_SIDE, len(lots))) as workers:
+            return [edge for edges in workers.map(in_32_bits(self._verify), lots) for edge in edges]
 
     def _verify(self, candidates: list[Candidate]) -> list[Edge | None]:
         """Align there, and back only what stands; each from the guess, so that they are two opinions."""

@@ -12,7 +12,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
 from gavo_jax.image.settling import still
-from gavo_jax.mapping.candidates import APART, MIN_SECONDS, Candidate, find_candidates
+from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, Candidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
@@ -315,3 +315,22 @@ def test_before_tiles_that_repeat_nothing_ties_two_keyframes():
     near_the_last_tile = exp(np.array([-24.0 * 1.5 / 525, 0, 0, 0, 0, 0]))
     assert mapper.verifier.verify([Candidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
     assert mapper.find(tiled(96.0)) is None
+
+
+def test_many_candidates_are_verified_side_by_side_to_the_same_edges():
+    sequence = SyntheticSequence(9, camera=CAMERA, rate=10.0, noise=NONE)
+    mapper = Mapper(CAMERA)
+    frames = [mapper.keyframes.make(frame, k, 0, np.eye(4), np.zeros(6)) for k, frame in enumerate(sequence)]
+    for keyframe in frames:
+        mapper.keyframes.add(keyframe)
+    poses = sequence.ground_truth.world_T_camera
+    guesses = [inverse(pose) @ poses[0] for pose in poses[1:]]
+    many = [Candidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
+    alone = [edge for candidate in many for edge in mapper.verifier.verify([candidate])]
+    together = mapper.verifier.verify(many)
+    assert len(many) > MOST and [edge is None for edge in together] == [edge is None for edge in alone]
+    assert sum(edge is not None for edge in together) > MOST
+    for one, other in zip(together, alone, strict=True):
+        if one is not None and other is not None:
+            assert (one.earlier, one.later) == (other.earlier, other.later)
+            np.testing.assert_array_equal(one.earlier_T_later, other.earlier_T_later)
