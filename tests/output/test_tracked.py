@@ -59,19 +59,22 @@ def test_what_is_compiled_on_the_way_is_said_and_does_not_slow_the_run(monkeypat
     said = []
     monkeypatch.setattr(screen.PairProgress, "compiling", lambda bar: said.append(len(steps)))
     sequence, steps = rendered(), []
+    start = time.perf_counter()
     tracked = track_visibly("clip", sequence, Odometry(CAMERA, aligner=CompilesLate()), steps.append)
     assert said == [1]
     assert tracked.compile_seconds >= SECONDS
     assert tracked.metrics[COMPILE_SECONDS] == tracked.compile_seconds
-    assert tracked.seconds < SECONDS
-    assert all(step.milliseconds < 1e3 * SECONDS for step in steps)
+    others = time.perf_counter() - start - SECONDS
+    assert tracked.seconds < others
+    assert sum(step.milliseconds for step in steps) < 1e3 * others
 
 
 def test_a_library_call_leaves_it_out_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gavo_jax.odometry.driver.make_aligner", lambda *_: CompilesLate())
-    metrics: Any = run_odometry(rendered()).metrics
+    sequence, start = rendered(), time.perf_counter()
+    metrics: Any = run_odometry(sequence).metrics
     assert metrics[COMPILE_SECONDS] >= SECONDS
-    assert 4 / metrics["frames_per_second"] < SECONDS
+    assert 4 / metrics["frames_per_second"] < time.perf_counter() - start - SECONDS
 
 
 def test_before_a_camera_the_search_behind_the_first_one_is_made_as_well() -> None:
