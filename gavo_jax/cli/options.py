@@ -146,9 +146,9 @@ class Align(Search):
     """Align one pair of RGB-D images and print the motion as JSON."""
 
     rgb0: Annotated[Positional[Path], arg(metavar="RGB0")]
-    """Colour (or grey) image of the reference frame, 8 bit."""
+    """Colour or grey image of the reference frame."""
     depth0: Annotated[Positional[Path], arg(metavar="DEPTH0")]
-    """Depth image of the reference frame, 16 bit, registered to it."""
+    """Depth image of the reference frame, registered to it."""
     rgb1: Annotated[Positional[Path], arg(metavar="RGB1")]
     """Colour image of the target frame."""
     depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
