@@ -1,7 +1,8 @@
 """Whether a new frame can be trusted, before anything is aligned: from its own figures and those of the frames before.
 
-Each check costs a look at every fourth row, on the host; together they take well under a millisecond. A frame that
-fails one is told apart by its `AlignmentStatus`, and by what it may still be used for (`Use`).
+Each check costs a look at every fourth row, or at every seventh reading of depth, on the host; together they take well
+under a millisecond. A frame that fails one is told apart by its `AlignmentStatus`, and by what it may still be used for
+(`Use`).
 """
 
 import enum
@@ -115,6 +116,9 @@ MAX_USUAL_INTERVAL = 1.5
 MIN_INTERVALS = 3
 """Intervals that have to be known before one can be unusual."""
 ROW_STEP = 4
+DEPTH_STEP = 7
+"""Of so many pixels of a depth image, row after row, one is looked at: some of every row and, as few widths are
+multiples of this, of every column. Every fourth row may be one of those that a spinning sensor leaves out."""
 
 
 def check_frame(
@@ -157,7 +161,7 @@ def check_frame(
     frozen, history = _is_depth_frozen(frame, history)
     if frozen:
         return Finding(AlignmentStatus.FROZEN, Use.GREY), history
-    depth, history = _check_depth(np.asarray(frame.depth)[::ROW_STEP], camera.depth_scale, history)
+    depth, history = _check_depth(some_of(frame.depth), camera.depth_scale, history)
     if depth.use is Use.NOTHING:
         return _doubt(depth, history)
     history = history._replace(clipped=_remember(history.clipped, clipped), doubts=0)
@@ -184,8 +188,8 @@ def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tup
     """What speaks against an image [H, W] and its depth by themselves, without any frame before. A scene may be near
     then: of a whole run a depth of less than `DEPTH_RANGE` is told as well.
     """
-    rows, depths = (np.asarray(image)[::ROW_STEP] for image in (grey, depth))
-    status, _ = _check_image(rows)
+    depths = some_of(depth)
+    status, _ = _check_image(np.asarray(grey)[::ROW_STEP])
     if status is AlignmentStatus.NOT_FINITE:
         return (status,)
     found, readings = [status], _readings(depths)
@@ -259,10 +263,10 @@ def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
     """Whether depth is the last frame's once more, though it claims to be of another moment. None at all is not; nor is
     a wall that is seen from straight before it by an exact sensor, and has been since the first frame.
     """
-    rows, stamp = np.asarray(frame.depth)[:: ROW_STEP**2], frame.depth_timestamp
-    checksum = zlib.crc32(rows.tobytes())
+    some, stamp = some_of(frame.depth), frame.depth_timestamp
+    checksum = zlib.crc32(some.tobytes())
     repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
-    readings = _readings(rows)
+    readings = _readings(some)
     has_relief = history.has_relief or (readings.size > 0 and bool(np.ptp(readings) > FLAT * readings.max()))
     history = history._replace(depth_checksum=checksum, depth_timestamp=stamp, has_relief=has_relief)
     return repeated and has_relief and readings.size > 0, history
@@ -292,6 +296,11 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
     if coverage < MIN_COVERAGE_RATIO * usual:
         return Finding(AlignmentStatus.PARTIAL_DEPTH, Use.TARGET), history
     return Finding(AlignmentStatus.OK, Use.ALL), history
+
+
+def some_of(depth: np.ndarray) -> np.ndarray:
+    """Pixels from all over a depth image, in one row."""
+    return np.asarray(depth).ravel()[::DEPTH_STEP]
 
 
 def _readings(depth: np.ndarray) -> np.ndarray:

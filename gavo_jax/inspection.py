@@ -11,7 +11,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
 from gavo_jax.depth_edges import DepthEdges
-from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame
+from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame, some_of
 from gavo_jax.status import AlignmentStatus
 
 Facts = dict[str, Any]
@@ -99,8 +99,9 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
                 doubted[str(finding.status)] += 1
         if isinstance(frame, Frame):
             edges = edges.after(frame, sequence.camera)
-            readings = frame.depth[::4, ::4][frame.depth[::4, ::4] > 0] / sequence.camera.depth_scale
-            coverages.append(readings.size / frame.depth[::4, ::4].size)
+            some = some_of(frame.depth)
+            readings = some[some > 0] / sequence.camera.depth_scale
+            coverages.append(readings.size / some.size)
             contrast.append((float(frame.grey.mean()), float(frame.grey.std())))
             if readings.size:
                 ranges.append(np.percentile(readings, [1, 50, 99]))

@@ -18,7 +18,7 @@ from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
-from gavo_jax.image.numbers import as_array, as_depth
+from gavo_jax.image.numbers import NO_READING, as_array, as_depth
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.precision import in_32_bits
 from gavo_jax.program_cache import CachedProgram
@@ -330,9 +330,11 @@ def _plain(image: Any) -> Any:
 
 
 def _readings(depth: Any) -> Any:
-    """Depth that a program takes, 0 where it holds no finite number."""
+    """Depth that a program takes, as of `as_depth`; one that is on a device stays there."""
     if not isinstance(depth, jax.Array):
         return as_depth(depth)
+    if depth.dtype == jnp.uint16:
+        return jnp.where(depth < NO_READING, depth, 0)
     return jnp.where(jnp.isfinite(depth), depth, 0) if jnp.issubdtype(depth.dtype, jnp.floating) else depth
 
 

@@ -23,12 +23,20 @@ def as_array(image: Any) -> np.ndarray:
     return array.astype(np.uint16 if array.dtype == ">u2" else np.float32)
 
 
+NO_READING = np.iinfo(np.uint16).max
+"""Depth of 16 bits that stands for none, as 0 does."""
+
+
 def as_depth(image: Any) -> np.ndarray:
-    """The same of a depth image, with 0 where it holds no finite number: there is no reading either."""
+    """The same of a depth image, with 0 where there is no reading: no finite number, or of 16 bits the largest one."""
     array = as_array(image)
-    if array.dtype.kind != "f" or np.isfinite(array).all():
+    if array.dtype.kind == "f":
+        is_reading = np.isfinite(array)
+    elif array.dtype == np.uint16:
+        is_reading = array < NO_READING
+    else:
         return array
-    return np.where(np.isfinite(array), array, array.dtype.type(0))
+    return array if is_reading.all() else np.where(is_reading, array, array.dtype.type(0))
 
 
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:
@@ -41,4 +49,4 @@ def readings_like(depth: np.ndarray, readings: Float[np.ndarray, "*n"]) -> np.nd
     """Readings in 16 bits where the depth they were made of is so (0 where they do not fit), else as float32."""
     if depth.dtype != np.uint16:
         return readings.astype(np.float32)
-    return np.where(readings < np.iinfo(np.uint16).max, np.round(readings), 0.0).astype(np.uint16)
+    return np.where(readings < NO_READING, np.round(readings), 0.0).astype(np.uint16)

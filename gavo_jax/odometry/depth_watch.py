@@ -58,7 +58,8 @@ def judge_by_depth(
     """
     if AlignmentStatus.DEPTH_MISMATCH in result.statuses:
         return result, watch
-    change = watch.change.after(_without(frame, bodies), elapsed, result.target_T_reference, camera)
+    explained = float(result.explained.grey)
+    change = watch.change.after(_without(frame, bodies), elapsed, result.target_T_reference, explained, camera)
     watch = watch._replace(change=change)
     watch = watch._replace(told=watch.is_wrong)
     return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.told else result, watch
