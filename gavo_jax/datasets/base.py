@@ -58,7 +58,8 @@ class Frame:
 
     Attributes:
         grey: intensities, 0 to 255.
-        depth: raw depth along z, 0 = no reading; metres = depth / camera.depth_scale. Registered to `grey`.
+        depth: raw depth along z, registered to `grey`; metres = depth / camera.depth_scale. 0, and of 16 bits 65535,
+            is no reading.
         timestamp: of the colour image, seconds.
         color: RGB, where the sequence was asked for it.
         depth_timestamp: of the depth image, seconds, where it is known: the two are not exposed together.
