@@ -30,8 +30,8 @@ DIGITS_OF_A_CLOCK = 10
 """Those of seconds since 1970; finer ones have more."""
 
 FEWEST = 10
-"""Images of each kind, or poses and images, without a gap in their numbers, of which it is told that the two count from
-different ones, or different ones."""
+"""Images of each kind, or poses and images, numbered without a gap, of which it is told that the two do not count
+alike."""
 
 RATES = (2, 3, 4, 5, 6)
 """How many images of one kind may come for each of the other, where both are of all that their cameras took."""
@@ -114,11 +114,11 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
 
 
 def _check_start(found: Found) -> None:
-    """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others.
+    """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others, or of
+    which there are `RATES` times as many of one kind.
 
     Whether one number or one place in the order is one frame is open then. Of a camera that started, or stopped, later
-    than the other one, the other ends are alike. But where there are twice as many of one kind, or three times, both
-    may be of the whole clip.
+    than the other one, the other ends are alike; but of one that is so many times as fast, too.
     """
     color, depth, _ = found
     few, many = sorted(map(len, (color, depth)))
