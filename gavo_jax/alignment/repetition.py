@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64, Integer
 
 from gavo_jax.alignment.planes import Plane, Small, StraightView, planes, seen_straight, smaller
 from gavo_jax.camera import Camera, to_pixels
+from gavo_jax.frame_checks import some_of
 from gavo_jax.trajectory import inverse
 
 REPEATS = 0.6
@@ -216,7 +217,7 @@ def _ahead(depth: Any, camera: Camera) -> Plane:
 
 def _distance(depth: Any, camera: Camera) -> float:
     """Metres, of the median of what is read."""
-    read = np.asarray(depth)[::8, ::8]
+    read = some_of(depth)
     read = read[read > 0]
     return max(float(np.median(read)) / float(camera.depth_scale), NEAREST) if read.size else USUAL_DISTANCE
 

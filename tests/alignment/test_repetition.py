@@ -46,6 +46,12 @@ def test_a_tiled_wall_repeats_itself_after_a_tile() -> None:
     assert {(20, 0), (0, 20), (-20, 0), (20, -20)} <= pixels(wall(20.0, noise=3.0))
 
 
+def test_a_tile_is_as_large_before_a_sensor_that_reads_every_other_row() -> None:
+    read = np.where(np.arange(CAMERA.height)[:, None] % 2 == 1, DEPTH // 3, 0)
+    size = np.linalg.norm(steps(wall(20.0), read), axis=1).min()
+    np.testing.assert_allclose(size, 20 * DISTANCE / 3 / CAMERA.fx, rtol=0.01)
+
+
 def slanted(slope: float, period: float = 0.2, noise: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """A tiled wall, turned by its slope along x, with tiles of so many metres; its depth as a Kinect reads it."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
