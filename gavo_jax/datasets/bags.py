@@ -419,10 +419,18 @@ class _Bag:
 
     def _between(self, a: str, b: str) -> tuple[np.ndarray | None, str]:
         """`a_T_b`, and the topic that says it; None where nothing does."""
-        found = between(self._transforms(FIXED_TOPIC), a, b)
-        if found is not None:
-            return found, FIXED_TOPIC
-        return between(self._transforms(FIXED_TOPIC, ANY_TOPIC), a, b), ANY_TOPIC
+        found = between(self._fixed, a, b)
+        return (found, FIXED_TOPIC) if found is not None else (between(self._unchanged, a, b), ANY_TOPIC)
+
+    @cached_property
+    def _fixed(self) -> dict[tuple[str, str], np.ndarray]:
+        """The transforms that are published once."""
+        return self._transforms(FIXED_TOPIC)
+
+    @cached_property
+    def _unchanged(self) -> dict[tuple[str, str], np.ndarray]:
+        """Those, and the ones that are published over and over without a change."""
+        return self._transforms(FIXED_TOPIC, ANY_TOPIC)
 
     def _transforms(self, *names: str) -> dict[tuple[str, str], np.ndarray]:
         """The transforms of some topics that never change."""
