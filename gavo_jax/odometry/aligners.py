@@ -207,6 +207,16 @@ def traced_part(options: OdometryOptions) -> OdometryOptions:
     return replace(options, recover=True, bodies="off", on_lost="hold", loops=False)
 
 
+def side_by_side(here: Callable[[], Any], beside: Callable[[], Any]) -> float:
+    """Compile by two functions at once, the second one in a thread; the seconds this took."""
+    start = time.perf_counter()
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        other = worker.submit(in_32_bits(beside))
+        here()
+        other.result()
+    return time.perf_counter() - start
+
+
 @dataclass(frozen=True)
 class Recovering:
     """An aligner whose unusable results are tried again by another one, from the same state.
@@ -232,12 +242,7 @@ class Recovering:
         """Of both, side by side."""
         if self.wide is None:
             return self.first.warm_up()
-        start = time.perf_counter()
-        with ThreadPoolExecutor(max_workers=1) as worker:
-            wide = worker.submit(in_32_bits(self.wide.warm_up))
-            self.first.warm_up()
-            wide.result()
-        return time.perf_counter() - start
+        return side_by_side(self.first.warm_up, self.wide.warm_up)
 
     def start(self, frame: Frame) -> Any:
         """By the first one."""
