@@ -9,7 +9,8 @@ from small import CAMERA
 
 from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches, frames_of, read_plan
+from gavo_jax.experiments.plan import batches, frames_of
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
 GRID = """

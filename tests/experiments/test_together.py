@@ -19,7 +19,8 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
 from gavo_jax.experiments import together
 from gavo_jax.experiments.executors import LocalExecutor
-from gavo_jax.experiments.plan import Plan, read_plan
+from gavo_jax.experiments.plan import Plan
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
