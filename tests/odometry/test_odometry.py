@@ -23,7 +23,8 @@ from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import WithRival
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, NONE, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import build_pyramid
