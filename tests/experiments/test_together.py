@@ -25,9 +25,9 @@ from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
-from gavo_jax.odometry.aligners import without_depth
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings
