@@ -36,10 +36,10 @@ from gavo_jax.datasets.moving import MovingPart as MovingPart
 from gavo_jax.datasets.registry import open_source as open_source
 from gavo_jax.datasets.registry import register_dataset as register_dataset
 from gavo_jax.datasets.room import Box as Box
-from gavo_jax.datasets.synthetic import SensorNoise as SensorNoise
+from gavo_jax.datasets.sensor_noise import SensorNoise as SensorNoise
 from gavo_jax.datasets.synthetic import SyntheticSequence as SyntheticSequence
-from gavo_jax.datasets.synthetic import write_tum as write_tum
 from gavo_jax.datasets.tum import TumSequence as TumSequence
+from gavo_jax.datasets.tum_writing import write_tum as write_tum
 from gavo_jax.errors import GavoError as GavoError
 from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error
 from gavo_jax.evaluation import distance_error as distance_error

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, Camera
 from gavo_jax.camera_makes import PARSERS, PROJECTION, Table
-from gavo_jax.camera_words import MODELS, model_of
+from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
@@ -38,9 +38,6 @@ LARGEST_SHIFT = 10.0
 ROTATION_TOLERANCE = 1e-3
 """How far a rotation, printed with a few digits, may be off one."""
 
-CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "model", "depth_scale", "readout")
-DEVICE_KEYS = ("depth_delay",)
-REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
 
 

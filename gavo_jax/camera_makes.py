@@ -14,19 +14,14 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera_exports import Table, is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
-from gavo_jax.camera_words import MATRIX, beside, first, known, numbers_of
+from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 PROJECTION = "projection_matrix"
 """Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
-FOCAL = ("fx", "fy", "cx", "cy")
-
 NESTED = ("camera", "cam", "camera_params", "cam_params")
 """Tables in which Replica, NICE-SLAM, SplaTAM and others keep a camera."""
-
-OWN = ("width", "height", "distortion", "model", "depth_scale", "readout", "depth_delay")
-"""Keys of our own that mean what they mean there."""
 
 SAME_CAMERA = 0.5
 """Pixels by which colour and depth camera of a scan may differ where depth is registered."""
@@ -181,7 +176,7 @@ def _read_vins(path: Path, values: Table) -> Table:
 
 def _read_flat(path: Path, values: Table) -> Table:
     """Looks like a camera of single numbers."""
-    ours = {key: value for key, value in values.items() if key in OWN or not known(key)}
+    ours = {key: value for key, value in values.items() if key in CAMERA_KEYS + DEVICE_KEYS or not known(key)}
     others = {key: value for key, value in values.items() if key not in ours}
     return {**ours, **beside(str(path), others)}
 
@@ -289,7 +284,7 @@ def _storage_orb(storage: Any) -> Table | None:
         node = storage.getNode(name)
         return None if node.empty() else _real(node, name)
 
-    table: Table = {key: real(f"{prefix}.{key}") for key in ("fx", "fy", "cx", "cy")}
+    table: Table = {key: real(f"{prefix}.{key}") for key in FOCAL}
     for key in ("width", "height"):
         value = real(f"Camera.{key}")
         table[key] = None if value is None else int(value)

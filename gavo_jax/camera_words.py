@@ -14,6 +14,13 @@ from gavo_jax.errors import GavoError
 
 Table = dict[str, Any]
 
+FOCAL = ("fx", "fy", "cx", "cy")
+REQUIRED = (*FOCAL, "width", "height")
+CAMERA_KEYS = (*REQUIRED, "distortion", "model", "depth_scale", "readout")
+"""Keys of a camera in our own files, the first ones in every one;"""
+DEVICE_KEYS = ("depth_delay",)
+"""and beside the cameras of a device."""
+
 MATRIX = ("cameramatrix", "k", "m1")
 """Of fx, fy, cx and cy."""
 

@@ -89,7 +89,6 @@ class CachedProgram(Generic[P, R]):
 
     def __init__(self, function: Callable[P, R], static: tuple[str, ...] = (), returns: tuple[type, ...] = ()):
         self._function, self._jitted = function, jax.jit(function, static_argnames=static)
-        self._called: set[Any] = set()
         for node in returns:
             _register(node)
         update_wrapper(self, function)
@@ -102,21 +101,16 @@ class CachedProgram(Generic[P, R]):
             return self._jitted(*args, **kwargs)
         kinds = tuple(map(Kind.of, leaves))
         signature = self._signature(structure, kinds, kwargs)
-        if _folder is None:
-            if signature in self._called:
-                return self._jitted(*args, **kwargs)
-            self._called.add(signature)
-            with counted_wait():  # to compile takes longer than the call
-                return self._jitted(*args, **kwargs)
         program = _loaded.get(signature)
-        if program is None:
-            with _lock:
-                loading = _loading.setdefault(signature, threading.Lock())
-            with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
-                program = _loaded.get(signature)
-                if program is None:
-                    program = _loaded[signature] = self._load(_folder, leaves, structure, kinds, kwargs)
-        return program(*leaves)
+        if program is not None:
+            return program(*leaves)
+        with _lock:
+            loading = _loading.setdefault(signature, threading.Lock())
+        with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
+            program = _loaded.get(signature)
+            if program is None:
+                program = _loaded[signature] = self._load(leaves, structure, kinds, kwargs)
+            return program(*leaves)  # which compiles it, where `_load` did not
 
     def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:
         """Whether a call would find its program, here or in the folder, and trace and compile nothing."""
@@ -145,16 +139,20 @@ class CachedProgram(Generic[P, R]):
         return folder / f"{function.__name__.strip('_')}-{digest[:32]}"
 
     def _load(
-        self, folder: Path, leaves: list[Any], structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]
+        self, leaves: list[Any], structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]
     ) -> Callable[..., R]:
-        """The program as a function of the leaves: from its file, or traced and written there."""
+        """The program as a function of the leaves: from its file, or traced and written there; where none is kept, as
+        `jax.jit` makes it.
+        """
 
         def of_leaves(*leaves: Any) -> R:
             return self._function(*jax.tree.unflatten(structure, leaves), **static)
 
         jitted = jax.jit(of_leaves)
+        if _folder is None:
+            return jitted
         try:
-            path = self._path(folder, structure, kinds, static)
+            path = self._path(_folder, structure, kinds, static)
         except Foreign:
             return jitted
         data = _read(path)

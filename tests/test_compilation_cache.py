@@ -14,7 +14,8 @@ from small import CAMERA
 
 from gavo_jax import program_cache
 from gavo_jax.compilation_cache import enable_compilation_cache, why_not_private
-from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoWarning
 from gavo_jax.program_cache import keep_programs_in
 

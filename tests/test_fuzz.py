@@ -18,7 +18,8 @@ from gavo_jax.camera import MAX_SIDE, Camera
 from gavo_jax.camera_files import load_camera
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches, read_plan
+from gavo_jax.experiments.plan import batches
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.tuning import read_tuning
 from gavo_jax.trajectory import Trajectory
 

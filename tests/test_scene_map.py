@@ -10,7 +10,8 @@ from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun

@@ -18,7 +18,7 @@ from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.frame_checks import check_images
-from gavo_jax.image.numbers import NO_READING, as_array, as_depth
+from gavo_jax.image.numbers import as_array, with_zeros
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.precision import in_32_bits
 from gavo_jax.program_cache import CachedProgram
@@ -329,15 +329,6 @@ def _plain(image: Any) -> Any:
     return image if isinstance(image, jax.Array) else as_array(image)
 
 
-def _readings(depth: Any) -> Any:
-    """Depth that a program takes, as of `as_depth`; one that is on a device stays there."""
-    if not isinstance(depth, jax.Array):
-        return as_depth(depth)
-    if depth.dtype == jnp.uint16:
-        return jnp.where(depth < NO_READING, depth, 0)
-    return jnp.where(jnp.isfinite(depth), depth, 0) if jnp.issubdtype(depth.dtype, jnp.floating) else depth
-
-
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
         raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
@@ -348,7 +339,7 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
             fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
             raise GavoError(fault + what_helps(name, image))
     require_grey_levels(grey)
-    depth = _readings(depth)
+    depth = with_zeros(depth)
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
@@ -381,6 +372,6 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
             raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
         require_grey_levels(side[0])
-        return Images(jnp.asarray(side[0]), jnp.asarray(_readings(side[1])))
+        return Images(jnp.asarray(side[0]), jnp.asarray(with_zeros(side[1])))
     images = [_rectified_images(frame, camera) for frame in side]
     return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

@@ -4,8 +4,6 @@
 move, that is all.
 """
 
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -26,10 +24,9 @@ from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.mapping.motions import exp, log
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.precision import in_32_bits
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 
@@ -113,12 +110,12 @@ class BodyAware:
 
     def warm_up(self) -> float:
         """Compile what every frame needs, side by side: the search, and the look at what it explains."""
-        start, state = time.perf_counter(), self.blank_state()
-        with ThreadPoolExecutor(max_workers=1) as worker:
-            look = worker.submit(in_32_bits(self.retina.look), state.scene, state.tracker, np.eye(4))
-            self.first.warm_up()
-            jax.block_until_ready(look.result())
-        return time.perf_counter() - start
+        state = self.blank_state()
+
+        def look() -> None:
+            jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
+
+        return side_by_side(self.first.warm_up, look)
 
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""

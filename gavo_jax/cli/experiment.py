@@ -14,7 +14,8 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.errors import GavoError, printable, read_text
 from gavo_jax.experiments.distinction import tell_apart
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
-from gavo_jax.experiments.plan import Plan, Run, programs, read_plan
+from gavo_jax.experiments.plan import Plan, Run, programs
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.summary import DRIFT, ROTATION_DRIFT, Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table

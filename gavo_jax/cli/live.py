@@ -59,7 +59,6 @@ def run_live(options: Run) -> int:
         say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
         scene = None if options.map is None else LiveMap(MapBuilder(odometry.camera, options.voxel))
         end = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
-        seconds = end.stopwatch.seconds
         if odometry.progress.last_index < 1:
             tracked = odometry.progress.last_index + 1
             seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
@@ -69,7 +68,7 @@ def run_live(options: Run) -> int:
         metrics: dict[str, Any] = {
             **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed},
             "complete": end.fault is None,
-            **conclude(first, folder.steps(), None, None, seconds, compile_seconds + end.stopwatch.waited).figures,
+            **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
@@ -89,11 +88,13 @@ def run_live(options: Run) -> int:
 class _End(NamedTuple):
     """How tracking came to its end."""
 
-    stopwatch: Stopwatch
-    """Since the first frame."""
-    interrupted: bool = False
+    seconds: float
+    """Since the first frame, without"""
+    waited: float
+    """those spent waiting for programs."""
+    interrupted: bool
     """By Ctrl-C."""
-    fault: GavoError | None = None
+    fault: GavoError | None
     """Of the device."""
 
 
@@ -109,6 +110,7 @@ def _track(
 ) -> _End:
     """Track until there is no more. Images that are unlike the first ones make a lost frame."""
     count, stopwatch = 0, Stopwatch()
+    interrupted, fault = False, None
     images: LiveImages
     try:
         for images in newest:
@@ -144,12 +146,12 @@ def _track(
         if count < 2:
             raise
         tell(f"{newest.device.name}: interrupted after {count} frames")
-        return _End(stopwatch, interrupted=True)
+        interrupted = True
     except GavoError as error:  # what was tracked counts
         if count < 2:
             raise
-        return _End(stopwatch, fault=error)
-    return _End(stopwatch)
+        fault = error
+    return _End(stopwatch.seconds, stopwatch.waited, interrupted, fault)
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:

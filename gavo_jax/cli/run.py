@@ -26,9 +26,9 @@ from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
-from gavo_jax.odometry.aligners import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import conclude
+from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
@@ -36,6 +36,7 @@ from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
+from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
@@ -73,21 +74,8 @@ def run(options: Run) -> int:
             record=viewer.wants_populations,
             relocaliser=mapper,
         )
-        config = {
-            "options": with_whole_paths(options),
-            "sequence": {
-                "name": sequence.name,
-                "frames": len(sequence),
-                "first_timestamp": float(sequence.timestamps[0]),
-                "last_timestamp": float(sequence.timestamps[-1]),
-                "camera": sequence.camera,
-                "recorded": recorded_as(sequence),
-                **({"bodies": options.moving} if options.moving else {}),
-            },
-            **circumstances(settings),
-        }
-        blank = blank_of(odometry.aligner)
-        progress = folder.resume(config, blank) if options.resume else None
+        config = _configuration(options, sequence, settings)
+        progress = folder.resume(config, blank_of(odometry.aligner)) if options.resume else None
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
@@ -125,6 +113,23 @@ def run(options: Run) -> int:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:
+    """What config.json says of a run."""
+    return {
+        "options": with_whole_paths(options),
+        "sequence": {
+            "name": sequence.name,
+            "frames": len(sequence),
+            "first_timestamp": float(sequence.timestamps[0]),
+            "last_timestamp": float(sequence.timestamps[-1]),
+            "camera": sequence.camera,
+            "recorded": recorded_as(sequence),
+            **({"bodies": options.moving} if options.moving else {}),
+        },
+        **circumstances(settings),
+    }
 
 
 def _track(

@@ -1,16 +1,8 @@
-"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), long because cameras and streams share a reader of rosbags.
-
-They are read as a stream.
-"""
+"""Frames of recordings of ROS 1 and ROS 2 (SQLite, MCAP), which are read as a stream."""
 
 import contextlib
-import io
-import itertools
-import re
-import struct
 import threading
-import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,59 +12,23 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, Size, camera_from_table
+from gavo_jax.camera_files import Calibration, Size
 from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
 from gavo_jax.datasets.files import Reading, places_of_a_few
-from gavo_jax.datasets.messages import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    as_taken,
-    camera_table,
-    color_of,
-    depth_of,
-    is_calibrated,
-    is_depth,
-)
+from gavo_jax.datasets.messages import color_of, depth_of
+from gavo_jax.datasets.recording import METADATA, SUFFIXES, Bag, legible
 from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
-from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_registered
-from gavo_jax.datasets.transforms import ANY_TOPIC, FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
-from gavo_jax.errors import GavoError, blamed
+from gavo_jax.datasets.topics import says_rectified
+from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, associate
-
-SUFFIXES = (".bag", ".mcap", ".db3")
-METADATA = "metadata.yaml"
-"""In the folder of a ROS 2 bag."""
-
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of what is compressed so."""
-
-MCAP = b"\x89MCAP0\r\n"
-"""First bytes of such a file."""
-
-FOREIGN = {
-    "": "its header names no profile, and the library reads 'ros2' alone: ros2 bag convert writes it so, if ROS 2's "
-    "messages are in it",
-    "ros1": "its profile is 'ros1', and the library reads 'ros2' alone: name the .bag that it was made from",
-}
-"""What to do about an MCAP by the profile in its header."""
 
 FAR_AHEAD = 64
 """Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
 
 NOWHERE: tuple[int, int] = (2**62, 2**62)
 """Behind every message: where a stream stands before it is entered."""
-
-FEW = 30
-"""Messages of a topic that are looked at for one that says something."""
-
-ROUNDED = 0.05
-"""Pixels by which the same camera may differ from one camera_info to another."""
-
-RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
-"""In the name of a topic whose images are free of distortion."""
 
 
 class BagSequence:
@@ -96,7 +52,7 @@ class BagSequence:
         Raises:
             GavoError: no bag, a torn one, no topic of colour or depth or several, no camera, no frame.
         """
-        self._bag = _Bag(path)
+        self._bag = Bag(path)
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
         self.ground_truth: Trajectory | None = None
         color, depth = self._bag.choose(reading)
@@ -211,7 +167,7 @@ class BagSequence:
 
     def _calibrate(self, path: Path, reading: Reading) -> Calibration:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
-        is_rectified = _is_rectified(self._topics[0].name)
+        is_rectified = says_rectified(self._topics[0].name)
         found = reading.calibration(own, self._size, MILLIMETRES, is_rectified)  # units of 16UC1, by REP 118
         return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
 
@@ -253,7 +209,7 @@ def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> fl
 class _Stream:
     """Gives the messages of frame after frame; each is read once while frames are asked for in order."""
 
-    def __init__(self, bag: "_Bag", topics: tuple[Topic, ...]) -> None:
+    def __init__(self, bag: Bag, topics: tuple[Topic, ...]) -> None:
         self._bag, self._topics, self._lock = bag, topics, threading.Lock()
         self._numbers = {topic.name: at for at, topic in enumerate(topics)}
         self._coming: Iterator[tuple[str, bytes, str]] = iter(())
@@ -272,7 +228,7 @@ class _Stream:
             if any(self._is_out_of_reach(topic, number) for topic, number in enumerate(wanted)):
                 self._enter(wanted)
             while missing := [key for key in enumerate(wanted) if key not in self._pending]:
-                with _legible(self._bag.path, FrameError):
+                with legible(self._bag.path, FrameError):
                     found = next(self._coming, None)
                 if found is None:
                     self._next = list(NOWHERE)
@@ -293,234 +249,3 @@ class _Stream:
         self._next = [int(np.searchsorted(topic.received, start)) for topic in self._topics]
         self._pending.clear()
         self._coming = self._bag.stream([topic.name for topic in self._topics], start)
-
-
-class _Bag:
-    """A recording as the library opens it; whatever it raises is one line here."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise GavoError(f"{path}: recordings of ROS need the extra [bag]: pip install 'gavo-jax[bag]'") from None
-        self.path = path
-        if path.is_file() and path.suffix not in SUFFIXES:
-            raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
-        if path.is_dir() and path.suffix == ".bag":
-            raise GavoError(f"{path}: a folder of ROS 2, which the library takes for a file of ROS 1: rename it")
-        with _legible(path):
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            self._reader.open()
-            _own_files(self._reader)
-        weakref.finalize(self, _close, self._reader)
-        self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
-
-    def stream(self, names: list[str], start: int | None = None) -> Iterator[tuple[str, bytes, str]]:
-        """Topic, content and type of messages, in the order in which they were received, from a time (ns) on."""
-        connections = [connection for connection in self._reader.connections if connection.topic in names]
-        for connection, _, raw in self._reader.messages(connections, start=start):
-            if self._reader.is2 and bytes(raw[:4]) == ZSTD:
-                raise GavoError(
-                    f"{self.path}: its messages are compressed (zstd), as its {METADATA} says: name the folder of both"
-                )
-            yield connection.topic, bytes(raw), connection.msgtype
-
-    def deserialize(self, raw: bytes, kind: str) -> Any:
-        """The message; raises `FrameError` for one that is torn."""
-        with _legible(self.path, FrameError):
-            return self._reader.deserialize(raw, kind)
-
-    def topic(self, name: str) -> Topic:
-        """Go over the messages of a topic for their stamps."""
-        connections = [connection for connection in self._reader.connections if connection.topic == name]
-        received, stamps = [], []
-        with _legible(self.path):
-            for _, time, raw in self._reader.messages(connections):
-                received.append(time)
-                stamps.append(_stamp(raw, self._reader.is2))
-        return Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
-
-    def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
-        """The first message of a topic, of the first few those that are good."""
-        with _legible(self.path):
-            few = itertools.islice(self.stream([name]), FEW)
-            messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
-            return next(filter(is_good, messages), None)
-
-    def size(self, name: str) -> Size:
-        """Width and height of the first image of a topic."""
-        kind, message = self.kinds[name], self.first(name)
-        if kind == IMAGE:
-            return int(message.width), int(message.height)  # pyright: ignore[reportOptionalMemberAccess]
-        read = depth_of if is_depth(kind, message, name) else color_of
-        height, width = read(kind, message, name).shape[:2]
-        return width, height
-
-    def choose(self, reading: Reading) -> tuple[str, str]:
-        """The topics of colour and depth, those that are named or those that messages and names speak for."""
-        images = {}
-        for name, kind in sorted(self.kinds.items()):
-            if (message := self.first(name)) is not None:
-                images[name] = Images.of(kind, message, name)
-        color, depth = choose(self.path, images, reading.color_topic, reading.depth_topic)
-        are_named = reading.color_topic is not None and reading.depth_topic is not None
-        if are_of_two_cameras(color, depth) and not are_named:
-            frames = images[color].frame, images[depth].frame
-            if frames[0] == frames[1] or self._between(*frames)[0] is None:
-                raise GavoError(
-                    f"{self.path}: {color} and {depth} are of two cameras, by their names: "
-                    "say --colour-topic and --depth-topic if they are of one"
-                )
-        return color, depth
-
-    def calibration(self, color: str, depth: str) -> Calibration:
-        """The cameras of two topics, from the camera_info beside each."""
-        found = self._info(color)
-        if found is None:
-            raise GavoError(f"{self.path}: no camera_info for {color}: say --camera")
-        name, info = found
-        camera = self._camera(name, info, color)
-        other = self._info(depth)
-        moved = None if other is None else self._camera(*other, depth)
-        if other is None or moved is None:
-            return self._alone(camera, name, (color, depth), info.header.frame_id)
-        frames = (info.header.frame_id, other[1].header.frame_id)
-        says_so = says_registered(color, depth)
-        is_one_place = frames[0] == frames[1] or not all(frames) or says_so
-        are_placed = any(frames) or says_so  # two that have no name are not for that one frame
-        color_T_depth, where = self._between(*frames) if are_placed else (None, "")
-        if _is_same(moved, camera):
-            color_T_depth = np.eye(4) if is_one_place else color_T_depth
-            has_one_lens = moved.distortion == camera.distortion or _is_rectified(color) == _is_rectified(depth)
-            if has_one_lens and color_T_depth is not None and np.allclose(color_T_depth, np.eye(4)):
-                return Calibration(camera, origin=name, states_depth_scale=False)
-        if color_T_depth is None:
-            raise GavoError(
-                f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie, "
-                f"nor does {ANY_TOPIC} without a change: "
-                "say --camera with a file of both cameras ([depth], colour_T_depth), or another --depth-topic"
-            )
-        origin = f"{name}, {other[0]} and {where}"
-        return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
-
-    def _alone(self, camera: Camera, name: str, topics: tuple[str, str], frame: str) -> Calibration:
-        """One camera for both topics, where nothing says that depth, without a camera_info, lies in another frame."""
-        image = self.first(topics[1])
-        other = frame if image is None else image.header.frame_id
-        color_T_depth, _ = self._between(frame, other)
-        if frame and other and (color_T_depth is None or not np.allclose(color_T_depth, np.eye(4))):
-            raise GavoError(
-                f"{self.path}: no camera_info for {topics[1]}, whose images lie in the frame {other[:60]!r} and not in "
-                f"{frame[:60]!r} as {topics[0]}: say --camera with a file of both cameras ([depth], colour_T_depth), "
-                "or of one if depth is registered to colour"
-            )
-        return Calibration(camera, origin=name, states_depth_scale=False)
-
-    def _between(self, a: str, b: str) -> tuple[np.ndarray | None, str]:
-        """`a_T_b`, and the topic that says it; None where nothing does."""
-        found = between(self._transforms(FIXED_TOPIC), a, b)
-        if found is not None:
-            return found, FIXED_TOPIC
-        return between(self._transforms(FIXED_TOPIC, ANY_TOPIC), a, b), ANY_TOPIC
-
-    def _transforms(self, *names: str) -> dict[tuple[str, str], np.ndarray]:
-        """The transforms of some topics that never change."""
-        topics = [c.topic for c in self._reader.connections if c.topic in names and c.msgtype == TRANSFORMS]
-        with blamed(f"{self.path}: {' and '.join(names)}"):
-            raw = self.stream(topics) if topics else ()
-            return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
-
-    def _info(self, topic: str) -> tuple[str, Any] | None:
-        """Name and first message of the camera_info beside a topic of images; one that says something, if any does.
-
-        RealSense's own recordings have it in a place of its own, `info/` beside `image/`.
-        """
-        infos = [c.topic for c in self._reader.connections if c.msgtype == CAMERA_INFO]
-        parts = topic.split("/")
-        beside = ["/".join(parts[:length]) for length in range(len(parts) - 1, 0, -1)]
-        for name in (f"{place}/{inner}camera_info" for place in beside for inner in ("", "info/")):
-            if name in infos and (message := self.first(name, is_calibrated) or self.first(name)) is not None:
-                return name, message
-        return None
-
-    def _camera(self, name: str, info: Any, topic: str) -> Camera:
-        place = f"{self.path}: {name}"
-        if not is_calibrated(info):
-            raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
-        with blamed(place):
-            table = as_taken(place, camera_table(info, _is_rectified(topic)), info, partial(self.size, topic))
-            return camera_from_table(place, table, MILLIMETRES)
-
-
-class _File(io.BufferedReader):
-    """A file that closes itself when nobody holds it any more: to read a recording is no context to be left."""
-
-    def close(self) -> None:
-        self.raw.close()
-        super().close()
-
-
-def _own_files(reader: Any) -> None:
-    """Let the library read files that close themselves in place of those that it opened.
-
-    It does not get to closing a ROS 1 file while somebody holds a message of its last chunk.
-    """
-    for part in reader.readers:
-        if isinstance(file := getattr(part, "bio", None), io.BufferedReader):
-            part.bio = _File(io.FileIO(file.name))
-            file.close()
-
-
-@contextlib.contextmanager
-def _legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
-    """Turn what the library raises of a torn recording into one line that says what may help."""
-    with blamed(f"{path}: not a bag that can be read", lambda words: kind(f"{words}: {_mending(path)}")):
-        yield
-
-
-def _mending(path: Path) -> str:
-    """What may help with a recording that is torn."""
-    files = [path] if path.is_file() else list(path.iterdir())
-    profiles = {_profile(file) for file in files if file.suffix.lower() == ".mcap"}
-    if (profile := next(iter(profiles - {"ros2", None}), None)) is not None:
-        return FOREIGN.get(profile, f"its profile is {profile[:40]!r}, and the library reads 'ros2' alone")
-    kinds = {file.suffix.lower() for file in files}
-    tool = "mcap recover" if ".mcap" in kinds else "rosbag reindex" if ".bag" in kinds else "ros2 bag reindex"
-    return f"get it anew, or mend it with {tool}"
-
-
-def _profile(file: Path) -> str | None:
-    """The profile in the header of an MCAP, the first of its records; None where there is no such header."""
-    with contextlib.suppress(OSError, struct.error, UnicodeDecodeError), file.open("rb") as stream:
-        magic, kind, _, length = struct.unpack("<8sBQI", stream.read(21))
-        if (magic, kind) == (MCAP, 1) and len(profile := stream.read(min(length, 64))) == length:
-            return profile.decode()
-    return None
-
-
-def _close(reader: Any) -> None:
-    """Close a recording that nobody holds any more, as far as the library gets."""
-    with contextlib.suppress(Exception):
-        reader.close()
-
-
-def _stamp(raw: Any, is_2: bool) -> float:
-    """Seconds, from the header that every image message begins with."""
-    data = bytes(raw[:12])
-    if len(data) < 12:
-        return 0.0
-    order = "<" if not is_2 or data[1] & 1 else ">"
-    seconds, nanoseconds = struct.unpack(f"{order}II", data[4:12])
-    return seconds + nanoseconds * 1e-9
-
-
-def _is_same(a: Camera, b: Camera) -> bool:
-    """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
-    numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
-    return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))
-
-
-def _is_rectified(topic: str) -> bool:
-    """Whether a topic's name says that its images are free of distortion."""
-    return bool(RECTIFIED.search(topic))

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from gavo_jax.camera import Camera
 from gavo_jax.camera_exports import common_camera
 from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
+from gavo_jax.camera_words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.folders import NumberedFolder, PlainFolder
@@ -188,7 +189,7 @@ def _at_width(camera: Camera, width: int) -> Camera:
 
 
 def _numbers(camera: Camera) -> dict[str, float]:
-    return {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
+    return {key: getattr(camera, key) for key in REQUIRED}
 
 
 def _numbered(place: str, fields: list[str], count: int) -> list[float] | None:

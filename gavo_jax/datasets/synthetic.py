@@ -1,17 +1,14 @@
-"""A synthetic RGB-D sequence, long because its path, its sensor's noise and its files describe one and the same camera.
-
-It moves through the rendered room; poses are exact, the noise is optional.
-"""
+"""A synthetic RGB-D sequence: a camera that moves through the rendered room, with exact poses and optional noise."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, cast, overload
+from typing import ClassVar, overload
 
 import cv2
 import numpy as np
@@ -19,8 +16,7 @@ from jaxtyping import Float, UInt8, UInt16
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.actors import builtin_bodies, turn
-from gavo_jax.datasets.base import Frame, Sequence
-from gavo_jax.datasets.bodies_truth import MASKS, WithBodies, write_mask, write_truth
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
 from gavo_jax.datasets.rendering import render
 from gavo_jax.datasets.room import (
@@ -30,6 +26,7 @@ from gavo_jax.datasets.room import (
     MARGIN_Y,
     free_space,
 )
+from gavo_jax.datasets.sensor_noise import KINECT, SensorNoise
 from gavo_jax.errors import GavoError
 from gavo_jax.image.shutter import row_time
 from gavo_jax.trajectory import Trajectory
@@ -48,118 +45,6 @@ LARGEST_EXTENT = 50.0
 _HALF_EXTENT, _HEIGHT = (3.0, 2.5), 3.0
 _FORWARD, _EYE_LEVEL = 0.45, 1.35
 _PATH_STREAM, _EXPOSURE_STREAM, _FRAME_STREAM = range(3)
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """What a structured-light RGB-D camera adds to the exact image and depth. All zeros (the default): nothing.
-
-    Depth noise and quantisation live in disparity, hence in inverse depth: both grow with z^2 (Khoshelham & Oude
-    Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 2012).
-
-    Attributes:
-        depth_sigma: deviation of inverse depth, 1/m: sigma_z = depth_sigma z^2.
-        depth_step: quantisation of inverse depth, 1/m: neighbouring depths differ by depth_step z^2.
-        depth_nearest: nearest depth with a reading, metres.
-        depth_furthest: furthest depth with a reading, metres; 0 for no limit.
-        baseline: from the camera to the pattern's projector along +x, metres. Where an object keeps the projector's
-            light from the surface behind, there is no depth: a strip to the left of the object.
-        edge_dropout: probability that a pixel beside a jump in depth has no reading.
-        grey_sigma: deviation of grey, grey levels.
-        gain_drift: amplitude of the slow change in gain (0.03: three per cent either way).
-        bias_drift: amplitude of the slow change in bias, grey levels.
-        drift_period: of the change in exposure, seconds.
-    """
-
-    depth_sigma: float = 0.0
-    depth_step: float = 0.0
-    depth_nearest: float = 0.0
-    depth_furthest: float = 0.0
-    baseline: float = 0.0
-    edge_dropout: float = 0.0
-    grey_sigma: float = 0.0
-    gain_drift: float = 0.0
-    bias_drift: float = 0.0
-    drift_period: float = 3.0
-
-    def __post_init__(self) -> None:
-        """Refuse values that are negative or not finite."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise GavoError(f"sensor noise: {field.name}: must be a number from 0, not {value!r}")
-        if self.drift_period == 0:
-            raise GavoError("sensor noise: drift_period: must be above 0")
-
-    def disturb_grey(
-        self,
-        grey: Float[np.ndarray, "height width"],
-        seconds: float,
-        phases: Float[np.ndarray, " 2"],
-        rng: np.random.Generator,
-    ) -> Float[np.ndarray, "height width"]:
-        """Drift of exposure at a time (phases of gain and bias, radians), then pixel noise; grey levels in and out."""
-        turn = 2 * math.pi * seconds / self.drift_period
-        gain = 1 + self.gain_drift * math.sin(turn + phases[0])
-        bias = self.bias_drift * math.sin(0.7 * turn + phases[1])
-        noise = rng.standard_normal(grey.shape, dtype=np.float32) if self.grey_sigma else np.float32(0)
-        return np.float32(gain) * grey + np.float32(bias) + np.float32(self.grey_sigma) * noise
-
-    def disturb_depth(
-        self, depth: Float[np.ndarray, "height width"], focal: float, rng: np.random.Generator
-    ) -> Float[np.ndarray, "height width"]:
-        """Noise, quantisation and missing readings (0); depth in metres in and out, focal length along x in pixels."""
-        seen = (depth > self.depth_nearest) & (depth < (self.depth_furthest or np.inf))
-        if self.baseline:
-            seen &= ~_projector_shadow(depth, focal * self.baseline)
-        if self.edge_dropout:
-            lost = rng.random(depth.shape, dtype=np.float32) < self.edge_dropout
-            seen &= ~(lost & _depth_jumps(depth))
-        if self.depth_sigma or self.depth_step:
-            inverse = 1 / np.maximum(depth, np.float32(1e-3))
-            inverse += np.float32(self.depth_sigma) * rng.standard_normal(depth.shape, dtype=np.float32)
-            if self.depth_step:
-                inverse = np.rint(inverse / np.float32(self.depth_step)) * np.float32(self.depth_step)
-            seen &= inverse > 0
-            depth = 1 / np.where(seen, inverse, np.float32(1))
-        return np.where(seen, depth, np.float32(0))
-
-
-NONE = SensorNoise()
-"""No noise at all; grey and depth are still rounded to 8 and 16 bit."""
-KINECT = SensorNoise(
-    depth_sigma=1.4e-3,
-    depth_step=2.85e-3,
-    depth_nearest=0.4,
-    depth_furthest=8.0,
-    baseline=0.075,
-    edge_dropout=0.3,
-    grey_sigma=2.0,
-    gain_drift=0.03,
-    bias_drift=3.0,
-)
-"""About the first Kinect: disparity in eighths of a pixel (7.5 cm baseline, 580 pixels), readings from 0.4 to 8 m."""
-
-
-def _projector_shadow(depth: np.ndarray, focal_baseline: float) -> np.ndarray:
-    """Pixels that a projector to the right, at the same height, cannot light: bool [H, W].
-
-    A pixel's column in the projector is x - f b / z; something further right in the image that lies further left in the
-    projector stands in the light.
-    """
-    x = np.arange(depth.shape[1], dtype=np.float32)
-    projected = x - np.float32(focal_baseline) / np.maximum(depth, np.float32(1e-3))
-    leftmost = np.minimum.accumulate(projected[:, ::-1], axis=1)[:, ::-1]
-    shadow = np.zeros(depth.shape, bool)
-    shadow[:, :-1] = projected[:, :-1] > leftmost[:, 1:]
-    return shadow
-
-
-def _depth_jumps(depth: np.ndarray, share: float = 0.05) -> np.ndarray:
-    """Pixels whose 3 x 3 neighbourhood spans more than a share of its nearest depth: bool [H, W]."""
-    kernel = np.ones((3, 3), np.uint8)
-    nearest = cv2.erode(depth, kernel)
-    return cv2.dilate(depth, kernel) - nearest > share * nearest
 
 
 class SyntheticSequence:
@@ -407,63 +292,3 @@ def _fit_room(path: Trajectory) -> tuple[Trajectory, tuple[float, float], float]
     world_T_camera = path.world_T_camera.copy()
     world_T_camera[:, :3, 3] += middle - (low + high) / 2
     return Trajectory(path.timestamps, world_T_camera), (float(half_extent[0]), float(half_extent[1])), float(height)
-
-
-def write_tum(sequence: Sequence, folder: str | Path) -> None:
-    """Write a sequence as a folder in TUM layout that reads back identically, with its camera as `camera.toml`.
-
-    Colour images are 8-bit RGB (three equal channels where the frames have no colour), depth 16 bit in the camera's raw
-    units. Where bodies move, `bodies_truth.csv` and `masks/` tell where they are. The lists are written last, so that a
-    folder left half written is not taken for a sequence.
-
-    Raises:
-        GavoError: the folder holds a sequence already, something cannot be written, or images are not of 8 and 16 bits.
-        FrameError: a frame of the sequence cannot be read.
-    """
-    folder = Path(folder)
-    if (folder / "rgb.txt").exists():
-        raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")
-    try:
-        for part in ("rgb", "depth"):
-            (folder / part).mkdir(parents=True, exist_ok=True)
-        stamps, depth_stamps, rows = [], [], []
-        bodies = getattr(sequence, "bodies_truth", ())
-        if bodies:
-            (folder / MASKS).mkdir(exist_ok=True)
-        for index, frame in enumerate(sequence):
-            for name, pixels in (("grey", frame.grey), ("depth", frame.depth)):
-                if pixels.dtype != (np.uint8 if name == "grey" else np.uint16):
-                    raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
-            delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
-            for written, stamp in ((stamps, frame.timestamp), (depth_stamps, delayed)):
-                written.append(np.format_float_positional(stamp, unique=True, min_digits=6))
-            image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
-            if frame.color is not None:
-                image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
-            _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
-            _write_png(folder / "depth" / f"{depth_stamps[-1]}.png", frame.depth)
-            if bodies:
-                rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamps[-1], folder)
-        (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
-        if sequence.ground_truth is not None:
-            sequence.ground_truth.write_tum(folder / "groundtruth.txt")
-        if bodies:
-            write_truth(rows, folder)
-        for part, own in (("depth", depth_stamps), ("rgb", stamps)):
-            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in own)]
-            (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image (BGR or one channel); raises OSError."""
-    path.write_bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
-
-
-def _camera_toml(camera: Camera) -> str:
-    lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
-    lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
-    lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
-    lines += [f"readout = {float(camera.readout)!r}", f'model = "{camera.model}"']
-    return "\n".join(lines) + "\n"

@@ -28,6 +28,9 @@ STREAM = re.compile(
 )
 """A word that tells one image of a camera from another, and no camera from another."""
 
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+"""In the name of a topic whose images are free of distortion."""
+
 
 class Images(NamedTuple):
     """What the first message of a topic tells of all."""
@@ -91,6 +94,11 @@ def are_of_two_cameras(color: str, depth: str) -> bool:
 def says_registered(color: str, depth: str) -> bool:
     """Whether the topic of depth says of itself that it lies on the images of colour, of the same camera."""
     return _is_named(depth, DEPTH_NAMES) and not are_of_two_cameras(color, depth)
+
+
+def says_rectified(topic: str) -> bool:
+    """Whether a topic's name says that its images are free of distortion."""
+    return bool(RECTIFIED.search(topic))
 
 
 def _of_depth(images: Mapping[str, Images], color: str | None, depth: str | None) -> list[str]:

@@ -106,27 +106,27 @@ class TumSequence(FileSequence):
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
-        color_rows, depth_rows, unit, are_paired = _read_lists(resolved, self.folder, rate)
-        if are_paired:
-            entries, why = _by_place(color_rows, depth_rows), "with a stamp of its own in their row"
+        lists = _read_lists(resolved, self.folder, rate)
+        if lists.are_paired:
+            entries, why = _by_place(lists.color, lists.depth), "with a stamp of its own in their row"
         else:
-            entries = _associate_lists(color_rows, depth_rows, max_difference)
+            entries = _associate_lists(lists.color, lists.depth, max_difference)
             why = f"within {max_difference:g} s that is not another's"
         if not entries:
             names = f"{COLOR_LIST} and {DEPTH_LIST}"
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry, max_difference) for entry in entries]
         stamps = [entry.stamp for entry in files]
-        truth = truth_in(self.folder, stamps, None if unit == 1 else lambda counts: unit * counts)
+        truth = truth_in(self.folder, stamps, None if lists.unit == 1 else lambda counts: lists.unit * counts)
         super().__init__(
             name or resolved.name,
             files,
             reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_most, files)),
             truth,
             reading,
-            unpaired((len(color_rows), len(depth_rows)), len(entries), why) + unread_truth(self.folder, truth),
+            unpaired((len(lists.color), len(lists.depth)), len(entries), why) + unread_truth(self.folder, truth),
         )
-        self.times_guessed = "stamps are numbers" if rate is None and unit == 1 / INDEX_RATE else ""
+        self.times_guessed = "stamps are numbers" if rate is None and lists.unit == 1 / INDEX_RATE else ""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -182,8 +182,19 @@ def _files(entry: _Entry, max_difference: float) -> Entry:
     return Entry(color.stamp, color.path, depth and depth.path, depth.stamp if depth and is_near else None, doubt)
 
 
-def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row], list[_Row], float, bool]:
-    """Rows of colour and of depth, the seconds of what their stamps counted, and whether one list has them in pairs."""
+class _Lists(NamedTuple):
+    """What a folder's lists say."""
+
+    color: list[_Row]
+    depth: list[_Row]
+    unit: float
+    """Seconds of what the stamps counted; those of the rows are in seconds."""
+    are_paired: bool
+    """Whether one list has both images of a frame in a row."""
+
+
+def _read_lists(root: Path, folder: Path, rate: float | None) -> _Lists:
+    """Read both lists, or the one in their place."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
     if all((folder / name).exists() for name in OPENLORIS) and not (folder / COLOR_LIST).exists():
         names, ours = " and ".join(OPENLORIS), f"{COLOR_LIST} and {DEPTH_LIST}"
@@ -203,7 +214,7 @@ def _read_lists(root: Path, folder: Path, rate: float | None) -> tuple[list[_Row
         if not abs(unit * row.stamp) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
     color, depth = ([row._replace(stamp=unit * row.stamp) for row in rows] for rows in (color, depth))
-    return color, depth, unit, both is not None
+    return _Lists(color, depth, unit, are_paired=both is not None)
 
 
 WHOLE = re.compile(r"-?\d+")

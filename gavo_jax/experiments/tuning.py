@@ -15,7 +15,8 @@ import numpy as np
 from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, read_toml, shown
-from gavo_jax.experiments.plan import Part, frames_of, parts_of
+from gavo_jax.experiments.plan import Part, frames_of
+from gavo_jax.experiments.plan_file import parts_of
 from gavo_jax.experiments.values import seeds_of, text_of, whole_of
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
@@ -28,15 +30,22 @@ NO_READING = np.iinfo(np.uint16).max
 
 
 def as_depth(image: Any) -> np.ndarray:
-    """The same of a depth image, with 0 where there is no reading: no finite number, or of 16 bits the largest one."""
-    array = as_array(image)
-    if array.dtype.kind == "f":
-        is_reading = np.isfinite(array)
-    elif array.dtype == np.uint16:
-        is_reading = array < NO_READING
+    """The same of a depth image, with 0 where there is no reading, as `with_zeros` has it."""
+    return with_zeros(as_array(image))
+
+
+def with_zeros(depth: Any) -> Any:
+    """Depth, an array here or on a device, with 0 where there is no reading: no finite number, or of 16 bits the
+    largest one.
+    """
+    numbers = jnp if isinstance(depth, jax.Array) else np
+    if depth.dtype == np.uint16:
+        is_reading = depth < NO_READING
+    elif jnp.issubdtype(depth.dtype, jnp.floating):
+        is_reading = numbers.isfinite(depth)
     else:
-        return array
-    return array if is_reading.all() else np.where(is_reading, array, array.dtype.type(0))
+        return depth
+    return numbers.where(is_reading, depth, depth.dtype.type(0))
 
 
 def grey_bytes(grey: Any) -> UInt8[np.ndarray, "h w"]:

@@ -18,12 +18,13 @@ from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, requi
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
-from gavo_jax.odometry.aligners import Aligner, Attempt, Recovering, make_aligner, without_depth
+from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
+from gavo_jax.odometry.second_thoughts import Recovering, make_aligner, without_depth
 from gavo_jax.odometry.way import Way
 from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
@@ -186,17 +187,7 @@ class Odometry:
             GavoError: What is given is no frame, its images are not of the camera's size or no grey and depth, or a
                 stamp is no number.
         """
-        if isinstance(frame, Frame):
-            frame = rectified(frame, self.recorded)
-            if self.progress.last_index < 0:  # later a dark image may be a covered lens
-                require_grey_levels(frame.grey)
-        elif not (frame is None or isinstance(frame, FrameError)):
-            raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
-        require_seconds("timestamp", timestamp)
-        if self.progress.last_index < 0 and not isinstance(frame, Frame):
-            raise frame or FrameError("the first frame could not be read")
-        if isinstance(frame, Frame):
-            frame = frame.at(timestamp)
+        frame = self._accepted(frame, timestamp)
         stopwatch = Stopwatch()
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
@@ -206,9 +197,7 @@ class Odometry:
         if before.tracker is None:
             outcome = self._begin(before, usable, finding)
         elif usable is None:
-            after, result = self._lose(before, None, timestamp), no_alignment(finding.status)
-            revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
-            outcome = Outcome(after, result, lost=True, revises=revises)
+            outcome = self._pass_over(before, finding, timestamp)
         else:
             outcome = self._align(before, usable, finding)
         after, result, lost, bodies = outcome.after, outcome.result, outcome.lost, outcome.bodies
@@ -247,6 +236,28 @@ class Odometry:
             bodies,
             outcome.revises,
         )
+
+    def _accepted(self, frame: Frame | FrameError | None, timestamp: float) -> Frame | FrameError | None:
+        """What is given, if it may be: a frame without distortion and at its stamp, or why there is none."""
+        is_first = self.progress.last_index < 0
+        if isinstance(frame, Frame):
+            frame = rectified(frame, self.recorded)
+            if is_first:  # later a dark image may be a covered lens
+                require_grey_levels(frame.grey)
+        elif not (frame is None or isinstance(frame, FrameError)):
+            raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
+        require_seconds("timestamp", timestamp)
+        if isinstance(frame, Frame):
+            return frame.at(timestamp)
+        if is_first:
+            raise frame or FrameError("the first frame could not be read")
+        return frame
+
+    def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> Outcome:
+        """Of a frame of which nothing can be used."""
+        revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
+        after = self._lose(before, None, timestamp)
+        return Outcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
     def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
         """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""

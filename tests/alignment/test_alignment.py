@@ -21,7 +21,8 @@ from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.visits import levels_of, prepare_pair, stack_levels, visited_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import LEVELS, build_pyramid

@@ -19,7 +19,7 @@ from layouts import CAMERA, GREYS, METRES
 from recordings import COLOR, COMPRESSIONS, DEPTH, KINDS, STYLES, Recorder, Shot, record
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets import bags as bags_module
+from gavo_jax.datasets import recording
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
@@ -1019,7 +1019,7 @@ def test_faulty_messages_are_refused_in_one_line(reader, kind, faulty):
 
 def test_a_file_of_ros_1_is_closed_however_it_is_let_go(bags, monkeypatch):
     """The library closes a ROS 1 file's last chunk first, which fails while a message of it is held."""
-    monkeypatch.setattr(bags_module, "_close", lambda reader: None)
+    monkeypatch.setattr(recording, "_close", lambda reader: None)
     before = set(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -11,16 +11,10 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendering import render
 from gavo_jax.datasets.room import build_room, free_space
-from gavo_jax.datasets.synthetic import (
-    DEFAULT_CAMERA,
-    KINECT,
-    NONE,
-    SensorNoise,
-    SyntheticSequence,
-    builtin_path,
-    write_tum,
-)
+from gavo_jax.datasets.sensor_noise import KINECT, NONE, SensorNoise
+from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence, builtin_path
 from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation
 

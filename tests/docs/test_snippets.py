@@ -24,7 +24,7 @@ from gavo_jax.cli import _parse, main
 from gavo_jax.cli.options import Align, Command, Compare, Download, Inspect, Run
 from gavo_jax.cli.selection import choose_settings
 from gavo_jax.datasets.download import folder_of
-from gavo_jax.experiments.plan import read_plan
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.tuning import read_tuning
 from gavo_jax.peers import PEERS
 

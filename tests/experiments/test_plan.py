@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 from small import CAMERA
 
-from gavo_jax.datasets.synthetic import SyntheticSequence, write_tum
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches, frames_of, read_plan
+from gavo_jax.experiments.plan import batches, frames_of
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
 GRID = """

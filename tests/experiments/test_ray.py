@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
-from gavo_jax.experiments.plan import Plan, RayOptions, read_plan
+from gavo_jax.experiments.plan import Plan, RayOptions
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 

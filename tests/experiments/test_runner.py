@@ -14,7 +14,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments import executors, tuning
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state
-from gavo_jax.experiments.plan import read_plan
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import estimate_seconds, missing, run_experiment
 from gavo_jax.experiments.table import COLUMNS, Table
 from gavo_jax.experiments.tuning import measure, read_tuning, tune

@@ -16,16 +16,18 @@ from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.synthetic import KINECT, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import KINECT
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.experiments import together
 from gavo_jax.experiments.executors import LocalExecutor
-from gavo_jax.experiments.plan import Plan, read_plan
+from gavo_jax.experiments.plan import Plan
+from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.experiments.together import track_stacked, track_together
-from gavo_jax.odometry.aligners import without_depth
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.settings import Settings

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.image.levels import Levels, image_plane
 from gavo_jax.image.pyramid import PyramidLevel, build_pyramid, make_atlas
 from gavo_jax.image.sampling import (

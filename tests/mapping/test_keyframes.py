@@ -10,7 +10,8 @@ from small import CAMERA
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import NONE, SyntheticSequence
+from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.image.settling import still
 from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, Candidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures

@@ -15,10 +15,11 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.objective.estimates import ExplainedShare
-from gavo_jax.odometry.aligners import Attempt, DoubtingDepth
+from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import MAX_DOUBTED, MAX_HELD, Odometry, Step
 from gavo_jax.odometry.plausibility import MIN_REMEMBERED, Usual, judge_by_history
 from gavo_jax.odometry.run import trajectory_of
+from gavo_jax.odometry.second_thoughts import DoubtingDepth
 from gavo_jax.odometry.stream import track
 from gavo_jax.presets import preset
 from gavo_jax.settings import OdometryOptions, Settings

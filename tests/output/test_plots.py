@@ -9,7 +9,7 @@ from matplotlib.text import Annotation
 
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import distance_error
-from gavo_jax.output import plots
+from gavo_jax.output import figure_parts, plots
 from gavo_jax.output.landscape import Landscape
 from gavo_jax.trajectory import Trajectory
 
@@ -96,7 +96,7 @@ def test_rivals_are_grey_and_no_two_of_ours_share_a_colour():
     )
     for figure in figures:
         colors = {line.get_label(): str(line.get_color()) for line in figure.axes[0].get_lines()}
-        assert len({colors[name] for name in ours}) == 4 and all(colors[name] in plots.COLORS for name in ours)
+        assert len({colors[name] for name in ours}) == 4 and all(colors[name] in figure_parts.COLORS for name in ours)
         greys = [float(colors[name]) for name in runs if name not in ours]
         assert len(set(greys)) == 2 and max(greys) <= 0.6  # still read on white
     many = plots.plot_trajectories({f"run {i}": straight(1.0 + i) for i in range(8)}, None).axes[0]
@@ -306,7 +306,7 @@ def test_curves_that_end_together_have_names_apart_in_the_order_of_their_ends():
     (axes,) = plots.plot_basin(np.array([7.0, 20.0]), success, "clip", ["ga"]).axes
     places = {text.get_text(): text.xyann[1] for text in axes.texts if isinstance(text, Annotation) and text.get_text()}
     assert sorted(places, key=lambda name: -places[name]) == ["ga", "opencv-rgb", "sift-pnp", "orb-pnp"]
-    assert np.diff(sorted(places.values())).min() >= plots.LABEL_HEIGHT - 1e-9
+    assert np.diff(sorted(places.values())).min() >= figure_parts.LABEL_HEIGHT - 1e-9
     assert min(places.values()) >= -1e-9 and max(places.values()) <= 1.0
     colors = {line.get_label(): line.get_color() for line in axes.lines}
     shown = {text.get_text(): text.get_color() for text in axes.texts if text.get_text()}
@@ -314,8 +314,8 @@ def test_curves_that_end_together_have_names_apart_in_the_order_of_their_ends():
 
 
 def test_places_move_no_further_than_the_distance_asks_for():
-    assert plots._apart(np.array([0.9, 0.5, 0.5]), 0.1, (0.0, 1.0)) == pytest.approx([0.9, 0.55, 0.45])
-    assert plots._apart(np.array([1.0, 1.0]), 0.1, (0.0, 1.0)) == pytest.approx([1.0, 0.9])
+    assert figure_parts.apart(np.array([0.9, 0.5, 0.5]), 0.1, (0.0, 1.0)) == pytest.approx([0.9, 0.55, 0.45])
+    assert figure_parts.apart(np.array([1.0, 1.0]), 0.1, (0.0, 1.0)) == pytest.approx([1.0, 0.9])
 
 
 def test_a_small_motion_has_a_bar_of_round_length():

@@ -10,10 +10,11 @@ import pytest
 from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry.aligners import Attempt, Recovering
+from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import COMPILE_SECONDS
 from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.second_thoughts import Recovering
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output import screen
 from gavo_jax.output.tracked import track_visibly

@@ -1,0 +1,74 @@
+"""A sequence as a folder in the layout of the TUM RGB-D benchmark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.bodies_truth import MASKS, WithBodies, write_mask, write_truth
+from gavo_jax.errors import GavoError
+
+
+def write_tum(sequence: Sequence, folder: str | Path) -> None:
+    """Write a sequence as a folder in TUM layout that reads back identically, with its camera as `camera.toml`.
+
+    Colour images are 8-bit RGB (three equal channels where the frames have no colour), depth 16 bit in the camera's raw
+    units. Where bodies move, `bodies_truth.csv` and `masks/` tell where they are. The lists are written last, so that a
+    folder left half written is not taken for a sequence.
+
+    Raises:
+        GavoError: the folder holds a sequence already, something cannot be written, or images are not of 8 and 16 bits.
+        FrameError: a frame of the sequence cannot be read.
+    """
+    folder = Path(folder)
+    if (folder / "rgb.txt").exists():
+        raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")
+    try:
+        for part in ("rgb", "depth"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        stamps, depth_stamps, rows = [], [], []
+        bodies = getattr(sequence, "bodies_truth", ())
+        if bodies:
+            (folder / MASKS).mkdir(exist_ok=True)
+        for index, frame in enumerate(sequence):
+            for name, pixels in (("grey", frame.grey), ("depth", frame.depth)):
+                if pixels.dtype != (np.uint8 if name == "grey" else np.uint16):
+                    raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
+            delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
+            for written, stamp in ((stamps, frame.timestamp), (depth_stamps, delayed)):
+                written.append(np.format_float_positional(stamp, unique=True, min_digits=6))
+            image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
+            if frame.color is not None:
+                image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+            _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
+            _write_png(folder / "depth" / f"{depth_stamps[-1]}.png", frame.depth)
+            if bodies:
+                rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamps[-1], folder)
+        (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
+        if sequence.ground_truth is not None:
+            sequence.ground_truth.write_tum(folder / "groundtruth.txt")
+        if bodies:
+            write_truth(rows, folder)
+        for part, own in (("depth", depth_stamps), ("rgb", stamps)):
+            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in own)]
+            (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image (BGR or one channel); raises OSError."""
+    path.write_bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
+
+
+def _camera_toml(camera: Camera) -> str:
+    lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
+    lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
+    lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
+    lines += [f"readout = {float(camera.readout)!r}", f'model = "{camera.model}"']
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,213 @@
+"""Second thoughts about a frame: the wide search behind the first one, an image without its depth, bodies that move.
+
+Each is an aligner around another one, as settings ask for it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, PRNGKeyArray
+
+from gavo_jax import presets
+from gavo_jax.alignment.result import with_finding
+from gavo_jax.bodies.aligner import BodyAware
+from gavo_jax.bodies.rival import WithRival
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.image.pyramid import LEVELS
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
+from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.settings import Settings
+from gavo_jax.status import AlignmentStatus
+
+
+@dataclass(frozen=True)
+class Recovering:
+    """An aligner whose unusable results are tried again by another one, from the same state.
+
+    Attributes:
+        first: What is asked first.
+        second: What is asked where that is unusable; made when it is needed.
+        wide: What the second one searches with; its program is made when it is needed,
+        is_loaded: or by `warm_up`, where it was compiled before.
+    """
+
+    first: Aligner
+    second: Callable[[], Aligner]
+    wide: Search | None = None
+    is_loaded: bool = False
+
+    def warm_up(self) -> float:
+        """That of the first one; the second compiles when it is needed."""
+        seconds = self.first.warm_up()
+        return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
+
+    def warm_up_both(self) -> float:
+        """Of both, side by side."""
+        if self.wide is None:
+            return self.first.warm_up()
+        return side_by_side(self.first.warm_up, self.wide.warm_up)
+
+    def start(self, frame: Frame) -> Any:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        """The first attempt if it is usable, else the second one if that is.
+
+        If neither is, the first one's motion can be used all the same where a high error is all that speaks against it
+        and the second ends at the same motion (blur, or something that moves). A reference should be better explained.
+        """
+        attempt = self.first.align(state, frame, clock)
+        if attempt.usable:
+            return attempt
+        again = self.second().align(state, frame, clock)
+        if again.usable:
+            return again
+        confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
+        return attempt._replace(usable=confirmed and agree(attempt.result, again.result), fit=False)
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+POLISHED = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR)
+"""What a finer search may say of a motion that another one has found."""
+SAME_BASIN = (0.05, 0.05)
+"""Metres and radians within which it ends in the same minimum."""
+
+
+@dataclass(frozen=True)
+class Polished:
+    """A search from whose motion another one begins, which sees it more exactly: it has the keyframe as well.
+
+    Attributes:
+        first: Finds the motion, and says whether the images match.
+        fine: Begins there.
+    """
+
+    first: Search
+    fine: Search
+
+    def warm_up(self) -> float:
+        """That of the first one: the other one serves every frame."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> TrackerState:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
+        """The first one's attempt, with the finer motion if that ends in the same minimum."""
+        attempt = self.first.align(state, frame, clock)
+        if not attempt.usable:
+            return attempt
+        guess = attempt.result.xi * (np.float32(state.seconds) / clock.elapsed)
+        again = self.fine.align(state._replace(guess=guess), frame, clock)
+        if again.result.status not in POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
+            return attempt
+        result = again.result._replace(status=attempt.result.status, findings=attempt.result.findings)
+        return attempt._replace(state=again.state, result=result)
+
+    def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+@dataclass(frozen=True)
+class DoubtingDepth:
+    """An aligner that doubts a frame's depth before it doubts the motion.
+
+    Where depth does not agree with the image, the frame is aligned once more by its image alone; the motion can be used
+    then, but a frame of such depth is no reference.
+
+    Attributes:
+        first: What aligns.
+        alone: What aligns an image alone.
+    """
+
+    first: Aligner
+    alone: Aligner
+
+    def warm_up(self) -> float:
+        """That of the first one."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> Any:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        """With depth, or without where it does not agree."""
+        attempt = self.first.align(state, frame, clock)
+        if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
+            return attempt
+        again = self.alone.align(state, without_depth(frame), clock)
+        if not again.is_found:
+            return attempt
+        result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
+        return again._replace(result=result, fit=False)
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+def without_depth(frame: Frame) -> Frame:
+    """A frame of which only the image counts."""
+    return replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def wide_search(search: Search) -> Search:
+    """The wide search on the points that a search's references hold, against the previous frame alone."""
+    settings, wide = search.settings, presets.preset("ga", "wide")
+    genetic: Any = wide.solver
+    places = [max(level, genetic.levels[-1]) for level in range(LEVELS)]  # of a level that it leaves out the next one's
+    iterations, population = ([schedule[k] for k in places] for schedule in (genetic.iterations, genetic.population))
+    iterations = tuple(count if k in settings.solver.levels else 0 for k, count in enumerate(iterations))
+    wide = Settings(
+        replace(genetic, iterations=iterations, population=tuple(population)),
+        replace(wide.alignment, points=settings.alignment.points),
+        replace(settings.odometry, reference="previous"),
+    )
+    return replace(search, settings=wide)
+
+
+def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: bool = False) -> Aligner:
+    """The aligner that settings describe."""
+    search = Search(camera, settings, key, record)
+    return with_recovery(search, search)
+
+
+def with_recovery(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner with second thoughts, where the search's settings ask for that: of bodies that move, without a depth
+    that does not agree, and with the wide search behind it.
+    """
+    if not search.settings.odometry.recover:
+        return with_bodies(aligner, search)
+    careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
+
+    wide = wide_search(search)
+
+    def behind() -> Aligner:
+        return with_bodies(Polished(wide, search), wide)
+
+    # loading it takes seconds, which a short run had better spare and a long one had better not stop for
+    return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
+
+
+def blank_of(aligner: Any) -> Any:
+    """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
+    while not hasattr(aligner, "blank_state"):
+        aligner = aligner.first
+    return aligner.blank_state()
+
+
+def with_bodies(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner that leaves out what moves on its own, where the search's settings ask for that."""
+    if search.settings.odometry.bodies == "off":
+        return aligner
+    return WithRival(BodyAware(aligner, search))
