@@ -162,7 +162,7 @@ def track_frame(
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * guess, finest) if options.synchronise else raw
     readout = None
-    if options.rolling_shutter:  # a readout that is longer than the time between two frames cannot be
+    if options.rolling_shutter:  # longer than the time between two frames, and stamps may be off, it cannot be
         readout = jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
     exposure = Exposure.of(raw)
     previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))

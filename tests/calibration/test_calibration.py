@@ -71,6 +71,23 @@ def test_shutter_delay_and_lens_are_found_from_the_images():
     assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
 
 
+def test_a_readout_is_no_longer_than_the_time_between_two_frames() -> None:
+    """Images that ask for 37 ms at 30 Hz: 37 ms were written, and a run then used them."""
+
+    def score(kind: str, change: Any) -> Any:
+        del kind, change
+        return lambda value: (1.0 + (value - 0.037) ** 2 * np.ones(20), np.ones(20, bool))
+
+    trial: Any = SimpleNamespace(score=score, unknowns=Unknowns.of(CAMERA))
+    leasts = estimate_module._find_readout(trial, 1 / 30, True)
+    assert leasts["readout"].value == trial.unknowns.readout == 1 / 30
+    found = estimate_module._judged(leasts, trial, 1 / 30, "names are numbers")["readout"]
+    assert found.why.split("; ")[1:] == [
+        "at the longest that it can be, the time between two frames",
+        "as true as the stamps, which are a guess (names are numbers)",
+    ]
+
+
 @pytest.mark.parametrize(
     ("wanted", "supposed"), [("readout", 0.0), ("depth_delay", READOUT), ("focal_length", READOUT)]
 )
