@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float64, Integer
 
-from gavo_jax.alignment.judgement import UNKNOWN
+from gavo_jax.alignment.judgement import MIN_EXPLAINED_GREY, UNKNOWN
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
@@ -304,18 +304,21 @@ def _moved(
 def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
     """The best candidate's attempt with what the image as a whole says of it.
 
-    What all of the image at rest speaks for is not wrong because a body hides what its points saw. And where another
-    motion has nearly as much support, or much of the image speaks against both, it may be a body's.
+    What all of the image at rest speaks for is not wrong because a body hides what its points saw; but the image has to
+    agree with it where its points still see. And where another motion has nearly as much support, or more of the image
+    speaks against this one than for it, it may be a body's.
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
     seen = known or float(belief.contradicted) > LEAST
     in_view = 1.0 - np.mean((belief.moving > 0) | belief.hidden)
     excused = EXCUSED if float(result.explained.depth) > MOST * in_view else bit(AlignmentStatus.HIGH_ERROR)
-    if seen and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
+    matches = float(result.explained.grey) > MIN_EXPLAINED_GREY
+    if seen and matches and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
         result = result._replace(status=AlignmentStatus.OK, findings=0)
         attempt = attempt._replace(result=result, usable=True)
     rivals = [other for other in tried if other.rank[0] and not agree(other.attempt.result, attempt.result, SAME)]
-    if any(float(other.belief.support) > NEARLY_AS_GOOD * float(belief.support) for other in rivals):
+    stronger = any(float(other.belief.support) > NEARLY_AS_GOOD * float(belief.support) for other in rivals)
+    if stronger or float(belief.contradicted) > float(belief.support):
         attempt = mistrusted(attempt)
     return attempt
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax import presets
+from gavo_jax.alignment.judgement import MIN_EXPLAINED_GREY
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import WithRival
@@ -101,7 +102,9 @@ class Polished:
         return self.first.start(frame)
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The first one's attempt, with the finer motion if that ends in the same minimum."""
+        """The first one's attempt, with the finer motion if that ends in the same minimum; where the image disagrees
+        with that one, it says so.
+        """
         attempt = self.first.align(state, frame, clock)
         if not attempt.usable:
             return attempt
@@ -110,6 +113,8 @@ class Polished:
         if again.result.status not in POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
             return attempt
         result = again.result._replace(status=attempt.result.status, findings=attempt.result.findings)
+        if result.explained.grey < MIN_EXPLAINED_GREY:
+            result = with_finding(result, AlignmentStatus.HIGH_ERROR)
         return attempt._replace(state=again.state, result=result)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gavo_jax import program_cache
-from gavo_jax.alignment.result import no_alignment
+from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, Candidate, _judged
@@ -351,16 +351,42 @@ def test_a_state_keeps_its_shape() -> None:
     assert shapes[0] == shapes[1]
 
 
+def judged(finding: AlignmentStatus, *, grey: float, depth: float, support: float, contradicted: float) -> Alignment:
+    """A finding's result as the whole image judges it, beside a body over two fifths of that."""
+    image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1.0)
+    shares = jnp.float32(support), jnp.float32(contradicted), covered > 0, jnp.float32(0.2)
+    belief = Belief(2 * covered - 1, 2 * covered - 1, *shares, image, image, jnp.ones(2))
+    result = no_alignment(finding)
+    result = result._replace(explained=result.explained._replace(grey=np.float32(grey), depth=np.float32(depth)))
+    best = Candidate(Attempt(None, result, usable=False), belief)
+    return _judged(best, [best], known=True).result
+
+
 @pytest.mark.parametrize(("explained", "status"), [(0.6, AlignmentStatus.OK), (0.1, AlignmentStatus.DEPTH_MISMATCH)])
 def test_depth_that_disagrees_where_no_body_is_has_no_excuse(explained: float, status: AlignmentStatus) -> None:
-    image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1.0)
-    some = jnp.float32(0.2)
-    shares = jnp.float32(0.8), some, covered > 0, some
-    belief = Belief(2 * covered - 1, 2 * covered - 1, *shares, image, image, jnp.ones(2))
-    result = no_alignment(AlignmentStatus.DEPTH_MISMATCH)
-    result = result._replace(explained=result.explained._replace(depth=np.float32(explained)))
-    best = Candidate(Attempt(None, result, usable=False), belief)
-    assert _judged(best, [best], known=True).result.status is status
+    result = judged(AlignmentStatus.DEPTH_MISMATCH, grey=0.8, depth=explained, support=0.8, contradicted=0.2)
+    assert result.status is status
+
+
+@pytest.mark.parametrize(("explained", "status"), [(0.7, AlignmentStatus.OK), (0.3, AlignmentStatus.HIGH_ERROR)])
+def test_an_image_that_disagrees_where_its_points_still_see_has_no_excuse(
+    explained: float, status: AlignmentStatus
+) -> None:
+    """An image that a fault had shifted was `ok` beside a body, as depth went on agreeing."""
+    result = judged(AlignmentStatus.HIGH_ERROR, grey=explained, depth=0.95, support=0.8, contradicted=0.1)
+    assert result.status is status
+
+
+@pytest.mark.parametrize(
+    ("support", "contradicted", "status"),
+    [(0.3, 0.6, AlignmentStatus.MOVING_BODY), (0.6, 0.3, AlignmentStatus.OK)],
+)
+def test_a_motion_that_more_of_the_image_contradicts_may_be_a_bodys(
+    support: float, contradicted: float, status: AlignmentStatus
+) -> None:
+    """Dirt on the lens over a third of the image was followed, and `ok`."""
+    result = judged(AlignmentStatus.OK, grey=0.8, depth=0.9, support=support, contradicted=contradicted)
+    assert result.status is status
 
 
 def test_what_is_thin_is_no_body() -> None:

@@ -745,6 +745,17 @@ def test_what_the_wide_search_finds_is_polished(first: Alignment, fine: Alignmen
     assert attempt.result.status is first.status and attempt.usable is (first.status is AlignmentStatus.OK)
 
 
+@pytest.mark.parametrize(("explained", "status"), [(0.5, AlignmentStatus.OK), (0.4, AlignmentStatus.HIGH_ERROR)])
+def test_an_image_that_the_finer_motion_does_not_explain_is_told(explained: float, status: AlignmentStatus) -> None:
+    """An image whose rows a fault had shifted was 4 degrees off and `ok`, as the wide search had found it good enough."""
+    fine = found(AlignmentStatus.HIGH_ERROR, 0.12)
+    fine = fine._replace(explained=fine.explained._replace(grey=np.float32(explained)))
+    state = blank_of(Odometry(CAMERA, SEARCH_ALONE).aligner)
+    polished = Polished(Told(found(AlignmentStatus.OK, 0.10)), Told(fine))  # pyright: ignore[reportArgumentType]
+    attempt = polished.align(state, Rendered(frames=1, camera=CAMERA, noise=NONE)[0], BEGINNING)
+    assert attempt.result.status is status and attempt.usable
+
+
 class Guessing(Told):
     """An aligner that guesses its motions, or says of how many it has guessed, where it is told so."""
 
