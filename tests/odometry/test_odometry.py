@@ -747,7 +747,7 @@ def test_what_the_wide_search_finds_is_polished(first: Alignment, fine: Alignmen
 
 @pytest.mark.parametrize(("explained", "status"), [(0.5, AlignmentStatus.OK), (0.4, AlignmentStatus.HIGH_ERROR)])
 def test_an_image_that_the_finer_motion_does_not_explain_is_told(explained: float, status: AlignmentStatus) -> None:
-    """An image whose rows a fault had shifted was 4 degrees off and `ok`, as the wide search had found it good enough."""
+    """An image whose rows a fault had shifted was 4 degrees off and `ok`, as the wide search found it good enough."""
     fine = found(AlignmentStatus.HIGH_ERROR, 0.12)
     fine = fine._replace(explained=fine.explained._replace(grey=np.float32(explained)))
     state = blank_of(Odometry(CAMERA, SEARCH_ALONE).aligner)
