@@ -226,7 +226,7 @@ def _refuse_without_effect(before: Settings, after: Settings, values: Mapping[st
             name, other = f"{room}.{field.name}", field.metadata.get("instead_of")
             is_idle = other is not None and getattr(part, other) is not None
             if is_idle and name in values and getattr(part, field.name) != getattr(earlier, field.name):
-                raise GavoError(f"{place}: {name} counts only where {room}.{other} is none: set that, or set it to none")
+                raise GavoError(f"{place}: {name} counts only where {room}.{other} is none: set that instead")
 
 
 def takes_whole(settings: Settings, name: str) -> bool:
