@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -319,6 +320,10 @@ BAD_OPTIONS = {
     "unknown option": (["--nonsense"], ["--nonsense"]),
     "rate of stamps": (["--rate", "10"], ["clip", "--rate", "stamps"]),
     "topic of a folder": (["--depth-topic", "/depth"], ["clip", "--depth-topic", "TUM RGB-D folder"]),
+    "no voxel": (["--voxel", "0"], ["voxel", "from"]),
+    "negative voxel of a mesh": (["--map-shape", "mesh", "--voxel", "-5"], ["voxel", "not -5"]),
+    "voxel of no map": (["--voxel", "0.02"], ["--voxel", "add --map FILE"]),
+    "shape of no map": (["--map-shape", "mesh"], ["--map-shape", "add --map FILE"]),
     "output is a file": (["--output", "clip/rgb.txt"], ["clip/rgb.txt"]),
     "output below a file": (["--output", "clip/rgb.txt/out"], ["clip/rgb.txt/out"]),
 }
@@ -674,6 +679,29 @@ def test_help_and_version(gavo):
     assert "compare" in gavo("--help").out
     assert "--on-lost" in gavo("run", "--help").out
     assert gavo("--version").out.startswith("gavo-jax ")
+    assert re.search(" --version +print the version and exit ", gavo("--help").out)
+    for words in (("run", "--help"), ("run", "--version", "--help")):
+        assert "--version" not in gavo(*words).out
+
+
+@pytest.mark.parametrize("command", ["", "run", "compare", "view", "experiment", "tune", "inspect", "calibrate"])
+def test_pages_of_help_fit_the_screen(gavo, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "80")
+    page = gavo(*command.split(), "--help").out
+    assert not [line for line in page.splitlines() if len(line) > 80 and not line.startswith("usage:")]
+    assert ("realsense" in page) == (command == "run")
+
+
+def test_no_text_of_an_option_has_lines_of_its_own():
+    """They would end where the source's do."""
+    texts = re.findall(r'^    """([^"]*)"""$', Path(options.__file__).read_text(encoding="utf-8"), re.M)
+    assert len(texts) > 40 and not [text for text in texts if "\n" in text and "\n\n" not in text]
+
+
+def test_help_tells_what_an_option_does_once_it_is_given(gavo):
+    assert "Do not track the frames once more" in " ".join(gavo("view", "--help").out.replace("│", "").split())
+    for words in (("experiment", "--help"), ("experiment", "report", "--help")):
+        assert "{FILE.toml,report} [DIR]" in gavo(*words).out.splitlines()[0]
 
 
 def test_help_lists_every_method_a_package_brings_and_loads_none(tmp_path):
