@@ -96,6 +96,8 @@ def run(options: Run) -> int:
             # before an earlier run is replaced: it may not open
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
+                if options.resume:
+                    say(f"nothing to resume in {folder.path}: a new run")
                 remove_trajectories(folder.path)
                 if folder.has_run():
                     say(f"the earlier run in {folder.path} is replaced")
