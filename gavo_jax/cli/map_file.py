@@ -17,8 +17,8 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
     """Refuse a map that cannot be made or written; return what it is to be.
 
     Raises:
-        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, how it is to be where there is
-            no map, or Open3D cannot be imported.
+        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, options of a map without
+            one, or Open3D cannot be imported.
     """
     check_voxel(voxel)
     if path is None:

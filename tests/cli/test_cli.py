@@ -144,6 +144,13 @@ def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_frames_of_the_room_are_rendered_and_not_read(gavo, clip, tmp_path):
+    arguments = (*FAST, "--frames", 2, "--output", tmp_path / "out")
+    room, read = gavo("run", *arguments), gavo("run", clip, "--camera", clip / "camera.toml", *arguments)
+    assert "speed, rendering included" in room.out and "speed, reading and decoding included" in read.out
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_same_seed_same_bytes_and_default_folder(gavo, clip, tmp_path):
     arguments = ("run", "clip", "--camera", clip / "camera.toml", *FAST, "--frames", 3, "--seed", 7)
     assert gavo(*arguments).status == 0
@@ -401,6 +408,7 @@ def test_align_fits_a_terminal():
     assert max(map(len, text.splitlines())) <= 80
     assert json.loads(text)["xi"][0] == -0.001235 and rounded(None) is None and rounded("ok") == "ok"
     assert np.isnan(rounded(np.array([np.nan])))
+    assert rounded(np.float32(12.345678)) == 12.35 and rounded(6553.5) == 6553.5
 
 
 @pytest.mark.parametrize("role", range(4))
@@ -439,7 +447,10 @@ def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, cl
 def test_evaluate_refuses(gavo, clip):
     truth = clip / "groundtruth.txt"
     assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")
-    assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "delta")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "gavo: --delta: must be a positive number, not 0")
+    half = ("--delta", 0.5, "--unit", "frames")
+    assert is_refused(gavo("evaluate", truth, truth, *half), "gavo: --delta: must be a whole number of frames, not 0.5")
+    assert "over 1 frame, all pairs" in gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames").out
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100", "--unit frames")
     later = clip / "later.txt"
     later.write_text("9000 0 0 0 0 0 0 1\n9002 0 0 0 0 0 0 1\n")
@@ -543,6 +554,20 @@ def test_compare(gavo, pristine, tmp_path):
     }
     report = (tmp_path / "out" / "report.html").read_text()
     assert f"<td>{table[1]['rpe_translation_rmse_m_per_s']:.4f}</td>" in report and report.count("<img") == 3
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_compare_without_truth_tells_of_the_paths(gavo, clip, tmp_path):
+    (clip / "groundtruth.txt").unlink()
+    arguments = ("compare", clip, "--camera", clip / "camera.toml", "--output", tmp_path / "out")
+    done = gavo(*arguments, "--methods", "gauss-newton,opencv-rgbd")
+    assert done.status == 0, done.err
+    lines = done.out.splitlines()
+    [heads] = [line for line in lines if line.startswith("┃")]
+    assert "path m ┃" in heads and "end m: x y z ┃" in heads and len(heads) <= 80
+    [row] = [line for line in lines if line.startswith("│ gauss-newton")]
+    assert re.search(r"│ +\d\.\d{4} │ [+-]\d\.\d{4} [+-]\d\.\d{4} [+-]\d\.\d{4} │", row)
+    assert any(line.startswith("end: position seen from the first frame") for line in lines)
 
 
 def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
