@@ -33,7 +33,7 @@ class HelpPage(io.StringIO):
         self._stream = stream
 
     @property
-    def encoding(self) -> str:
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The stream's."""
         return self._stream.encoding
 
