@@ -73,7 +73,7 @@ class Camera:
             _require_size(name, getattr(self, name))
         for name in ("fx", "fy", "depth_scale", "readout"):
             value = getattr(self, name)
-            if isinstance(value, int | float | np.integer | np.floating) and not 0 <= value < np.inf:
+            if isinstance(value, int | float | np.integer | np.floating) and value < 0:
                 what = "seconds from 0 on are" if name == "readout" else "a positive number is"
                 raise GavoError(f"camera: {name}: {what} needed, not {value!r}")
 

@@ -301,7 +301,7 @@ def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: 
     [
         ({"fx": -5}, "fx: a positive number"),
         ({"fy": np.float32(-5)}, "fy: a positive number"),
-        ({"depth_scale": float("nan")}, "depth_scale: a positive number"),
+        ({"depth_scale": -1000.0}, "depth_scale: a positive number"),
         ({"readout": -0.02}, "readout: seconds"),
         ({"height": 480.5}, "height: a whole number"),
         ({"width": -640}, "width: a whole number"),
