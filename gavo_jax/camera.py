@@ -23,6 +23,11 @@ OFF_AXIS = 10.0, 10001
 """Up to where, as x / z, a lens is looked at, 84 degrees; and at how many places."""
 
 
+def _require_size(name: str, size: Any) -> None:
+    if not isinstance(size, int | np.integer) or size < 0:
+        raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
+
+
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["fx", "fy", "cx", "cy", "depth_scale", "readout"],
@@ -46,6 +51,10 @@ class Camera:
         depth_scale: raw depth units per metre (metres = raw / depth_scale).
         readout: seconds from the exposure of the first row to that of the last (rolling shutter); 0 = all at once.
         model: what the distortion's numbers are: "pinhole" (Brown-Conrady, also rational) or "fisheye" (equidistant).
+
+    Raises:
+        GavoError: a side is no whole number of pixels, or a length or scale is negative. What is being traced, and
+            whatever else stands for a number in a pytree, has no value to look at.
     """
 
     fx: float
@@ -58,6 +67,15 @@ class Camera:
     depth_scale: float = 5000.0
     readout: float = 0.0
     model: Literal["pinhole", "fisheye"] = "pinhole"
+
+    def __post_init__(self):
+        for name in ("width", "height"):
+            _require_size(name, getattr(self, name))
+        for name in ("fx", "fy", "depth_scale", "readout"):
+            value = getattr(self, name)
+            if isinstance(value, int | float | np.integer | np.floating) and value < 0:
+                what = "seconds from 0 on are" if name == "readout" else "a positive number is"
+                raise GavoError(f"camera: {name}: {what} needed, not {value!r}")
 
     @staticmethod
     def preset(name: str) -> "Camera":
@@ -221,9 +239,6 @@ def require_camera(camera: Camera) -> None:
     """
     if not isinstance(camera, Camera):
         raise GavoError(f"a Camera is needed, not {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
-    for name in ("width", "height"):
-        if not isinstance(size := getattr(camera, name), int | np.integer):
-            raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
     for name, least in {"fx": 0.0, "fy": 0.0, "cx": -np.inf, "cy": -np.inf, "depth_scale": 0.0}.items():
         if not (_is_number(value := getattr(camera, name)) and value > least):
             raise GavoError(f"camera: {name}: a {'positive ' * (least == 0)}number is needed, not {value!r}")

@@ -252,9 +252,8 @@ def _relative_pose_error_frames(estimate: Trajectory, truth: Trajectory, delta: 
         raise GavoError(f"relative pose error: no associated poses {delta} frames apart ({len(stamps)} associate)")
     start_T_end = inverse(estimated[start]) @ estimated[start + delta]
     true_start_T_end = inverse(true[start]) @ true[start + delta]
-    definition = (
-        f"inv(true_i_T_j) @ est_i_T_j over {delta} frames, all pairs, nearest stamps within {MAX_DIFFERENCE:g} s"
-    )
+    span = "1 frame" if delta == 1 else f"{delta} frames"
+    definition = f"inv(true_i_T_j) @ est_i_T_j over {span}, all pairs, nearest stamps within {MAX_DIFFERENCE:g} s"
     error = inverse(true_start_T_end) @ start_T_end
     return _relative_pose_error(error, stamps[start], definition, delta, "frames")
 

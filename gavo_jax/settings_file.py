@@ -1,4 +1,4 @@
-"""Settings in files and by name: `solver.mutation_rate`, `alignment.loss`, `solver.population.4`.
+"""Settings in files and by name: `solver.mutation_decay`, `alignment.loss`, `solver.population.4`.
 
 A settings file is TOML: `method` and `preset` at the top say what it starts from, the tables `solver`, `alignment` and
 `odometry` what differs from that. A run's config.json is one too.
@@ -187,8 +187,10 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
         place: Where the values stand, for the message.
 
     Raises:
-        GavoError: an unknown name (with the nearest known one), or a value of the wrong kind.
+        GavoError: an unknown name (with the nearest known one), a value of the wrong kind, or one that would change
+            nothing.
     """
+    before = settings
     for name, value in values.items():
         room, _, rest = name.partition(".")
         if room not in ROOMS:
@@ -206,7 +208,25 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
             new = _convert(where, type(part), field, current, value)
         settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
     require_settings(settings, place)
+    _refuse_without_effect(before, settings, values, place)
     return settings
+
+
+def _refuse_without_effect(before: Settings, after: Settings, values: Mapping[str, Any], place: str) -> None:
+    """Raise GavoError for a new value that another one keeps from counting.
+
+    A file that names every field is left alone: it holds those, too, that do not count (`save_settings`).
+    """
+    for room in ROOMS:
+        part, earlier = getattr(after, room), getattr(before, room)
+        fields = [field for field in dataclasses.fields(part) if field.repr]
+        if all(f"{room}.{field.name}" in values for field in fields):
+            continue
+        for field in fields:
+            name, other = f"{room}.{field.name}", field.metadata.get("instead_of")
+            is_idle = other is not None and getattr(part, other) is not None
+            if is_idle and name in values and getattr(part, field.name) != getattr(earlier, field.name):
+                raise GavoError(f"{place}: {name} counts only where {room}.{other} is none: set that instead")
 
 
 def takes_whole(settings: Settings, name: str) -> bool:

@@ -294,3 +294,35 @@ def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: 
     require_camera(replace(camera, fx=np.float32(131.0), cx=jnp.float32(79.5), width=np.int64(160), distortion=()))  # pyright: ignore
     with pytest.raises(GavoError, match=words):
         require_camera(replace(camera, **values))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"fx": -5}, "fx: a positive number"),
+        ({"fy": np.float32(-5)}, "fy: a positive number"),
+        ({"depth_scale": -1000.0}, "depth_scale: a positive number"),
+        ({"readout": -0.02}, "readout: seconds"),
+        ({"height": 480.5}, "height: a whole number"),
+        ({"width": -640}, "width: a whole number"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_as_it_is_made(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(GavoError, match=f"^camera: {words}"):
+        Camera(**{"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480, **values})
+
+
+def test_a_camera_holds_whatever_stands_for_its_numbers() -> None:
+    """As a pytree: traced, batched, shapes alone, names and axes."""
+    camera = Camera(np.float32(131), 131, 79.5, 59.5, np.int64(160), 120)  # pyright: ignore[reportArgumentType]
+
+    def half(one: Camera) -> Camera:
+        return replace(one.level(1), fx=-one.fx)
+
+    assert jax.jit(half)(camera).fx == -131 and jax.eval_shape(half, camera).width == 80
+    batch = jax.tree.map(lambda value: jnp.stack([-value, value]), jax.tree.map(jnp.float32, camera))
+    axes = jax.tree.map(lambda _: 0, camera)
+    np.testing.assert_array_equal(jax.vmap(half, in_axes=(axes,))(batch).fx, [131, -131])
+    for leaf in (None, "fx", object(), True):
+        assert jax.tree.map(lambda _, leaf=leaf: leaf, camera).fx is leaf
+    assert jax.grad(lambda one: one.fx * one.cx)(jax.tree.map(float, camera)).fx == 79.5

@@ -15,6 +15,8 @@ PAGE = (PACKAGE.parent / "docs" / "method.md").read_text(encoding="utf-8")
 FUNCTIONS = {int(number): name for number, name in re.findall(r"^\| \((\d+)\) \|.*\| `([\w.]+)` \|$", PAGE, re.M)}
 STOPS = re.findall(r"^\| \w+ stop: .*\| `([\w.]+)` \|$", PAGE, re.M)
 
+UNNUMBERED = re.findall(r"^\| [^(|].*\| `(gavo_jax[\w.]+)` \|$", PAGE, re.M)
+
 CLAIM = re.compile(r"(?:\bequations?|\bpaper's)((?:[\s,]|\band\b|\bto\b|\(\d+\))+)", re.I)
 """`Equation (n)`, or several numbers in one go."""
 
@@ -66,3 +68,8 @@ def test_no_other_docstring_claims_an_equation() -> None:
 @pytest.mark.parametrize("name", STOPS)
 def test_the_stop_criteria_exist(name: str) -> None:
     assert "stop criterion" in resolve_name(name).__doc__
+
+
+@pytest.mark.parametrize("name", UNNUMBERED)
+def test_steps_without_a_number_have_a_function(name: str) -> None:
+    assert callable(resolve_name(name))

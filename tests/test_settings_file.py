@@ -64,6 +64,7 @@ def test_values_of_every_kind():
         ("solver.mutation_rate", True, ["mutation_rate", "number"]),
         ("solver.mutation_rate", float("nan"), ["mutation_rate", "number"]),
         ("solver.mutation_rate", "none", ["mutation_rate", "cannot be left out"]),
+        ("solver.mutation_rate", 0.9, ["solver.mutation_rate counts only where solver.mutation_step is none"]),
         ("solver.patience", 2.5, ["patience", "whole"]),
         ("solver.patience", -1, ["patience", "at least 1"]),
         ("solver.population", [16, 16], ["population", "list of 5 whole numbers"]),
@@ -90,6 +91,21 @@ def test_what_is_refused(name, value, words):
     with pytest.raises(GavoError) as refused:
         override(presets.preset("ga", "default"), {name: value}, "file.toml: methods[1]")
     assert all(word in str(refused.value) for word in ("file.toml: methods[1]", *words))
+
+
+def test_a_rate_that_does_not_count_is_read_from_a_file_of_every_setting(tmp_path):
+    default = presets.preset("ga")
+    settings = replace(default, solver=replace(default.solver, mutation_rate=0.9))
+    save_settings(tmp_path / "settings.toml", settings)
+    assert load_settings(tmp_path / "settings.toml").settings == settings
+
+
+def test_a_rate_counts_without_a_step():
+    values = {"solver.mutation_step": "none", "solver.mutation_rate": 0.9}
+    solver = override(presets.preset("ga"), values).solver
+    assert isinstance(solver, GeneticAlgorithm) and solver.mutation_rate == 0.9
+    override(presets.preset("ga", "paper"), {"solver.mutation_rate": 0.9})
+    override(presets.preset("ga"), {"solver.mutation_rate": 0.1})  # as it is
 
 
 def test_nested_tables_have_dotted_names():

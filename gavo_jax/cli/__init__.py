@@ -27,7 +27,7 @@ from gavo_jax.cli.options import (
     Tune,
     View,
 )
-from gavo_jax.cli.usage import fault_of_usage
+from gavo_jax.cli.usage import HelpPage, asking_for_help, fault_of_usage
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, GavoWarning, printable, shown
 from gavo_jax.version import __version__
@@ -42,7 +42,7 @@ BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
-    "or Adam, on one compiled photometric objective. `gavo --version` says which version this is."
+    "or Adam, on one compiled photometric objective."
 )
 
 
@@ -189,18 +189,19 @@ def _parse(arguments: list[str]) -> Command | None:
     Raises:
         GavoError: unknown or missing arguments.
     """
-    messages = io.StringIO()
+    messages, page = io.StringIO(), HelpPage(sys.stdout)
     try:
-        with contextlib.redirect_stderr(messages):
+        with contextlib.redirect_stderr(messages), contextlib.redirect_stdout(page):
             return tyro.cli(
                 Command,
                 prog="gavo",
                 description=DESCRIPTION,
-                args=arguments,
+                args=asking_for_help(arguments),
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as stop:
         if not stop.code:
+            print(page.fitted())
             return None
     raise GavoError(fault_of_usage(messages.getvalue(), arguments))
 

@@ -33,7 +33,7 @@ from gavo_jax.output.screen import say, waiting
 from gavo_jax.trajectory import inverse
 
 MATRIX_DIGITS, TWIST_DIGITS = 7, 4
-"""Significant ones of four and of six numbers in a row, on a terminal; a pipe gets all."""
+"""Significant ones of four and of six numbers in a row, or of one, on a terminal; a pipe gets all."""
 
 
 def align(options: Align) -> int:
@@ -73,10 +73,12 @@ def align(options: Align) -> int:
 
 
 def rounded(value: Any) -> Any:
-    """An array with as many digits as let its rows fit 80 columns; anything else as it is."""
+    """What was found, with as many digits as let its rows fit 80 columns; anything else as it is."""
+    if not isinstance(value, jax.Array | np.ndarray | np.generic):
+        return value
     numbers = np.asarray(value)
     if numbers.ndim == 0:
-        return value
+        return float(f"{float(numbers):.{TWIST_DIGITS}g}")
     digits = MATRIX_DIGITS if numbers.shape[-1] == 4 else TWIST_DIGITS
     return np.array([float(f"{number:.{digits}g}") for number in numbers.ravel()]).reshape(numbers.shape)
 

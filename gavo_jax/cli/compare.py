@@ -9,11 +9,12 @@ from jaxtyping import Float
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Compare
-from gavo_jax.cli.run_table import why_no_drift
+from gavo_jax.cli.run_table import path_and_end, why_no_drift
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError
 from gavo_jax.inspection import summary
@@ -41,7 +42,7 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.report import REPORT, Picture, Table, write_report
-from gavo_jax.output.screen import known_columns, number, print_table, say, tell, waiting
+from gavo_jax.output.screen import DASH, known_columns, number, print_table, say, tell, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
@@ -58,23 +59,28 @@ COLUMNS = (
     ("frames/s", FRAMES_PER_SECOND, 1),
 )
 """Columns of the table: heading, key in comparison.json, decimals. The errors per frame stand in for the drift."""
-HEADINGS = ("method", *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
+OF_PATH = ("path m", "end m: x y z")
+"""Columns where nothing is known of the errors."""
+HEADINGS = ("method", *OF_PATH, *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
 TABLE_CAPTION = (
     "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
     "evaluate_rpe.py, fixed delta). m/frame: the same from frame to frame, in place of the drift. ATE: root "
     "mean square distance of associated positions after the best rigid alignment. End: distance from the true position "
-    "at the end, both relative to the first pose. Segments: stretches between which the motion is unknown. ms/pair: "
-    "median, from two decoded images to the motion on the host. "
-    "frames/s: from files to poses, decoding included."
+    "at the end, both relative to the first pose. Path: its length, where there is no truth; end x y z: position of "
+    "the last frame seen from the first, x right, y down, z forward. Segments: stretches between which the motion is "
+    "unknown. ms/pair: median, from two decoded images to the motion on the host. frames/s: from frame to pose, {cost} "
+    "included."
 )
 MEANINGS = {
+    OF_PATH[0]: "path: its length",
+    OF_PATH[1]: "end: position seen from the first frame, x right, y down, z forward",
     "m/s": "m/s, deg/s: drift, the relative pose error over 1 s",
     "m/frame": "m/frame: relative pose error from frame to frame",
     "ATE m": "ATE: absolute error after alignment",
     "end m": "end: off at the last frame",
     "segments": "segments: stretches between which the motion is unknown; errors are within them",
     "ms/pair": "ms/pair: from two decoded images to their motion",
-    "frames/s": "frames/s: from files to poses, decoding included",
+    "frames/s": "frames/s: from frame to pose, {cost} included",
 }
 """What the columns that are shown are."""
 
@@ -148,7 +154,8 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
     title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
     rows = _rows(entries, typical)
-    _print(title, rows, options.seeds)
+    cost = "rendering" if options.sequence == SYNTHETIC else "reading and decoding"
+    _print(title, rows, options.seeds, cost)
     for entry in typical:
         if reason := why_no_drift(entry.metrics, entry.trajectory, sequence.ground_truth is not None):
             say(reason)
@@ -158,7 +165,7 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     write_report(
         folder / REPORT,
         f"gavo compare: {title}",
-        [Table(TABLE_CAPTION, *known_columns(HEADINGS, rows))],
+        [Table(TABLE_CAPTION.format(cost=cost), *known_columns(HEADINGS, rows))],
         pictures,
         {"options": options, "camera": sequence.camera},
         _versions(entries),
@@ -167,14 +174,14 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     )
 
 
-def _print(title: str, rows: list[list[Any]], seeds: int) -> None:
-    """Print the table; what tells seeds apart only where there are several."""
-    shown = len(HEADINGS) if seeds > 1 else 1 + len(COLUMNS)
+def _print(title: str, rows: list[list[Any]], seeds: int, cost: str) -> None:
+    """Print the table; what tells seeds apart only where there are several. `cost` is what frames take beside poses."""
+    shown = len(HEADINGS) if seeds > 1 else 1 + len(OF_PATH) + len(COLUMNS)
     columns, cells = known_columns(HEADINGS[:shown], [row[:shown] for row in rows])
     print_table(title, columns, cells)
     for heading, meaning in MEANINGS.items():
         if heading in columns:
-            say(f"{meaning}.")
+            say(f"{meaning.format(cost=cost)}.")
 
 
 def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder: Path) -> list[Picture]:
@@ -275,5 +282,8 @@ def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
         known = [drift for drift in drifts if drift is not None]
         cells = [number(_shown(run.metrics, key), digits) for _, key, digits in COLUMNS]
         span = [number(extreme(known, default=None)) for extreme in (min, max)]
-        rows.append([run.method, *cells, len(drifts), *span])
+        path, end = path_and_end(run.trajectory)
+        is_all = run.metrics[DRIFT_PER_FRAME] is None
+        of_path = [number(path), end or DASH] if is_all else [DASH] * len(OF_PATH)
+        rows.append([run.method, *of_path, *cells, len(drifts), *span])
     return rows

@@ -36,7 +36,7 @@ def doctor(command: Doctor) -> int:
     say(f"python: {platform.python_version()} ({platform.python_implementation()})")
     say(f"system: {platform.platform()}")
     say(f"processor: {compiler.processor()}, {os.cpu_count()} cores, {_usable_cores()} of them for this process")
-    say(f"devices: {', '.join(f'{device.platform} {device.device_kind}' for device in jax.devices())}")
+    say(f"devices: {', '.join(_device(device.platform, device.device_kind) for device in jax.devices())}")
     fault = compiler.unfit_compiler()
     if fault:
         say(f"compiler: WRONG: {fault}")
@@ -70,6 +70,11 @@ def _print_checks() -> list[str]:
     recorded = ", ".join(f"{time} on an {name}" for name, time in checks.RECORDED_NANOSECONDS.items())
     say(f"speed: {checks.scoring_nanoseconds():.1f} ns per pixel and candidate (2 cores have taken {recorded})")
     return wrong
+
+
+def _device(platform_name: str, kind: str) -> str:
+    """A device in words; a CPU's kind says no more than its platform."""
+    return kind if kind.lower() == platform_name.lower() else f"{platform_name} {kind}"
 
 
 def _version(package: str) -> str | None:

@@ -33,6 +33,10 @@ ALIKE = 0.1
 
 def evaluate(options: Evaluate) -> int:
     """Print relative pose error, absolute trajectory error and distance error with their definitions, or as JSON."""
+    if not 0 < options.delta < np.inf:
+        raise GavoError(f"--delta: must be a positive number, not {options.delta:g}")
+    if options.unit == "frames" and options.delta != int(options.delta):
+        raise GavoError(f"--delta: must be a whole number of frames, not {options.delta:g}")
     if options.plot is not None:
         if not plots.available():
             raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")

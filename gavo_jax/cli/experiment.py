@@ -26,7 +26,7 @@ from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.report import REPORT as PAGE
 from gavo_jax.output.report import Picture, write_report
 from gavo_jax.output.report import Table as ReportTable
-from gavo_jax.output.screen import known_columns, markdown_table, number, pair_progress, print_table, say
+from gavo_jax.output.screen import counted, known_columns, markdown_table, number, pair_progress, print_table, say
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"
@@ -113,7 +113,9 @@ def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:
                     "the same command goes on from there"
                 ) from None
     if finished.faults:
-        raise GavoError(f"{len(finished.faults)} batches of runs failed: {'; '.join(finished.faults)}")
+        raise GavoError(
+            f"{counted(len(finished.faults), 'batch', 'batches')} of runs failed: {'; '.join(finished.faults)}"
+        )
 
 
 def _news(outcome: Outcome) -> str:
@@ -172,7 +174,7 @@ def _report(folder: Path, markdown: bool) -> int:
         environment(),
         " ".join(notes),
     )
-    say(f"{len(rows)} runs in {Table(folder).folder}, report in {page}")
+    say(f"{counted(len(rows), 'run')} in {Table(folder).folder}, report in {page}")
     return 0
 
 
@@ -210,9 +212,10 @@ def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
     for line in plan.skipped:
         say(line)
     seconds = estimate_seconds(runs, table.read() if table.done() else [], slots)
+    done, batches = len(plan.runs) - len(runs), counted(len(todo), "batch", "batches")
     say(
-        f"{len(plan.runs)} runs, {len(plan.runs) - len(runs)} of them done; {len(runs)} to do in {len(todo)} batches, "
-        f"{programs(runs)} compiled programs, about {_duration(seconds)}; results in {plan.folder}"
+        f"{counted(len(plan.runs), 'run')}, {done} of them done; {len(runs)} to do in {batches}, "
+        f"{counted(programs(runs), 'compiled program')}, about {_duration(seconds)}; results in {plan.folder}"
     )
 
 

@@ -10,11 +10,11 @@ from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 
 NOTES = {
-    "gap": "frames are missing before it; it is used in full",
-    "frozen": "its depth is the last one once more; the image alone is used",
-    "no_depth": "too few depth readings: it is aligned with a frame before, and none with it",
-    "partial_depth": "much of the usual depth is missing: it is aligned with a frame before, and none with it",
-    "depth_units": "its depth may be in other units; it is used in full",
+    "gap": "frames are missing before; used in full",
+    "frozen": "depth repeats that of the frame before; the image alone is used",
+    "no_depth": "too few depth readings; aligned with a frame before, and no later one with it",
+    "partial_depth": "much of the usual depth is missing; aligned with a frame before, and no later one with it",
+    "depth_units": "depth may be in other units; used in full",
 }
 """What a run makes of frames that it uses and doubts, by status."""
 
@@ -56,7 +56,9 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _time(facts: dict[str, Any]) -> str:
     rate = "no rate" if facts["rate_hz"] is None else f"{facts['rate_hz']:.1f} frames/s"
-    gaps = f"{facts['gaps']} gaps, the longest of {facts['longest_gap_s']:.2f} s" if facts["gaps"] else "no gap"
+    longest, gaps = f"{facts['longest_gap_s']:.2f} s", {0: "no gap"}.get(facts["gaps"])
+    if gaps is None:
+        gaps = f"1 gap of {longest}" if facts["gaps"] == 1 else f"{facts['gaps']} gaps, the longest of {longest}"
     guess = f" ({facts['times_guessed']})" if facts["times_guessed"] else ""
     return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}{guess}, {gaps}"
 
@@ -65,7 +67,7 @@ def _camera(camera: dict[str, Any]) -> str:
     size = f"{camera['width']}x{camera['height']}"
     intrinsics = " ".join(f"{name} {camera[name]:g}" for name in ("fx", "fy", "cx", "cy"))
     lens = f", {camera['model']} distortion {camera['distortion']}" if _is_distorted(camera) else ""
-    shutter = f", rolling shutter of {1e3 * camera['readout']:g} ms" if camera["readout"] else ""
+    shutter = f", rolling shutter of {round(1e3 * camera['readout'], 1):g} ms" if camera["readout"] else ""
     return f"{size}, {intrinsics}{lens}{shutter}"
 
 

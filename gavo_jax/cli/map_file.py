@@ -3,6 +3,7 @@
 from collections.abc import Sequence as Many
 from pathlib import Path
 
+from gavo_jax.cli.options import Run
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
@@ -16,16 +17,20 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
     """Refuse a map that cannot be made or written; return what it is to be.
 
     Raises:
-        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, or Open3D cannot be imported.
+        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, options of a map without
+            one, or Open3D cannot be imported.
     """
+    check_voxel(voxel)
     if path is None:
+        for option, is_given in (("--map-shape", shape is not None), ("--voxel", voxel != Run.voxel)):
+            if is_given:
+                raise GavoError(f"{option}: is of a map, and there is none: add --map FILE")
         return shape or "cloud"
     shape = check_map(path, shape)
     if not path.absolute().parent.is_dir():
         raise GavoError(f"{path}: no such folder: {path.parent}")
     if path.is_dir():
         raise GavoError(f"{path}: a folder: name a file for the map")
-    check_voxel(voxel)
     import_open3d()
     return shape
 

@@ -14,17 +14,25 @@ Method = Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")]
 """A name that presets.methods() knows; the help does without the code of the packages that bring some."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
+# tyro breaks a docstring of several lines where its lines end; a text of such a length is given as `help`
+
+SOURCE = "A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package"
+LIVE = "Also realsense: live frames of the first Intel RealSense camera that is connected"
+
 
 @dataclass(frozen=True)
 class Source:
     """Which frames."""
 
-    sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]")] = "synthetic"
-    """A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package. For
-    `gavo run` also realsense: live frames of the first Intel RealSense camera that is connected."""
-    camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a file of TOML or ROS or
-    Kalibr, OpenCV, Open3D."""
+    sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}.")] = "synthetic"
+    camera: Annotated[
+        str,
+        arg(
+            metavar="{auto,fr1,fr2,fr3,FILE}",
+            help="The camera: what the source brings, a camera of a benchmark (bonn and icl, too), or a camera file "
+            "(TOML, ROS, Kalibr, OpenCV, Open3D).",
+        ),
+    ] = "auto"
     start: Annotated[int, arg(metavar="K")] = 0
     """First frame."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
@@ -49,12 +57,20 @@ class Source:
 class Search:
     """How."""
 
-    method: Method = "ga"
-    """Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those of
-    installed packages."""
-    preset: PresetName = "default"
-    """Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has all of them;
-    a method of another package has default alone."""
+    method: Annotated[
+        Method,
+        arg(
+            help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those "
+            "of installed packages."
+        ),
+    ] = "ga"
+    preset: Annotated[
+        PresetName,
+        arg(
+            help="Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has "
+            "all of them; a method of another package has default alone."
+        ),
+    ] = "default"
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
     """Settings from a TOML file, or from config.json of an earlier run; the method and preset that it names count."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
@@ -65,13 +81,14 @@ class Search:
 class Run(Search, Source):
     """Estimate the trajectory of a sequence."""
 
+    sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}. {LIVE}.")] = "synthetic"
     seed: Annotated[int, arg(metavar="S")] = 0
     """Of the method's randomness: the same seed gives the same trajectory, bit for bit."""
     reference: Annotated[
         Literal["previous", "keyframe"] | None,
         arg(metavar="{previous,keyframe}", help_behavior_hint="(default: the preset's)"),
     ] = None
-    """What a frame is aligned to: the previous frame, or the last keyframe."""
+    """What a frame is aligned to: the previous frame alone, or it and a keyframe at once."""
     on_lost: Annotated[
         Literal["hold", "predict", "stop"] | None,
         arg(metavar="{hold,predict,stop}", help_behavior_hint="(default: the preset's)"),
@@ -136,9 +153,13 @@ class View:
     """The output folder of `gavo run`."""
     viewer: Literal["spawn", "web", "save"] = "web"
     """As in `gavo run`; save writes view.rrd into DIR."""
-    search: bool = True
-    """Whether the frames are tracked once more, so that the particles are seen; else paths and images are there at
-    once."""
+    search: Annotated[
+        bool,
+        arg(
+            help="Do not track the frames once more: paths and images are there at once, without the particles.",
+            help_behavior_hint="(default: they are tracked)",
+        ),
+    ] = True
 
 
 @dataclass(frozen=True)

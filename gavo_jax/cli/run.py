@@ -20,6 +20,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
+from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, summary
@@ -84,6 +85,8 @@ def run(options: Run) -> int:
             # before an earlier run is replaced: it may not open
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
+                if options.resume:
+                    say(f"nothing to resume in {folder.path}: a new run")
                 remove_trajectories(folder.path)
                 if folder.has_run():
                     say(f"the earlier run in {folder.path} is replaced")
@@ -104,7 +107,9 @@ def run(options: Run) -> int:
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(name, metrics, folder.path, sequence.ground_truth is not None)
+        print_run(
+            name, metrics, folder.path, sequence.ground_truth is not None, is_rendered=options.sequence == SYNTHETIC
+        )
         if options.map is not None:
             save_map(options.map, sequence, folder.steps(), trajectory, shape, options.voxel)
     if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):

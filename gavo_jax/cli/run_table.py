@@ -48,11 +48,13 @@ COUNTS = (
     ("time per pair, decoded images, median", MILLISECONDS, 1, "ms"),
     ("speed, reading and decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
 )
+OF_RENDERED = {FRAMES_PER_SECOND: "speed, rendering included"}
+"""What a row is called where frames are rendered and not read."""
 
 Row = tuple[str, str, str]
 
 
-def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bool) -> None:
+def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bool, is_rendered: bool = False) -> None:
     """Print the table of a run and where its files are.
 
     Args:
@@ -60,13 +62,15 @@ def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bo
         metrics: as in metrics.json.
         folder: the run's.
         has_truth: whether the sequence has a ground truth.
+        is_rendered: whether its frames are those of the synthetic room.
     """
     trajectory = Trajectory.read_tum(folder / TRAJECTORY)
     known = [row for row in ERRORS + BEFORE_LOOPS if metrics.get(row[1]) is not None]
     rows: list[Row] = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in known]
     if not known:
         rows += _of_trajectory(trajectory, metrics)
-    rows += [(what, number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
+    names = OF_RENDERED if is_rendered else {}
+    rows += [(names.get(key, what), number(metrics.get(key), digits), unit) for what, key, digits, unit in COUNTS]
     for status, count in metrics.get("statuses", {}).items():
         if status == "frozen":
             rows += _of_frozen(read_steps(folder, trajectory))
@@ -110,19 +114,23 @@ def _of_bodies(path: Path) -> list[Row]:
     ]
 
 
-def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:
-    """What a trajectory tells without a truth beside it: of its end nothing where the way there is unknown."""
+def path_and_end(trajectory: Trajectory) -> tuple[float, str | None]:
+    """The length of a path and where it ends, metres; of its end nothing where the way there is unknown."""
     places = trajectory.world_T_camera[:, :3, 3]
     known = np.diff(trajectory.segments) == 0
     path = float(np.linalg.norm(np.diff(places, axis=0), axis=1)[known].sum())
+    is_known = trajectory.segments[0] == trajectory.segments[-1]
+    return path, " ".join(f"{value:+.4f}" for value in places[-1]) if is_known else None
+
+
+def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:
+    """What a trajectory tells without a truth beside it."""
+    path, end = path_and_end(trajectory)
     angle = float(np.degrees(rotation_angle(trajectory.world_T_camera[-1:, :3, :3])[0]))
     share = metrics.get("statuses", {}).get("ok", 0) / max(1, metrics.get("pairs", 0))
     rows = [("length of the path", number(path), "m")]
-    if trajectory.segments[0] == trajectory.segments[-1]:
-        rows += [
-            ("end: x right, y down, z forward", " ".join(f"{value:+.4f}" for value in places[-1]), "m"),
-            ("end: turned by", number(angle, 2), "deg"),
-        ]
+    if end is not None:
+        rows += [("end: x right, y down, z forward", end, "m"), ("end: turned by", number(angle, 2), "deg")]
     return [*rows, ("pairs that are ok", number(100 * share, 1), "%")]
 
 

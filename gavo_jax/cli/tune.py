@@ -42,7 +42,10 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     def show(trial: int, drift: float, milliseconds: float) -> None:
         say(f"trial {trial}: {number(drift, 5)} m/s, {number(milliseconds, 1)} ms/pair")
 
-    front = search(tuning, storage, trials, show)
+    try:
+        front = search(tuning, storage, trials, show)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(": the same command goes on from there") from None
     names = list(tuning.space)
     rows = [_row(choice, names) for choice in front]
     print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)

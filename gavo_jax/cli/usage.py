@@ -1,15 +1,70 @@
-"""What tyro says of arguments that it does not take, in this command's words: one line, with what would help."""
+"""What tyro says, in this command's words: of arguments that it does not take one line, with what would help; and pages
+of help that fit the screen.
+"""
 
 import difflib
+import io
 import itertools
 import re
+import shutil
+import textwrap
 from collections.abc import Sequence
+from typing import TextIO
 
 COMMANDS = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor", "inspect")
 COMMANDS += ("calibrate",)
 NUMBER = r"(?:could not convert string to float|invalid literal for int\(\) with base 10): (?P<value>.*)"
 UNION = r"no type matching .*(?P<kind>INT|FLOAT) could be instantiated from \[(?P<values>.*)\]\."
 CHOICE = r"invalid choice (?P<value>.*) for argument '(?P<name>[^']*)'\. Expected one of \((?P<choices>.*)\)\."
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+HELP = ("-h", "--help")
+HELP_OF_HELP = ("-h, --help", "show this help message and exit")
+VERSION = ("--version", "print the version and exit")
+"""What a page of help says of an option, and `--version` likewise: tyro knows none beside subcommands."""
+
+
+class HelpPage(io.StringIO):
+    """Takes what tyro prints in the place of a stream, whose colours and lines are those that the stream can show."""
+
+    def __init__(self, stream: TextIO) -> None:
+        """Take what is meant for the stream."""
+        super().__init__()
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The stream's."""
+        return self._stream.encoding
+
+    def isatty(self) -> bool:
+        """Whether the stream is a terminal."""
+        return self._stream.isatty()
+
+    def fitted(self) -> str:
+        """The page, its sentences between words to the width of the screen; beside `--help` of the whole command it has
+        `--version`, too.
+        """
+        width = shutil.get_terminal_size().columns
+        lines = self.getvalue().splitlines()
+        plain = [COLOUR.sub("", line) for line in lines]
+        is_of_all = any(line.strip(" ╭─╮") == "subcommands" for line in plain)
+        fitted = []
+        for line, words in zip(lines, plain, strict=True):
+            is_sentence = words[:1].isalpha() and not words.startswith("usage:")
+            fitted.append(textwrap.fill(line, width, break_long_words=False) if is_sentence else line)
+            if is_of_all and HELP_OF_HELP[1] in words:
+                for told, ours in zip(HELP_OF_HELP, VERSION, strict=True):
+                    words = words.replace(told, ours.ljust(len(told)))
+                fitted.append(words)
+        return "\n".join(fitted)
+
+
+def asking_for_help(arguments: Sequence[str]) -> list[str]:
+    """The arguments; where a subcommand's help is among them, that alone: tyro leaves out what was given already."""
+    if arguments and arguments[0] in COMMANDS and any(word in HELP for word in arguments[1:]):
+        return [arguments[0], HELP[1]]
+    return list(arguments)
 
 
 def fault_of_usage(box: str, arguments: Sequence[str]) -> str:

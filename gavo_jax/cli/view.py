@@ -115,10 +115,9 @@ def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:
     try:
         values = {name: value for name, value in entry["camera"].items() if name != "type"}
         camera = Camera(**{**values, "distortion": tuple(values["distortion"])})
+        require_camera(camera)
     except (AttributeError, KeyError, TypeError):
         raise GavoError(f"{folder / CONFIG}: does not tell the camera") from None
-    try:
-        require_camera(camera)
     except GavoError as error:
         raise GavoError(f"{folder / CONFIG}: {error}") from None
     return camera

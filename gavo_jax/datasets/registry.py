@@ -1,9 +1,10 @@
 """Which kind of source lies at a path: the kinds that are known, and those that other packages bring."""
 
+import inspect
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import Sequence
@@ -101,9 +102,34 @@ def register_dataset(dataset: Dataset) -> None:
 
     Args:
         dataset: has `kind` (what it is called), `recognises(path) -> bool` and `open(path, reading) -> Sequence`.
+
+    Raises:
+        GavoError: it lacks one of these, or one cannot be called so.
     """
+    _require_dataset(dataset)
     if dataset not in _registered:
         _registered.insert(0, dataset)
+
+
+CALLS = {"recognises": ("path",), "open": ("path", "reading")}
+"""What a kind of source is asked, and with what."""
+
+
+def _require_dataset(dataset: Any) -> None:
+    name = getattr(dataset, "__name__", type(dataset).__name__)
+    if not (isinstance(kind := getattr(dataset, "kind", None), str) and kind):
+        raise GavoError(f"dataset {name}: kind: what it is called is needed, a text")
+    for method, arguments in CALLS.items():
+        call, form = getattr(dataset, method, None), f"{method}({', '.join(arguments)})"
+        if not callable(call):
+            raise GavoError(f"dataset {name}: has no {form}")
+        try:
+            inspect.signature(call).bind(*arguments)
+        except TypeError:
+            hint = ": a classmethod is needed, or an object of the class" if isinstance(dataset, type) else ""
+            raise GavoError(f"dataset {name}: {form} cannot be called so{hint}") from None
+        except ValueError:  # nothing tells what it takes
+            pass
 
 
 def datasets() -> tuple[Dataset, ...]:
@@ -154,23 +180,31 @@ def recognise(path: Path) -> Dataset:
     Raises:
         GavoError: none that is known; the message says what is there instead.
     """
-    dataset = _kind_of(path)
+    faults: list[str] = []
+    dataset = _kind_of(path, faults)
     if dataset is not None:
         return dataset
-    raise GavoError("; ".join([f"{path}: {_contents(path)}", *faulty_plugins()]))
+    raise GavoError("; ".join([f"{path}: {_contents(path)}", *faults, *faulty_plugins()]))
 
 
-def _kind_of(path: Path) -> Dataset | None:
+def _kind_of(path: Path, faults: list[str] | None = None) -> Dataset | None:
+    """The kind of source that lies at a path; one of a package that fails is passed over, and told in `faults`."""
     for dataset in datasets():
-        with blamed(f"dataset {dataset.kind!r}: {path}"):
-            if dataset.recognises(path):
-                return dataset
+        try:
+            with blamed(f"dataset {dataset.kind!r}: {path}"):
+                if dataset.recognises(path):
+                    return dataset
+        except GavoError as error:
+            if dataset in BUILT_IN:
+                raise
+            if faults is not None:
+                faults.append(str(error))
     return None
 
 
 def _contents(path: Path) -> str:
     """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
-    known = ", ".join(dataset.kind for dataset in datasets())
+    known = f"{', '.join(dataset.kind for dataset in datasets())} (SUN3D's, too)"
     if not path.is_dir():
         if path.is_file() and (source := source_around(path)):
             return f"a file of a source: name its folder, {source}"
@@ -209,11 +243,7 @@ def _contents(path: Path) -> str:
 
 
 def source_around(path: Path) -> Path | None:
-    """The folder of the source that a file or folder is a part of; None where it is of none.
-
-    Raises:
-        GavoError: a package's kind fails.
-    """
+    """The folder of the source that a file or folder is a part of; None where it is of none."""
     return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
 
 

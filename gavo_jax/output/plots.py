@@ -65,16 +65,18 @@ CAPTIONS = {
     "population": "Root of E over the iterations of each level's search of the run's last pair: best and median of the "
     "population, and the range of its middle 80 %. Levels from coarse to fine; their errors are not comparable.",
     "landscape": "Root of E around the motion that was found, along the eigenvectors of its covariance with the "
-    "largest and the smallest variance: translation v and rotation w, in the axes of the reference camera. Gaps: too "
-    "little of the view is left.",
+    "largest and the smallest variance: translation v and rotation w, in the axes of the reference camera.",
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
 """By the name of the figure's files."""
 WITH_TRUTH = (
-    " Ground truth: interpolated at the frames' stamps, laid on the first estimate at the first pose that it covers."
+    " Ground truth: interpolated at the frames' stamps, laid on the first estimate at its first pose that the "
+    "ground truth covers."
 )
 """Of the trajectories' caption."""
+GAPS = " Gaps: too little of the view is left."
+"""Of the landscape's caption, where there are any."""
 SEVERAL_RUNS = " Bars: median over the runs; whiskers: smallest and largest."
 """Of the drift's caption."""
 MORE_THAN_THE_PAIR = " The motion was found with {}, too: the minimum of this pair alone may lie millimetres away."
@@ -246,9 +248,9 @@ def plot_landscape(landscape: Landscape, pair: str = "", more: Sequence[str] = (
         pair: which frames it is of, for the title.
         more: what the motion was found with beside the two frames, for the caption.
     """
-    figure = new_figure(
-        8.0, 4.8, CAPTIONS["landscape"] + (MORE_THAN_THE_PAIR.format(" and ".join(more)) if more else "")
-    )
+    has_gaps = not all(np.isfinite(errors).all() for errors in landscape.errors.values())
+    found_with = MORE_THAN_THE_PAIR.format(" and ".join(more)) if more else ""
+    figure = new_figure(8.0, 4.8, CAPTIONS["landscape"] + GAPS * has_gaps + found_with)
     figure.suptitle(pair, fontsize="medium")
     titles = ("worst-conditioned direction", "best-conditioned direction")
     for i, (axes, title) in enumerate(zip(panels_of(figure, 2), titles, strict=True)):

@@ -145,6 +145,11 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return a count with what it counts: 1 run, 2 runs; `many` where an s is not enough."""
+    return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """Return a number of fixed decimals, or a dash for what is not known."""
     return DASH if value is None else f"{value:.{digits}f}"

@@ -20,9 +20,16 @@ def static(default: Any, least: float | None = None) -> Any:
     return field(default=default, metadata={"static": True, "range": (least, None)})
 
 
-def within(default: Any, least: float, most: float | None = None) -> Any:
-    """A dataclass field that is an input of the program, and the range of its numbers on levels that are searched."""
-    return field(default=default, metadata={"range": (least, most)})
+def within(default: Any, least: float, most: float | None = None, instead_of: str | None = None) -> Any:
+    """A dataclass field that is an input of the program, and the range of its numbers on levels that are searched.
+
+    Args:
+        default: Its value.
+        least: What a number must at least be.
+        most: What it may at most be.
+        instead_of: Another field of the same solver, which has to be None for this one to count.
+    """
+    return field(default=default, metadata={"range": (least, most), "instead_of": instead_of})
 
 
 Schedule = Annotated[Any, "schedule"]

@@ -55,7 +55,7 @@ class GeneticAlgorithm(PerLevel):
         mutation_step: First standard deviation of a mutation, search units, an entry per level; None takes
             δ = mutation_rate (ξ^U − ξ^L), as the paper does.
         mutation_decay: Factor on the step from generation to generation; 1 in the paper.
-        mutation_rate: p_m, 0.1 in the paper.
+        mutation_rate: p_m, 0.1 in the paper; counts where `mutation_step` is None.
         crossover_range: d of the intermediate `crossover`: α is uniform in [−d, 1 + d].
         pressure: Factor in the `fitness`, 8 in the paper.
     """
@@ -68,7 +68,7 @@ class GeneticAlgorithm(PerLevel):
     spread: Schedule | None = within((0.5, 0.5, 2.0, 3.0, 6.0), 0)
     mutation_step: Schedule | None = within((0.5, 0.5, 2.0, 3.0, 6.0), 0)
     mutation_decay: float = within(0.8, 0, 1)
-    mutation_rate: float = within(0.1, 0, 1)
+    mutation_rate: float = within(0.1, 0, 1, instead_of="mutation_step")
     crossover_range: float = within(0.25, 0)
     pressure: float = within(8.0, 0)
 

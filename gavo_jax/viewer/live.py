@@ -171,7 +171,7 @@ class RerunViewer(Viewer):
         """Serve the browser until Ctrl-C; a window of its own and a file need nothing."""
         if not self.url:
             return
-        print(f"viewer at {self.url} (Ctrl-C ends it)", flush=True)
+        print("the viewer stays until Ctrl-C ends it", flush=True)
         try:
             while True:
                 time.sleep(1.0)

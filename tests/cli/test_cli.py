@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -142,6 +143,13 @@ def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
     np.testing.assert_allclose(step.world_T_camera, corrected.world_T_camera[21], atol=1e-6)
     assert gavo(*command, "--resume").status == 0
     assert gavo(*command[:-1]).status == 0 and not (out / "odometry.txt").exists() and not (out / "loops.csv").exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_frames_of_the_room_are_rendered_and_not_read(gavo, clip, tmp_path):
+    arguments = (*FAST, "--frames", 2, "--output", tmp_path / "out")
+    room, read = gavo("run", *arguments), gavo("run", clip, "--camera", clip / "camera.toml", *arguments)
+    assert "speed, rendering included" in room.out and "speed, reading and decoding included" in read.out
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -321,6 +329,10 @@ BAD_OPTIONS = {
     "unknown option": (["--nonsense"], ["--nonsense"]),
     "rate of stamps": (["--rate", "10"], ["clip", "--rate", "stamps"]),
     "topic of a folder": (["--depth-topic", "/depth"], ["clip", "--depth-topic", "TUM RGB-D folder"]),
+    "no voxel": (["--voxel", "0"], ["voxel", "from"]),
+    "negative voxel of a mesh": (["--map-shape", "mesh", "--voxel", "-5"], ["voxel", "not -5"]),
+    "voxel of no map": (["--voxel", "0.02"], ["--voxel", "add --map FILE"]),
+    "shape of no map": (["--map-shape", "mesh"], ["--map-shape", "add --map FILE"]),
     "output is a file": (["--output", "clip/rgb.txt"], ["clip/rgb.txt"]),
     "output below a file": (["--output", "clip/rgb.txt/out"], ["clip/rgb.txt/out"]),
 }
@@ -398,6 +410,7 @@ def test_align_fits_a_terminal():
     assert max(map(len, text.splitlines())) <= 80
     assert json.loads(text)["xi"][0] == -0.001235 and rounded(None) is None and rounded("ok") == "ok"
     assert np.isnan(rounded(np.array([np.nan])))
+    assert rounded(np.float32(12.345678)) == 12.35 and rounded(6553.5) == 6553.5
 
 
 @pytest.mark.parametrize("role", range(4))
@@ -436,7 +449,10 @@ def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, cl
 def test_evaluate_refuses(gavo, clip):
     truth = clip / "groundtruth.txt"
     assert is_refused(gavo("evaluate", clip / "none.txt", truth), "none.txt")
-    assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "delta")
+    assert is_refused(gavo("evaluate", truth, truth, "--delta", 0), "gavo: --delta: must be a positive number, not 0")
+    half = ("--delta", 0.5, "--unit", "frames")
+    assert is_refused(gavo("evaluate", truth, truth, *half), "gavo: --delta: must be a whole number of frames, not 0.5")
+    assert "over 1 frame, all pairs" in gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames").out
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100", "--unit frames")
     later = clip / "later.txt"
     later.write_text("9000 0 0 0 0 0 0 1\n9002 0 0 0 0 0 0 1\n")
@@ -540,6 +556,20 @@ def test_compare(gavo, pristine, tmp_path):
     }
     report = (tmp_path / "out" / "report.html").read_text()
     assert f"<td>{table[1]['rpe_translation_rmse_m_per_s']:.4f}</td>" in report and report.count("<img") == 3
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_compare_without_truth_tells_of_the_paths(gavo, clip, tmp_path):
+    (clip / "groundtruth.txt").unlink()
+    arguments = ("compare", clip, "--camera", clip / "camera.toml", "--output", tmp_path / "out")
+    done = gavo(*arguments, "--methods", "gauss-newton,opencv-rgbd")
+    assert done.status == 0, done.err
+    lines = done.out.splitlines()
+    [heads] = [line for line in lines if line.startswith("┃")]
+    assert "path m ┃" in heads and "end m: x y z ┃" in heads and len(heads) <= 80
+    [row] = [line for line in lines if line.startswith("│ gauss-newton")]
+    assert re.search(r"│ +\d\.\d{4} │ [+-]\d\.\d{4} [+-]\d\.\d{4} [+-]\d\.\d{4} │", row)
+    assert any(line.startswith("end: position seen from the first frame") for line in lines)
 
 
 def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
@@ -676,6 +706,29 @@ def test_help_and_version(gavo):
     assert "compare" in gavo("--help").out
     assert "--on-lost" in gavo("run", "--help").out
     assert gavo("--version").out.startswith("gavo-jax ")
+    assert re.search(" --version +print the version and exit ", gavo("--help").out)
+    for words in (("run", "--help"), ("run", "--version", "--help")):
+        assert "--version" not in gavo(*words).out
+
+
+@pytest.mark.parametrize("command", ["", "run", "compare", "view", "experiment", "tune", "inspect", "calibrate"])
+def test_pages_of_help_fit_the_screen(gavo, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "80")
+    page = gavo(*command.split(), "--help").out
+    assert not [line for line in page.splitlines() if len(line) > 80 and not line.startswith("usage:")]
+    assert ("realsense" in page) == (command == "run")
+
+
+def test_no_text_of_an_option_has_lines_of_its_own():
+    """They would end where the source's do."""
+    texts = re.findall(r'^    """([^"]*)"""$', Path(options.__file__).read_text(encoding="utf-8"), re.M)
+    assert len(texts) > 40 and not [text for text in texts if "\n" in text and "\n\n" not in text]
+
+
+def test_help_tells_what_an_option_does_once_it_is_given(gavo):
+    assert "Do not track the frames once more" in " ".join(gavo("view", "--help").out.replace("│", "").split())
+    for words in (("experiment", "--help"), ("experiment", "report", "--help")):
+        assert "{FILE.toml,report} [DIR]" in gavo(*words).out.splitlines()[0]
 
 
 def test_help_lists_every_method_a_package_brings_and_loads_none(tmp_path):

@@ -36,6 +36,7 @@ def test_doctor_tells_what_an_issue_report_needs(gavo, tmp_path):
     assert lines["gavo-jax"] == __version__
     assert lines["jax"] == jax.__version__ and lines["numpy"] == np.__version__
     assert {"jaxlib", "opencv-python-headless", "python", "system", "devices"} <= set(lines)
+    assert "cpu cpu" not in lines["devices"] and lines["devices"]
     assert f"{os.cpu_count()} cores" in lines["processor"] and compiler.processor() in lines["processor"]
     assert lines["cache"].startswith(str(tmp_path / "cache")) and lines["cache"].endswith("writable")
     assert {f"extra {name}" for name in ("plot", "viewer", "download", "ray", "tune", "peers", "cuda")} <= set(lines)

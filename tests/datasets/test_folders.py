@@ -901,10 +901,38 @@ def test_a_faulty_dataset_of_others_is_named(tmp_path, no_plugins, fault):
         register_dataset(broken)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="(own_package:Lines.*|'odd'.*): no way"):
         open_source(tmp_path)
-    if fault == "load":  # what others recognise does not ask for it
-        (tmp_path / "room").mkdir()
-        LAYOUTS["plain"][1](tmp_path / "room")
-        assert len(open_source(tmp_path / "room")) == len(GREYS)
+    (tmp_path / "room").mkdir()  # what others recognise does not ask for it
+    LAYOUTS["plain"][1](tmp_path / "room")
+    assert len(open_source(tmp_path / "room")) == len(GREYS)
+
+
+class Unbound:
+    """Its methods want an object of the class."""
+
+    kind = "unbound"
+
+    def recognises(self, path: Path) -> bool:
+        return path.suffix == ".lines"
+
+    def open(self, path: Path, reading: Reading) -> Sequence:
+        return Lines.open(path, reading)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "words"),
+    [
+        (type("Empty", (), {}), "Empty: kind"),
+        (type("Named", (), {"kind": "named"}), r"Named: has no recognises\(path\)"),
+        (type("Half", (), {"kind": "half", "recognises": staticmethod(len)}), r"Half: has no open\(path, reading\)"),
+        (Unbound, r"Unbound: recognises\(path\) cannot be called so: a classmethod is needed"),
+    ],
+)
+def test_what_is_no_dataset_is_refused_at_once(no_plugins, dataset, words):
+    with pytest.raises(GavoError, match=f"^dataset {words}"):
+        register_dataset(dataset)
+    assert not registry._registered
+    register_dataset(Unbound())
+    assert registry._registered
 
 
 def test_red_kitchen_by_its_folder_alone(data_dir):

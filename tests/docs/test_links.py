@@ -28,6 +28,13 @@ def test_links_inside_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{file}#{anchor}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_of_the_site_stay_in_it(page: Path) -> None:
+    site = ROOT / "docs"
+    for file, _ in links(page) if site in page.parents else ():
+        assert not file or (page.parent / file).resolve().is_relative_to(site), file
+
+
 def test_the_reference_has_every_public_name() -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     documented = re.findall(r"^::: gavo_jax\.([\w.]+)$", pages, re.MULTILINE)

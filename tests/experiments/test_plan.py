@@ -19,7 +19,7 @@ GRID = """
 name = "ga"
 presets = ["fast", "default"]
 solver.patience = 5
-sweep.solver.mutation_rate = [0.1, 0.2]
+sweep.solver.mutation_decay = [0.7, 0.9]
 sweep.alignment.loss = ["huber", "l2"]
 [[methods]]
 name = "gauss-newton"
@@ -34,7 +34,7 @@ def test_a_grid(write_experiment, tmp_path):
     assert plan.name == "small" and plan.folder == Path("runs/small")
     assert len(plan.runs) == 2 * 4 * 3 + 1 + 1 == len({run.id for run in plan.runs})
     labels = list(dict.fromkeys(run.label for run in plan.runs))
-    assert labels[0] == "ga, fast, patience=5, mutation_rate=0.1, loss=huber"
+    assert labels[0] == "ga, fast, patience=5, mutation_decay=0.7, loss=huber"
     assert labels[-2:] == ["gauss-newton", "opencv-rgb"]
     assert [run.seed for run in plan.runs[-2:]] == [7, None]
     # the loss and the preset shape a program, the rate does not

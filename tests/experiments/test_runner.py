@@ -129,7 +129,7 @@ def test_command(small, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["experiment", str(small), "--output", str(out), "--dry-run"]) == 0
     planned = capsys.readouterr().out
-    assert "4 runs, 0 of them done; 4 to do in 3 batches, 1 compiled programs" in planned and not out.exists()
+    assert "4 runs, 0 of them done; 4 to do in 3 batches, 1 compiled program," in planned and not out.exists()
     assert " frame pairs " in planned
     assert main(["experiment", str(small), "--output", str(out)]) == 0
     printed, news = capsys.readouterr()
@@ -192,6 +192,15 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
     front = json.loads((out / "front.json").read_text())
     assert len(front) == 5 and [f["milliseconds"] for f in front] == sorted(f["milliseconds"] for f in front)
     assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
+
+
+def test_an_interrupted_study_says_how_it_goes_on(tuned, tmp_path, capsys, monkeypatch):
+    def stopped(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gavo_jax.cli.tune.search", stopped)
+    assert main(["tune", str(tuned), "--output", str(tmp_path / "study")]) == 130
+    assert capsys.readouterr().err == "gavo: interrupted: the same command goes on from there\n"
 
 
 def test_the_setting_says_whether_a_range_is_of_whole_numbers(tuned, tmp_path, monkeypatch):

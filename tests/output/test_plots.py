@@ -200,6 +200,12 @@ def test_every_figure_carries_its_definition_and_units():
         assert caption.startswith(plots.CAPTIONS[name])
         for axes in figure.axes:
             assert axes.get_xlabel(), name
+    landscape.errors[1][0, 0] = np.inf
+    for caption, has_gaps in (
+        (figures["landscape"].get_supxlabel(), False),
+        (plots.plot_landscape(landscape).get_supxlabel(), True),
+    ):
+        assert ("Gaps:" in str(caption)) == has_gaps
 
 
 def test_convergence_carries_the_last_error_on_and_counts_from_it():

@@ -173,9 +173,9 @@ def test_interrupted_run_is_resumed(clip, whole, tmp_path, monkeypatch):
 def test_nothing_to_resume(clip, whole, tmp_path, capsys):
     """An empty folder is a run from the start; of a run that came to its end nothing is touched."""
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
+    assert f"nothing to resume in {tmp_path / 'out'}: a new run\n" in capsys.readouterr().out
     assert same_ending(tmp_path / "out", whole)
     before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
-    capsys.readouterr()
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
     done = capsys.readouterr()
     assert "nothing to resume" in done.err and "lost pairs" in done.out
