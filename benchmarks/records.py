@@ -157,7 +157,7 @@ def summary(records: Records) -> Table:
     rows = []
     for title, method in SUMMARY:
         if method in OF_TABLE_1:
-            drift = [records.cell("table1", "fr1_xyz", *OF_TABLE_1[method])[:6], UNKNOWN, UNKNOWN]
+            drift = [f"{float(records.cell('table1', 'fr1_xyz', *OF_TABLE_1[method])):.4f}", UNKNOWN, UNKNOWN]
         else:
             drift = [records.cell("drift", f"drift on {clip}", method, "m/s") for clip in CLIPS]
         found = next(records.cells("basin", "success rate on fr1_rpy", method, "10 frames"), None)
