@@ -73,7 +73,8 @@ LABEL_HEIGHT = 0.05
 def label_ends(axes: Any) -> None:
     """Write each curve's name beside the panel at the height of its last point, in its colour.
 
-    Names of curves that end together make room. Those that end at one point share a line to it.
+    Names of curves that end together make room, and a line leads to each one's end. Where some end at one point, a
+    piece of each curve stands before its name instead.
     """
     low, high = axes.get_ylim()
     ends = {line: (float(line.get_xdata()[-1]), float(line.get_ydata()[-1])) for line in axes.lines if _drawn(line)}
@@ -82,11 +83,12 @@ def label_ends(axes: Any) -> None:
         return
     wanted = np.array([(ends[line][1] - low) / (high - low) for line in curves])
     places = dict(zip(curves, apart(wanted, LABEL_HEIGHT, (0.0, 1.0)).tolist(), strict=True))
+    shared = len(set(ends.values())) < len(ends)
     for line, place in places.items():
         axes.annotate(
             line.get_label(),
             (1.0, place),
-            (1.06, place),
+            (1.12 if shared else 1.06, place),
             xycoords="axes fraction",
             textcoords="axes fraction",
             annotation_clip=False,
@@ -94,9 +96,10 @@ def label_ends(axes: Any) -> None:
             color=line.get_color(),
             fontsize="small",
         )
-    for end in dict.fromkeys(ends.values()):
-        group = [places[line] for line in curves if ends[line] == end]
-        _draw_leader(axes, end, min(group), max(group))
+        if shared:
+            _draw_sample(axes, line, place)
+        else:
+            _draw_leader(axes, ends[line], place)
 
 
 def _drawn(line: Any) -> bool:
@@ -104,24 +107,21 @@ def _drawn(line: Any) -> bool:
     return len(line.get_xdata()) > 0 and not str(line.get_label()).startswith("_")
 
 
-def _draw_leader(axes: Any, end: tuple[float, float], lowest: float, highest: float) -> None:
-    """Draw a thin line from the end of a curve, or of several, to the name or names beside the panel.
+def _draw_leader(axes: Any, end: tuple[float, float], place: float) -> None:
+    """Draw a thin line from the end of a curve to its name beside the panel.
 
     It is dotted where it crosses the panel: it is no curve.
     """
     style = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
-    beside = 1.03 if highest == lowest else 1.045
     across = {"linestyle": ":", "linewidth": 0.8} if end[0] < axes.get_xlim()[0] + 0.9 * np.ptp(axes.get_xlim()) else {}
-    axes.annotate(
-        "",
-        end,
-        (beside, (lowest + highest) / 2),
-        textcoords="axes fraction",
-        annotation_clip=False,
-        arrowprops=style | across,
-    )
-    if highest > lowest:
-        axes.plot([beside] * 2, [lowest, highest], transform=axes.transAxes, clip_on=False, color="0.6", linewidth=0.6)
+    axes.annotate("", end, (1.03, place), textcoords="axes fraction", annotation_clip=False, arrowprops=style | across)
+
+
+def _draw_sample(axes: Any, line: Any, place: float) -> None:
+    """Draw a piece of a curve before its name beside the panel."""
+    names = ("color", "linestyle", "linewidth", "marker", "markersize")
+    style = {name: getattr(line, f"get_{name}")() for name in names}
+    axes.plot([1.03, 1.065, 1.1], [place] * 3, transform=axes.transAxes, clip_on=False, markevery=[1], **style)
 
 
 def apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float, float]) -> Float[np.ndarray, " n"]:

@@ -319,6 +319,17 @@ def test_curves_that_end_together_have_names_apart_in_the_order_of_their_ends():
     assert shown == {name: color for name, color in colors.items() if name in ends}
 
 
+@pytest.mark.parametrize(("ends", "pieces"), [((0.5, 0.1), 0), ((0.1, 0.1), 2)])
+def test_curves_that_end_at_one_point_show_a_piece_of_themselves(ends: tuple[float, float], pieces: int) -> None:
+    """Ten names shared one line to one point: which curve was whose, nobody could tell."""
+    success = {name: np.array([1.0, end]) for name, end in zip(("ga", "opencv-rgb"), ends, strict=True)}
+    (axes,) = plots.plot_basin(np.array([7.0, 20.0]), success, "clip", ["ga"]).axes
+    curves, beside = axes.lines[:2], axes.lines[2:]
+    assert len(beside) == pieces
+    for curve, piece in zip(curves, beside, strict=False):
+        assert (piece.get_linestyle(), piece.get_marker()) == (curve.get_linestyle(), curve.get_marker())
+
+
 def test_places_move_no_further_than_the_distance_asks_for():
     assert figure_parts.apart(np.array([0.9, 0.5, 0.5]), 0.1, (0.0, 1.0)) == pytest.approx([0.9, 0.55, 0.45])
     assert figure_parts.apart(np.array([1.0, 1.0]), 0.1, (0.0, 1.0)) == pytest.approx([1.0, 0.9])
