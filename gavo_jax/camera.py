@@ -23,11 +23,6 @@ OFF_AXIS = 10.0, 10001
 """Up to where, as x / z, a lens is looked at, 84 degrees; and at how many places."""
 
 
-def _require_size(name: str, size: Any) -> None:
-    if not isinstance(size, int | np.integer) or size < 0:
-        raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
-
-
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["fx", "fy", "cx", "cy", "depth_scale", "readout"],
@@ -70,7 +65,8 @@ class Camera:
 
     def __post_init__(self):
         for name in ("width", "height"):
-            _require_size(name, getattr(self, name))
+            if not isinstance(size := getattr(self, name), int | np.integer) or size < 0:
+                raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
         for name in ("fx", "fy", "depth_scale", "readout"):
             value = getattr(self, name)
             if isinstance(value, int | float | np.integer | np.floating) and value < 0:

@@ -198,7 +198,7 @@ def estimate_camera(
                 on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {rounds}")
                 leasts |= find(trial, interval, number == 0)
                 trial.settle()
-    found |= _judged(leasts, trial, min(interval, LONGEST_READOUT), guessed)
+    found |= _judged(leasts, trial, interval, guessed)
     delay = found["depth_delay"].value if "depth_delay" in found else None
     return CameraEstimate(found, _with_found(sequence, found), delay or 0.0, pairs)
 
@@ -208,7 +208,7 @@ def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, L
     score = trial.score("grey", lambda unknowns, value: unknowns._replace(readout=value))
     start = coarse(score, np.linspace(0, most, 7)) if is_first else float(trial.unknowns.readout)
     least = refine(score, start, READOUT_STEP, -2 * READOUT_STEP, most + 2 * READOUT_STEP)
-    least = least._replace(value=min(max(0.0, least.value), most))
+    least = least._replace(value=min(max(0.0, least.value), interval))
     trial.unknowns = trial.unknowns._replace(readout=least.value)
     return {"readout": least}
 
@@ -276,19 +276,19 @@ _KINDS: dict[str, tuple[str, str, str]] = {
 }
 
 
-def _judged(leasts: dict[str, Least], trial: _Trial, longest: float, guessed: str) -> dict[str, Found]:
+def _judged(leasts: dict[str, Least], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
     """Each number with its deviation, or why it is not determined.
 
     Args:
         leasts: What was found, by name.
         trial: What it was found from.
-        longest: That a readout can be, seconds.
+        interval: Between two frames, seconds: no readout is longer.
         guessed: What the stamps are taken from, where that is a guess; else empty.
     """
     found = {}
     for name, least in leasts.items():
         kind, unit, how = _KINDS[name]
-        if name == "readout" and least.value >= longest:
+        if name == "readout" and least.value >= interval:
             how += "; at the longest that it can be, the time between two frames"
         if unit == "s" and guessed:
             how += f"; as true as the stamps, which are a guess ({guessed})"

@@ -7,7 +7,7 @@ from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.depth_unit import name_of_unit
 from gavo_jax.inspection import inspect_sequence
 from gavo_jax.output.files import json_text
-from gavo_jax.output.screen import say, waiting
+from gavo_jax.output.screen import counted, say, waiting
 
 NOTES = {
     "gap": "frames are missing before; used in full",
@@ -56,9 +56,10 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _time(facts: dict[str, Any]) -> str:
     rate = "no rate" if facts["rate_hz"] is None else f"{facts['rate_hz']:.1f} frames/s"
-    longest, gaps = f"{facts['longest_gap_s']:.2f} s", {0: "no gap"}.get(facts["gaps"])
-    if gaps is None:
-        gaps = f"1 gap of {longest}" if facts["gaps"] == 1 else f"{facts['gaps']} gaps, the longest of {longest}"
+    gaps = "no gap"
+    if facts["gaps"]:
+        several = ", the longest" if facts["gaps"] > 1 else ""
+        gaps = f"{counted(facts['gaps'], 'gap')}{several} of {facts['longest_gap_s']:.2f} s"
     guess = f" ({facts['times_guessed']})" if facts["times_guessed"] else ""
     return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}{guess}, {gaps}"
 

@@ -180,26 +180,29 @@ def recognise(path: Path) -> Dataset:
     Raises:
         GavoError: none that is known; the message says what is there instead.
     """
-    faults: list[str] = []
-    dataset = _kind_of(path, faults)
+    dataset, faults = _asked(path)
     if dataset is not None:
         return dataset
     raise GavoError("; ".join([f"{path}: {_contents(path)}", *faults, *faulty_plugins()]))
 
 
-def _kind_of(path: Path, faults: list[str] | None = None) -> Dataset | None:
-    """The kind of source that lies at a path; one of a package that fails is passed over, and told in `faults`."""
+def _kind_of(path: Path) -> Dataset | None:
+    return _asked(path)[0]
+
+
+def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
+    """The kind of source that lies at a path, and what is wrong with those of packages that were passed over."""
+    faults: list[str] = []
     for dataset in datasets():
         try:
             with blamed(f"dataset {dataset.kind!r}: {path}"):
                 if dataset.recognises(path):
-                    return dataset
+                    return dataset, faults
         except GavoError as error:
             if dataset in BUILT_IN:
                 raise
-            if faults is not None:
-                faults.append(str(error))
-    return None
+            faults.append(str(error))
+    return None, faults
 
 
 def _contents(path: Path) -> str:

@@ -45,6 +45,8 @@ def with_zeros(depth: Any) -> Any:
         is_reading = numbers.isfinite(depth)
     else:
         return depth
+    if numbers is np and is_reading.all():  # most images; a copy of each would be work on every frame
+        return depth
     return numbers.where(is_reading, depth, depth.dtype.type(0))
 
 

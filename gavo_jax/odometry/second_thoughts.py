@@ -25,7 +25,30 @@ from gavo_jax.status import AlignmentStatus
 
 
 @dataclass(frozen=True)
-class Recovering:
+class SecondThought:
+    """An aligner around another one, which differs in what it makes of a frame.
+
+    Attributes:
+        first: What is asked first.
+    """
+
+    first: Aligner
+
+    def warm_up(self) -> float:
+        """That of the first one; what else is asked serves every frame, or compiles when it is needed."""
+        return self.first.warm_up()
+
+    def start(self, frame: Frame) -> Any:
+        """By the first one."""
+        return self.first.start(frame)
+
+    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
+        """By the first one."""
+        return self.first.predict(state, elapsed)
+
+
+@dataclass(frozen=True)
+class Recovering(SecondThought):
     """An aligner whose unusable results are tried again by another one, from the same state.
 
     Attributes:
@@ -35,7 +58,6 @@ class Recovering:
         is_loaded: or by `warm_up`, where it was compiled before.
     """
 
-    first: Aligner
     second: Callable[[], Aligner]
     wide: Search | None = None
     is_loaded: bool = False
@@ -50,10 +72,6 @@ class Recovering:
         if self.wide is None:
             return self.first.warm_up()
         return side_by_side(self.first.warm_up, self.wide.warm_up)
-
-    def start(self, frame: Frame) -> Any:
-        """By the first one."""
-        return self.first.start(frame)
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         """The first attempt if it is usable, else the second one if that is.
@@ -70,10 +88,6 @@ class Recovering:
         confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
         return attempt._replace(usable=confirmed and agree(attempt.result, again.result), fit=False)
 
-    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
-        return self.first.predict(state, elapsed)
-
 
 POLISHED = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR)
 """What a finer search may say of a motion that another one has found."""
@@ -82,7 +96,7 @@ SAME_BASIN = (0.05, 0.05)
 
 
 @dataclass(frozen=True)
-class Polished:
+class Polished(SecondThought):
     """A search from whose motion another one begins, which sees it more exactly: it has the keyframe as well.
 
     Attributes:
@@ -90,16 +104,7 @@ class Polished:
         fine: Begins there.
     """
 
-    first: Search
     fine: Search
-
-    def warm_up(self) -> float:
-        """That of the first one: the other one serves every frame."""
-        return self.first.warm_up()
-
-    def start(self, frame: Frame) -> TrackerState:
-        """By the first one."""
-        return self.first.start(frame)
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
         """The first one's attempt, with the finer motion if that ends in the same minimum; where the image disagrees
@@ -117,13 +122,9 @@ class Polished:
             result = with_finding(result, AlignmentStatus.HIGH_ERROR)
         return attempt._replace(state=again.state, result=result)
 
-    def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
-        return self.first.predict(state, elapsed)
-
 
 @dataclass(frozen=True)
-class DoubtingDepth:
+class DoubtingDepth(SecondThought):
     """An aligner that doubts a frame's depth before it doubts the motion.
 
     Where depth does not agree with the image, the frame is aligned once more by its image alone; the motion can be used
@@ -134,16 +135,7 @@ class DoubtingDepth:
         alone: What aligns an image alone.
     """
 
-    first: Aligner
     alone: Aligner
-
-    def warm_up(self) -> float:
-        """That of the first one."""
-        return self.first.warm_up()
-
-    def start(self, frame: Frame) -> Any:
-        """By the first one."""
-        return self.first.start(frame)
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         """With depth, or without where it does not agree."""
@@ -155,10 +147,6 @@ class DoubtingDepth:
             return attempt
         result = with_finding(again.result, AlignmentStatus.DEPTH_MISMATCH)
         return again._replace(result=result, fit=False)
-
-    def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
-        return self.first.predict(state, elapsed)
 
 
 def without_depth(frame: Frame) -> Frame:
