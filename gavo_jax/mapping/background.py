@@ -44,9 +44,9 @@ class BackgroundMapper:
         self._wait_for(MOST_AHEAD - 1)
         self._ahead.append(self._worker.submit(in_32_bits(self.mapper.watch), frame, step))
 
-    def find(self, frame: Frame) -> Found | None:
+    def find(self, frame: Frame, segment: int) -> Found | None:
         """Where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
-        return self._after_all(self.mapper.find, frame)
+        return self._after_all(self.mapper.find, frame, segment)
 
     def replay(self, sequence: Sequence, steps: list[Step]) -> None:
         """Take notice of what a run did before it was cut short; see `Mapper.replay`."""

@@ -1,7 +1,9 @@
 """A run's trajectory as its map corrects it."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float64, Int
 
 from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.mapper import Loops
@@ -10,39 +12,61 @@ from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.trajectory import Trajectory, inverse
 
 
-def correct(odometry: Trajectory, loops: Loops, guessed: Bool[np.ndarray, " n"] | None = None) -> Trajectory:
+IN_DOUBT = 100.0
+"""How much more a guessed motion counts than one that was found, where a correction has to change."""
+
+
+class Doubts(NamedTuple):
+    """Which poses of a trajectory are no more than guesses."""
+
+    guessed: Bool[np.ndarray, " n"]
+    """Of the motion to them: lost, or gone on with behind a body."""
+    lost: Bool[np.ndarray, " n"]
+    """Those of these that nothing was seen of."""
+
+
+def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) -> Trajectory:
     """A trajectory of the odometry corrected as its keyframes were.
 
     Args:
         odometry: It.
         loops: The map.
-        guessed: Which poses are no more than guesses; they are put between those around, where these belong together.
+        doubts: Which poses are guesses; where they are lost they are put between those around, if these belong together.
 
     Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
-    poses which they give. Segments that a loop joins become one.
+    poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
+    become one.
     """
     keyframes = loops.keyframes
     if not keyframes:
         return odometry
     stamps = np.array([keyframe.timestamp for keyframe in keyframes])
+    passed = _passed(odometry.timestamps, doubts)
+    at_keyframes = np.interp(stamps, odometry.timestamps, passed)
     corrections = [keyframe.world_T_camera @ inverse(keyframe.world_T_odometry) for keyframe in keyframes]
     poses = np.empty_like(odometry.world_T_camera)
     for i, (stamp, pose) in enumerate(zip(odometry.timestamps, odometry.world_T_camera, strict=True)):
         after = int(np.searchsorted(stamps, stamp, side="right"))
         before = max(after - 1, 0)
         if 0 < after < len(stamps) and keyframes[before].segment == keyframes[after].segment:
-            share = (stamp - stamps[before]) / (stamps[after] - stamps[before])
+            share = (passed[i] - at_keyframes[before]) / (at_keyframes[after] - at_keyframes[before])
             poses[i] = between(corrections[before] @ pose, corrections[after] @ pose, float(share))
         else:
             nearest = after if _begins(keyframes, after, odometry.segments[i]) else before
             poses[i] = corrections[nearest] @ pose
     corrected = Trajectory(odometry.timestamps, poses, joined(odometry.segments, loops))
-    return corrected if guessed is None else bridged(corrected, guessed)
+    return corrected if doubts is None else bridged(corrected, doubts.lost)
 
 
-def bridged(trajectory: Trajectory, guessed: Bool[np.ndarray, " n"]) -> Trajectory:
-    """A trajectory with the poses that were guessed between two others of one segment put on the way between these."""
-    known = np.flatnonzero(~guessed)
+def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64[np.ndarray, " n"]:
+    """Seconds since the first pose, those of a guessed motion counted more often."""
+    weights = 1.0 if doubts is None else np.where(doubts.guessed[1:], IN_DOUBT, 1.0)
+    return np.concatenate([[0.0], np.cumsum(weights * np.diff(stamps))])
+
+
+def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
+    """A trajectory with the poses that were lost between two others of one segment put on the way between these."""
+    known = np.flatnonzero(~lost)
     poses, segments, stamps = trajectory.world_T_camera.copy(), trajectory.segments, trajectory.timestamps
     for start, end in zip(known, known[1:], strict=False):
         for i in range(start + 1, end):

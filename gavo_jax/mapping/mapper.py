@@ -102,15 +102,18 @@ class Mapper:
         elif frame is not None and _may_be_keyframe(step):
             self._newest = frame, step, twist
 
-    def find(self, frame: Frame) -> Found | None:
+    def find(self, frame: Frame, segment: int) -> Found | None:
         """Where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
-        self._place = None
-        lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
-        self._place = place = self.recogniser.find(lost, self.keyframes.searchable())
+        self._place = place = self._find(frame, [k for k in self.keyframes.searchable() if k.segment != segment])
         if place is None or place.edge.alignment is None:
             return None
         world_T_camera = place.keyframe.world_T_odometry @ place.edge.earlier_T_later
         return Found(place.edge.alignment, place.keyframe.timestamp, world_T_camera, place.keyframe.segment)
+
+    def _find(self, frame: Frame, keyframes: list[Keyframe]) -> Place | None:
+        """Where a frame was taken, among some keyframes."""
+        lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
+        return self.recogniser.find(lost, keyframes)
 
     def is_due(self, step: Step) -> bool:
         """Whether a step's frame will become a keyframe."""
@@ -125,7 +128,8 @@ class Mapper:
         for step in steps:
             frame = _decoded(sequence, step.index) if self.is_due(step) or step.index == last else None
             if frame is not None and step.origin == "relocalised":
-                self.find(frame)
+                by = [k for k in self.keyframes.searchable() if _key(k.timestamp) == _key(step.reference_timestamp)]
+                self._place = self._find(frame, by)
             self.watch(frame, step)
 
     def finish(self) -> Loops:

@@ -86,8 +86,8 @@ class Found(NamedTuple):
 class Relocaliser(Protocol):
     """Finds frames in a map of the run so far."""
 
-    def find(self, frame: Frame) -> Found | None:
-        """Where a frame was taken; None where the map does not show that."""
+    def find(self, frame: Frame, segment: int) -> Found | None:
+        """Where a frame was taken, seen from another segment than its own; None where the map does not show that."""
         ...
 
 
@@ -296,7 +296,7 @@ class Odometry:
             return None
         if after.adrift > SOUGHT_AT_ONCE and after.adrift % SOUGHT_EVERY:
             return None
-        return self.relocaliser.find(frame)
+        return self.relocaliser.find(frame, after.segment)
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
         """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
-from gavo_jax.mapping.correction import correct, loop_figures
+from gavo_jax.mapping.correction import Doubts, correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
@@ -165,7 +164,7 @@ def conclude(
     causal = trajectory = trajectory_of(first_timestamp, steps)
     loops = mapper.finish() if mapper else None
     if loops is not None:
-        trajectory = correct(causal, loops, guessed(steps))
+        trajectory = correct(causal, loops, doubts_of(steps))
     seconds += time.perf_counter() - start
     if frames is not None:
         seconds *= (len(steps) + 1) / frames  # as if all had been tracked at this speed
@@ -179,10 +178,15 @@ def conclude(
     return Outcome(trajectory, steps, figures(trajectory) | of_loops, causal, loops)
 
 
-def guessed(steps: list[Step]) -> Bool[np.ndarray, " poses"]:
+def doubts_of(steps: list[Step]) -> Doubts:
     """Which poses of `trajectory_of` are guesses."""
     kept = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
-    return np.array([False] + [step.origin == "guessed" for step in kept])
+    guessed, lost = ([False] + [said(step) for step in kept] for said in (_is_guess, lambda step: step.lost))
+    return Doubts(np.array(guessed), np.array(lost))
+
+
+def _is_guess(step: Step) -> bool:
+    return step.origin == "guessed"
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:

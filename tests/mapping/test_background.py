@@ -32,7 +32,7 @@ class Slow:
             raise GavoError("worst")
         self.seen.append(step)
 
-    def find(self, frame: Frame) -> list[Any]:
+    def find(self, frame: Frame, segment: int) -> list[Any]:
         self.threads.add(threading.get_ident())
         return list(self.seen)
 
@@ -51,7 +51,7 @@ def test_frames_are_seen_in_their_order_and_all_before_one_is_looked_for():
         mapper.watch(FRAME, cast(Any, step))
         assert step + 1 - len(slow.seen) <= MOST_AHEAD
         if step % 7 == 0:
-            assert mapper.find(FRAME) == list(range(step + 1))
+            assert mapper.find(FRAME, 1) == list(range(step + 1))
     assert mapper.finish() == list(range(3 * MOST_AHEAD))
     assert len(slow.threads) == 1 and threading.get_ident() not in slow.threads
 

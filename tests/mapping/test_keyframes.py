@@ -21,7 +21,7 @@ from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
 from gavo_jax.odometry.metrics import compute_metrics
-from gavo_jax.odometry.run import guessed, trajectory_of
+from gavo_jax.odometry.run import doubts_of, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
 from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
@@ -175,7 +175,7 @@ class Knows:
     def __init__(self, segment: int | None = 0):
         self.segment = segment
 
-    def find(self, frame: Frame) -> Found | None:
+    def find(self, frame: Frame, segment: int) -> Found | None:
         self.asked += 1
         if self.segment is None:
             return None
@@ -226,7 +226,9 @@ def test_a_covered_lens_is_followed_by_the_map(known):
     if known:
         np.testing.assert_allclose(steps[-1].world_T_camera[0, 3], 0.5)
     trajectory = trajectory_of(0.0, steps)
-    assert guessed(steps).sum() == (5 if known else 6) and len(guessed(steps)) == len(trajectory)
+    doubts = doubts_of(steps)
+    assert doubts.guessed.sum() == doubts.lost.sum() == (5 if known else 6)
+    assert len(doubts.guessed) == len(doubts.lost) == len(trajectory)
 
 
 def test_keyframes_are_frames_whose_depth_can_be_trusted():
@@ -253,11 +255,12 @@ def test_a_frame_is_found_in_the_map_and_another_room_is_not():
     for i in range(0, 12, 2):
         keyframe = mapper.keyframes.make(WALK[i], i, 0, inverse(truth[0]) @ truth[i], np.zeros(6))
         mapper.keyframes.add(keyframe)
-    found = mapper.find(WALK[5])
+    found = mapper.find(WALK[5], segment=1)
     assert found is not None and found.segment == 0
     metres, radians = size(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
     assert metres < 0.03 and radians < 0.03
-    assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0]) is None
+    assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0], segment=1) is None
+    assert mapper.find(WALK[5], segment=0) is None  # to its own segment nothing has to tie it
 
 
 def weight(thing: Any, seen: set[int]) -> int:
@@ -283,7 +286,7 @@ def test_what_is_heavy_is_held_for_a_stated_number_of_keyframes():
     for step in drifting(rounds, np.full(6, 1e-4)):
         mapper.watch(rounds[step.index], step)
         if step.index % 5 == 0:
-            mapper.find(rounds[step.index])
+            mapper.find(rounds[step.index], segment=1)
     mapper.finish()
     kept, seen = mapper.keyframes.searchable(), set()
     heavy = weight(kept, seen)
@@ -315,7 +318,7 @@ def test_before_tiles_that_repeat_nothing_ties_two_keyframes():
     mapper.keyframes.add(earlier)
     near_the_last_tile = exp(np.array([-24.0 * 1.5 / 525, 0, 0, 0, 0, 0]))
     assert mapper.verifier.verify([Candidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
-    assert mapper.find(tiled(96.0)) is None
+    assert mapper.find(tiled(96.0), segment=1) is None
 
 
 def test_many_candidates_are_verified_side_by_side_to_the_same_edges():

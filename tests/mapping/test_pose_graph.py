@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from gavo_jax.mapping.correction import correct, joined
+from gavo_jax.mapping.correction import Doubts, correct, joined
 from gavo_jax.mapping.keyframes import Keyframe, Look
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.motions import adjoint, between, exp, log
@@ -96,9 +96,21 @@ def test_guesses_are_put_on_the_way_between_what_is_known():
     poses = np.stack([np.eye(4)] * 5)
     poses[4, 0, 3] = 0.4
     loops = solved([keyframe(0, 0.0, poses[0], poses[0]), keyframe(1, 4.0, poses[4], poses[4])], [])
-    guessed = np.array([False, True, True, True, False])
-    corrected = correct(Trajectory(np.arange(5.0), poses), loops, guessed)
+    lost = np.array([False, True, True, True, False])
+    corrected = correct(Trajectory(np.arange(5.0), poses), loops, Doubts(lost, lost))
     np.testing.assert_allclose(corrected.world_T_camera[:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-9)
+
+
+def test_a_motion_gone_on_with_stays_as_it_is_but_takes_the_correction():
+    """Behind a body the path bends as the camera was moving: it was cut straight from where it is known to where it is."""
+    poses = np.stack([exp(np.array([0.1 * i, 0, 0, 0, 0.2 * (i == 2), 0])) for i in range(5)])
+    frames = [keyframe(0, 0.0, poses[0], poses[0]), keyframe(1, 4.0, poses[4], poses[4])]
+    doubts = Doubts(np.array([False, False, True, False, False]), np.zeros(5, bool))
+    odometry = Trajectory(np.arange(5.0), poses)
+    np.testing.assert_allclose(correct(odometry, solved(frames, []), doubts).world_T_camera, poses, atol=1e-9)
+    raised = exp(np.array([0.0, 0.04, 0.0, 0.0, 0.0, 0.0])) @ poses[4]
+    corrected = correct(odometry, solved([frames[0], keyframe(1, 4.0, poses[4], raised)], []), doubts)
+    np.testing.assert_allclose(corrected.world_T_camera[:, 1, 3], [0.0, 0.0, 0.04, 0.04, 0.04], atol=2e-3)
 
 
 def test_a_loop_joins_segments():
