@@ -15,13 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
-from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -218,7 +219,7 @@ class LiveMap:
         if why is None and step.segment != self._segment:
             why = ELSEWHERE
         if why is None:
-            self._builder.add(frame, step.world_T_camera)
+            self._builder.add(without_moving(frame, step.moving), step.world_T_camera)
         else:
             self._reasons[why] += 1
 
@@ -256,12 +257,13 @@ def build_map(
     voxel: float = VOXEL,
     farthest: float = FARTHEST,
     trajectory: Trajectory | None = None,
+    moving: Moving = seen_moving,
 ) -> SceneMap:
     """Fuse the frames of a run, read once more, one at a time.
 
     Between two segments of a run the motion is unknown, so that they are no part of one map: that of most frames is
     returned. A frame that was lost, whose pose is a guess, whose depth is in doubt, or that cannot be read, is left
-    out.
+    out, and so is of each frame what moves on its own.
 
     Args:
         sequence: the run's; with `Reading(color=True)` the map has colours, else it is grey.
@@ -270,6 +272,7 @@ def build_map(
         voxel: side, metres.
         farthest: depth beyond is left out, metres.
         trajectory: the poses where they are not the steps' own any more: loops have corrected them.
+        moving: where bodies are in the frame of a step.
 
     Raises:
         GavoError: an absurd voxel, or Open3D cannot be imported.
@@ -279,7 +282,7 @@ def build_map(
     if trajectory is not None:
         rows = zip(trajectory.world_T_camera, trajectory.segments.tolist(), strict=True)
         corrected = dict(zip(trajectory.timestamps.tolist(), rows, strict=True))
-    places: list[tuple[int, np.ndarray, int]] = [(0, np.eye(4), 0)]
+    places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]
     reasons: Counter[str] = Counter()
     for step in steps:
         if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
@@ -288,16 +291,17 @@ def build_map(
         if (why := _why_not(step)) is not None:
             reasons[why] += 1
         else:
-            places.append((step.index, *corrected.get(step.timestamp, (step.world_T_camera, step.segment))))
+            places.append((step.index, step, *corrected.get(step.timestamp, (step.world_T_camera, step.segment))))
     segments = [segment for *_, segment in places]
     chosen = max(set(segments), key=lambda segment: (segments.count(segment), -segment), default=0)
     builder = MapBuilder(sequence.camera, voxel, farthest)
-    for index, world_T_camera, segment in places:
+    for index, step, world_T_camera, segment in places:
         if segment != chosen:
             reasons[ELSEWHERE] += 1
             continue
         try:
-            builder.add(sequence[index], world_T_camera)
+            frame = sequence[index] if step is None else without_moving(sequence[index], moving(step))
+            builder.add(frame, world_T_camera)
         except FrameError:
             reasons[UNREADABLE] += 1
     return builder.extract(shape, _left_out(reasons))

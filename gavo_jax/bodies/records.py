@@ -1,6 +1,7 @@
 """What is told of a body: where it is, how it moved, how well that is known."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.datasets.base import Frame
 from gavo_jax.trajectory import inverse
 
 
@@ -64,6 +66,25 @@ class Body:
     def status(self) -> str:
         """In a word: that of its motion; `seen` where there is none."""
         return "seen" if self.alignment is None else str(self.alignment.status)
+
+
+BORDER = 1 / 80
+"""Of the image's width: what is left out round a body with it, a pixel of the level that bodies are seen on."""
+
+
+def covered(bodies: Iterable[Body]) -> Bool[np.ndarray, "height width"] | None:
+    """Pixels that any of a frame's bodies covers; None where there are none."""
+    masks = [body.mask for body in bodies]
+    return np.any(masks, axis=0) if masks else None
+
+
+def without_moving(frame: Frame, moving: Bool[np.ndarray, "height width"] | None) -> Frame:
+    """A frame without depth where something moves on its own, and around it; None: nothing does."""
+    if moving is None:
+        return frame
+    side = 2 * round(BORDER * moving.shape[1]) + 1
+    around = cv2.dilate(moving.astype(np.uint8), np.ones((side, side), np.uint8))
+    return replace(frame, depth=np.where(around > 0, 0, frame.depth))
 
 
 def in_world(

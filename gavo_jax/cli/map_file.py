@@ -1,13 +1,12 @@
 """`gavo run --map`: the map as a file; what cannot be is refused before the run starts."""
 
-from collections.abc import Sequence as Many
 from pathlib import Path
 
 from gavo_jax.cli.options import Run
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
+from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, import_open3d, warn_of
 from gavo_jax.trajectory import Trajectory
@@ -36,15 +35,16 @@ def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape
 
 
 def save_map(
-    path: Path, sequence: Sequence, steps: Many[Step], trajectory: Trajectory, shape: Shape, voxel: float
+    path: Path, sequence: Sequence, folder: RunFolder, trajectory: Trajectory, shape: Shape, voxel: float
 ) -> None:
     """Fuse the frames of a run, as its later frames have shown them to be, and write the map.
 
     Raises:
         GavoError: it cannot be written.
     """
+    steps = folder.steps()
     with waiting(f"a map of {len(steps) + 1} frames …"):
-        scene = build_map(sequence, revised(steps), shape, voxel, trajectory=trajectory)
+        scene = build_map(sequence, revised(steps), shape, voxel, trajectory=trajectory, moving=folder.moving)
     write_map(scene, path)
 
 

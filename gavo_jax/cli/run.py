@@ -97,7 +97,7 @@ def run(options: Run) -> int:
                 for step in (None, *steps):
                     viewer.watch(None, step)
                 if mapper is not None:
-                    mapper.replay(sequence, steps)
+                    mapper.replay(sequence, steps, folder.moving)
             say(summary(sequence))
             if lines := left_out(sequence):
                 counts = ", ".join(line.partition(": ")[0] for line in lines)
@@ -111,7 +111,7 @@ def run(options: Run) -> int:
             name, metrics, folder.path, sequence.ground_truth is not None, is_rendered=options.sequence == SYNTHETIC
         )
         if options.map is not None:
-            save_map(options.map, sequence, folder.steps(), trajectory, shape, options.voxel)
+            save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
     if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
         say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
     if interrupted:

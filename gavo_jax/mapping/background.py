@@ -5,13 +5,13 @@ the result is that of a map made frame by frame, whatever the timing.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.mapping.mapper import Loops, Mapper
-from gavo_jax.odometry.driver import Found, Step
+from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
 from gavo_jax.precision import in_32_bits
 
 P = ParamSpec("P")
@@ -48,13 +48,13 @@ class BackgroundMapper:
         """Where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
         return self._after_all(self.mapper.find, frame, segment)
 
-    def replay(self, sequence: Sequence, steps: list[Step]) -> None:
+    def replay(self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving) -> None:
         """Take notice of what a run did before it was cut short; see `Mapper.replay`."""
-        self._after_all(self.mapper.replay, sequence, steps)
+        self._after_all(self.mapper.replay, sequence, steps, moving)
 
-    def finish(self) -> Loops:
+    def finish(self, steps: Iterable[Step] = ()) -> Loops:
         """The whole map; see `Mapper.finish`."""
-        return self._after_all(self.mapper.finish)
+        return self._after_all(self.mapper.finish, steps)
 
     def _after_all(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """What a function returns that the worker runs once the map has seen all frames."""

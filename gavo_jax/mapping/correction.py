@@ -11,7 +11,6 @@ from gavo_jax.mapping.motions import between
 from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.trajectory import Trajectory, inverse
 
-
 IN_DOUBT = 100.0
 """How much more a guessed motion counts than one that was found, where a correction has to change."""
 
@@ -31,7 +30,7 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     Args:
         odometry: It.
         loops: The map.
-        doubts: Which poses are guesses; where they are lost they are put between those around, if these belong together.
+        doubts: Which poses are guesses; those that are lost are put between those around, if these belong together.
 
     Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
     poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins

@@ -2,11 +2,13 @@
 
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.mapping.candidates import Candidate, find_candidates
@@ -15,14 +17,16 @@ from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
-from gavo_jax.odometry.driver import Found, Step
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
+from gavo_jax.status import GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 STEP_FLOOR = 5e-4
 """Metres and radians that a step of the odometry is off by beside what its covariance says."""
+DOUBTED = 0.1
+"""Metres and radians that stand for a motion which something speaks against,"""
 UNTIED = 1.0
-"""Metres and radians that stand for a motion of which nothing is known."""
+"""and for one of which nothing is known."""
 GROWTH = 1.25
 """Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
 FIRST = 20
@@ -33,6 +37,8 @@ MOST_IN_THE_END = 100
 """Candidates, the likest ones, that are aligned when loops are looked for once more in the end."""
 REMEMBERED = 64
 """Frames since a keyframe whose covariance is kept, for those that refer to them."""
+SPEAKS_AGAINST = frozenset(GRAVITY)
+"""What can be found of a motion that is not lost."""
 
 
 class Loops(NamedTuple):
@@ -65,6 +71,7 @@ class Mapper:
         self._first: Frame | None = None
         self._newest: tuple[Frame, Step, Float64[np.ndarray, " 6"]] | None = None
         self._next, self._scale = FIRST, 1.0
+        self._doubted: set[float] = set()
 
     def warm_up(self) -> float:
         """Compile what is needed, or load it; the seconds this took."""
@@ -72,8 +79,16 @@ class Mapper:
         self.verifier.warm_up()
         return time.perf_counter() - start
 
-    def watch(self, frame: Frame | None, step: Step | None) -> None:
-        """Take notice of a frame (None: it could not be read) with its step (None: it is the first)."""
+    def watch(self, frame: Frame | None, step: Step | None, moving: Moving = seen_moving) -> None:
+        """Take notice of a frame (None: it could not be read) with its step (None: it is the first).
+
+        What moves on its own is no part of a map: two frames that show the same body would be tied by it.
+
+        Args:
+            frame: It.
+            step: It.
+            moving: Where bodies are in the frame of a step.
+        """
         if step is None:
             self._first = frame
             return
@@ -81,6 +96,7 @@ class Mapper:
             self._first = None
         if step.lost:
             return
+        self._doubt(step)
         seconds = step.timestamp - step.reference_timestamp
         motion = np.asarray(step.alignment.target_T_reference, np.float64)
         twist = log(motion) / max(seconds, 1e-3)
@@ -92,6 +108,8 @@ class Mapper:
             twist = np.zeros(6)
         else:
             self._follow(step, motion)
+        if frame is not None and _may_be_keyframe(step):
+            frame = without_moving(frame, moving(step))
         if frame is not None and due:
             known = None if is_found else self._known.get(_key(step.timestamp))
             keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known)
@@ -121,8 +139,14 @@ class Mapper:
             return step.origin == "relocalised"
         return step.depth_is_trusted and self.keyframes.is_due(step.world_T_camera, step.segment)
 
-    def replay(self, sequence: Sequence, steps: list[Step]) -> None:
-        """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded."""
+    def replay(self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving) -> None:
+        """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded.
+
+        Args:
+            sequence: The run's.
+            steps: It had made.
+            moving: Where bodies are in the frame of a step.
+        """
         self.watch(_decoded(sequence, 0), None)
         last = max((step.index for step in steps if _may_be_keyframe(step)), default=0)
         for step in steps:
@@ -130,10 +154,16 @@ class Mapper:
             if frame is not None and step.origin == "relocalised":
                 by = [k for k in self.keyframes.searchable() if _key(k.timestamp) == _key(step.reference_timestamp)]
                 self._place = self._find(frame, by)
-            self.watch(frame, step)
+            self.watch(frame, step, moving)
 
-    def finish(self) -> Loops:
-        """Make the last frame a keyframe, look for loops once more with what is known now, and optimise."""
+    def finish(self, steps: Iterable[Step] = ()) -> Loops:
+        """Make the last frame a keyframe, look for loops once more with what is known now, and optimise.
+
+        Args:
+            steps: Of the run, as later ones have shown them to be: more of them may be in doubt.
+        """
+        for step in steps:
+            self._doubt(step)
         if self._newest is not None:
             frame, step, twist = self._newest
             known = self._known.get(_key(step.timestamp))
@@ -165,6 +195,11 @@ class Mapper:
                 if place is not None:
                     self._link(keyframe, place.edge)
                     break
+
+    def _doubt(self, step: Step) -> None:
+        """Remember a motion that something speaks against: it may be off by more than its covariance says."""
+        if not SPEAKS_AGAINST.isdisjoint(step.alignment.statuses):
+            self._doubted.add(step.timestamp)
 
     def _follow(self, step: Step, motion: np.ndarray) -> None:
         """Keep the covariance of the motion since the last keyframe."""
@@ -224,6 +259,8 @@ class Mapper:
         edges = []
         for a, b in zip(keyframes, keyframes[1:], strict=False):
             covariance = UNTIED**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
+            if any(a.timestamp < stamp <= b.timestamp for stamp in self._doubted):
+                covariance = covariance + DOUBTED**2 * np.eye(6)
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
 

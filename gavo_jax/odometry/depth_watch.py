@@ -1,12 +1,9 @@
 """What speaks against a run's depth as a whole, from its first frame on: how it changes, and where it lies."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from gavo_jax.alignment.result import Alignment, with_finding
-from gavo_jax.bodies.records import Body
+from gavo_jax.bodies.records import Body, covered, without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.depth_edges import DepthEdges
@@ -59,15 +56,8 @@ def judge_by_depth(
     if AlignmentStatus.DEPTH_MISMATCH in result.statuses:
         return result, watch
     explained = float(result.explained.grey)
-    change = watch.change.after(_without(frame, bodies), elapsed, result.target_T_reference, explained, camera)
+    at_rest = without_moving(frame, covered(bodies))
+    change = watch.change.after(at_rest, elapsed, result.target_T_reference, explained, camera)
     watch = watch._replace(change=change)
     watch = watch._replace(told=watch.is_wrong)
     return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.told else result, watch
-
-
-def _without(frame: Frame, bodies: tuple[Body, ...]) -> Frame:
-    """A frame without depth where something moves on its own."""
-    if not bodies:
-        return frame
-    covered = np.any([body.mask for body in bodies], axis=0)
-    return replace(frame, depth=np.where(covered, 0, frame.depth))

@@ -3,16 +3,17 @@
 It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 import jax
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
-from gavo_jax.bodies.records import Body, in_world
+from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
 from gavo_jax.datasets.rectified import rectified
@@ -70,6 +71,11 @@ class Step:
         """Whether nothing speaks against the frame's own depth: maps are made of such frames."""
         return DOUBTED_DEPTH.isdisjoint(self.alignment.statuses)
 
+    @property
+    def moving(self) -> Bool[np.ndarray, "height width"] | None:
+        """Pixels of the image, without distortion, that move on their own; None where nothing is known to."""
+        return covered(self.bodies)
+
 
 class Found(NamedTuple):
     """Where a frame was found in a map."""
@@ -103,6 +109,15 @@ DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
 """Of frames that have a motion, but no depth of their own that could be trusted."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
+
+
+Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
+"""Tells what moves in the frame of a step: `Step.moving`, or where the steps were read from files these."""
+
+
+def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:
+    """`Step.moving`."""
+    return step.moving
 
 
 class Outcome(NamedTuple):

@@ -162,7 +162,7 @@ def conclude(
     start = time.perf_counter()
     steps = revised(steps)
     causal = trajectory = trajectory_of(first_timestamp, steps)
-    loops = mapper.finish() if mapper else None
+    loops = mapper.finish(steps) if mapper else None
     if loops is not None:
         trajectory = correct(causal, loops, doubts_of(steps))
     seconds += time.perf_counter() - start

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from jaxtyping import Bool
 
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.locks import hold
@@ -42,6 +43,7 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.frames import FRAME_COLUMNS, as_line, frame_row, read_steps, with_hindsight
+from gavo_jax.output.masks import read_masks, remove_masks, write_masks
 from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
@@ -153,6 +155,7 @@ class RunFolder:
         growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
         remove_files(self.path, METRICS, CHECKPOINT, CONFIG, LOOPS, RECORDING, VIEW, *growing)
         remove_figures(self.path)
+        remove_masks(self.path)
         write_json(self.path / CONFIG, config)
         self._open(dict.fromkeys(self._growing(config)))
         self._files[FRAMES].append(",".join(FRAME_COLUMNS))
@@ -198,6 +201,7 @@ class RunFolder:
         remove_files(self.path, METRICS, LOOPS, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
+        remove_masks(self.path, after=max((step.timestamp for step in self._said()), default=-np.inf))
         return progress
 
     def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:
@@ -229,6 +233,7 @@ class RunFolder:
         Raises:
             GavoError: the disk is full, or the like; the files then end with the last whole row.
         """
+        write_masks(self.path, step)
         self._files[FRAMES].append(as_line(frame_row(step)))
         if BODIES in self._files:
             for body in body_rows(step):
@@ -258,6 +263,10 @@ class RunFolder:
         """The steps of the run so far, as the files tell them: see `read_steps`, and with loops to all digits."""
         steps = self._said()
         return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
+
+    def moving(self, step: Step) -> Bool[np.ndarray, "height width"] | None:
+        """Pixels of a step's frame that move on their own, as the files tell; None where the run saw nothing move."""
+        return read_masks(self.path, step.timestamp)
 
     def _said(self) -> list[Step]:
         """The steps as frames.csv and the poses tell them, without what an interruption left of one."""

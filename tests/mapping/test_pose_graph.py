@@ -102,7 +102,7 @@ def test_guesses_are_put_on_the_way_between_what_is_known():
 
 
 def test_a_motion_gone_on_with_stays_as_it_is_but_takes_the_correction():
-    """Behind a body the path bends as the camera was moving: it was cut straight from where it is known to where it is."""
+    """Behind a body the path bends as the camera moved: it was cut straight from one known place to the next."""
     poses = np.stack([exp(np.array([0.1 * i, 0, 0, 0, 0.2 * (i == 2), 0])) for i in range(5)])
     frames = [keyframe(0, 0.0, poses[0], poses[0]), keyframe(1, 4.0, poses[4], poses[4])]
     doubts = Doubts(np.array([False, False, True, False, False]), np.zeros(5, bool))

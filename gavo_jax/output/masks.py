@@ -1,0 +1,96 @@
+"""masks/: where bodies are, an image per frame that shows one, named by its colour stamp.
+
+Each pixel has the number of the body that covers it, 0 where nothing moves.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from gavo_jax.errors import GavoError, write_bytes
+from gavo_jax.odometry.driver import Step
+
+MASKS = "masks"
+"""The folder, in that of a run."""
+
+
+def write_masks(folder: Path, step: Step) -> None:
+    """Write where a step's bodies are, if it shows any.
+
+    Args:
+        folder: Of the run.
+        step: Of the frame.
+
+    Raises:
+        GavoError: It cannot be written.
+    """
+    if not step.bodies:
+        return
+    most = max(body.number for body in step.bodies)
+    labels = np.zeros(step.bodies[0].size, np.uint8 if most <= np.iinfo(np.uint8).max else np.uint16)
+    for body in step.bodies:
+        labels[body.mask] = body.number
+    path = _path(folder, step.timestamp)
+    try:
+        if path.parent.is_symlink():
+            raise GavoError(f"{path.parent}: a link: what it leads to is not this run's")
+        path.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise GavoError(f"{path.parent}: cannot be made: {error.strerror or error}") from None
+    write_bytes(path, cv2.imencode(".png", labels)[1].tobytes())
+
+
+def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width"] | None:
+    """Where any body was in a frame; None where the run saw none.
+
+    Args:
+        folder: Of the run.
+        timestamp: The frame's colour stamp, seconds.
+
+    Raises:
+        GavoError: It cannot be read.
+    """
+    path = _path(folder, timestamp)
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise GavoError(f"{path}: {error.strerror or error}") from None
+    labels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if labels is None or labels.ndim != 2:
+        raise GavoError(f"{path}: not an image of bodies")
+    return labels > 0
+
+
+def remove_masks(folder: Path, after: float = -np.inf) -> None:
+    """Remove the images of frames after a stamp, and the folder if nothing is left in it.
+
+    Raises:
+        GavoError: One cannot be removed.
+    """
+    inside = folder / MASKS
+    if inside.is_symlink() or not inside.is_dir():
+        return
+    try:
+        for path in inside.glob("*.png"):
+            if _stamp(path) > after:
+                path.unlink()
+        if not any(inside.iterdir()):
+            inside.rmdir()
+    except OSError as error:
+        raise GavoError(f"{inside}: cannot be replaced: {error.strerror or error}") from None
+
+
+def _path(folder: Path, timestamp: float) -> Path:
+    return folder / MASKS / f"{timestamp:.6f}.png"
+
+
+def _stamp(path: Path) -> float:
+    """Of the frame; not-a-number where the file is not of a run."""
+    try:
+        return float(path.stem)
+    except ValueError:
+        return float("nan")
