@@ -66,8 +66,10 @@ class Fused:
     def __init__(self, *_: object) -> None:
         self.frames: list[float] = []
         self.x: list[float] = []
+        self.known: list[float] = []
 
     def add(self, frame: Frame, world_T_camera: np.ndarray) -> None:
+        self.known.append(float(np.mean(frame.depth > 0)))
         self.frames.append(frame.timestamp)
         self.x.append(float(world_T_camera[0, 3]))
 
@@ -123,6 +125,15 @@ def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
     steps += [stepped(i, segment=1) for i in (2, 3)]
     frames, _, left_out = fused(steps)
     assert frames == [WALK.timestamps[i] for i in (2, 3)] and left_out == ["2 frames: lost"]
+
+
+def test_what_moves_on_its_own_is_no_part_of_a_map(monkeypatch):
+    fuser = Fused()
+    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", lambda *_: fuser)
+    mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    mask[:, : CAMERA.width // 2] = True
+    build_map(WALK, [stepped(1), stepped(2)], moving=lambda step: mask if step.index == 2 else None)
+    assert fuser.known[2] < 0.6 * fuser.known[1] and fuser.known[1] == pytest.approx(fuser.known[0], abs=0.02)
 
 
 @pytest.mark.parametrize("begins", [0, 1, 2])

@@ -1,0 +1,92 @@
+"""Where bodies are, on disk: written as they are seen, read for maps, gone with the run."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.bodies.records import Body
+from gavo_jax.errors import GavoError
+from gavo_jax.odometry.driver import Step
+from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
+from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.settings import OdometryOptions
+from gavo_jax.status import AlignmentStatus
+
+HEIGHT, WIDTH = 12, 16
+
+
+def body(number: int, left: int, right: int) -> Body:
+    """One that covers some columns of the image."""
+    field = -np.ones((HEIGHT, WIDTH), np.float32)
+    field[:, left:right] = 1.0
+    unknown = np.full(3, np.nan)
+    return Body(number, (right - left) / WIDTH, np.zeros(3), unknown, unknown, None, field, (HEIGHT, WIDTH))
+
+
+def stepped(index: int, *bodies: Body) -> Step:
+    found = no_alignment(AlignmentStatus.OK)
+    return Step(index, index - 1.0, float(index), found, np.eye(4), 1.0, False, bodies=bodies)
+
+
+@pytest.mark.parametrize(("number", "kind"), [(2, np.uint8), (300, np.uint16)])
+def test_a_pixel_has_the_number_of_its_body(tmp_path: Path, number: int, kind: Any):
+    step = stepped(3, body(1, 0, 4), body(number, 10, 12))
+    write_masks(tmp_path, step)
+    labels = cv2.imread(str(tmp_path / MASKS / "3.000000.png"), cv2.IMREAD_UNCHANGED)
+    assert labels is not None and labels.dtype == kind
+    np.testing.assert_array_equal(labels[0], [1] * 4 + [0] * 6 + [number] * 2 + [0] * 4)
+    np.testing.assert_array_equal(read_masks(tmp_path, 3.0), step.moving)
+
+
+def test_where_nothing_moves_there_is_no_file(tmp_path: Path):
+    write_masks(tmp_path, stepped(1))
+    assert not list(tmp_path.iterdir()) and read_masks(tmp_path, 1.0) is None and stepped(1).moving is None
+
+
+def test_a_link_is_not_followed(tmp_path: Path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "1.000000.png").touch()
+    (tmp_path / "run" / MASKS).symlink_to(tmp_path / "others")
+    with pytest.raises(GavoError, match="a link"):
+        write_masks(tmp_path / "run", stepped(1, body(1, 0, 4)))
+    remove_masks(tmp_path / "run")
+    assert [path.name for path in (tmp_path / "others").iterdir()] == ["1.000000.png"]
+
+
+@pytest.mark.parametrize("data", [b"", b"nothing", cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()])
+def test_a_damaged_image_is_one_line(tmp_path: Path, data: bytes):
+    write_masks(tmp_path, stepped(1, body(1, 0, 4)))
+    (tmp_path / MASKS / "1.000000.png").write_bytes(data)
+    with pytest.raises(GavoError, match=r"1\.000000\.png: not an image of bodies"):
+        read_masks(tmp_path, 1.0)
+
+
+def test_files_of_others_stay(tmp_path: Path):
+    write_masks(tmp_path, stepped(1, body(1, 0, 4)))
+    (tmp_path / MASKS / "mine.png").touch()
+    remove_masks(tmp_path)
+    assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["mine.png"]
+
+
+def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
+    config = {"odometry": OdometryOptions()}
+    with RunFolder(tmp_path) as folder:
+        folder.start(config, 0.0)
+        folder.add(stepped(1, body(1, 0, 4)))
+        folder.add(stepped(2))
+        assert folder.moving(stepped(1)) is not None and folder.moving(stepped(2)) is None
+    with RunFolder(tmp_path) as folder:
+        folder.start(config, 0.0)
+    assert not (tmp_path / MASKS).exists()
+
+
+def test_what_came_after_a_checkpoint_is_removed(tmp_path: Path):
+    for index in (1, 2, 3):
+        write_masks(tmp_path, stepped(index, body(1, 0, 4)))
+    remove_masks(tmp_path, after=1.0)
+    assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["1.000000.png"]
