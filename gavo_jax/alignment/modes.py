@@ -23,7 +23,7 @@ def _near(places: Float[Array, "n 6"], index: Integer[Array, ""]) -> Bool[Array,
 def best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
     """Indices of the `count` best motions with no two of one mode, best first (clearing, Petrowski 1996).
 
-    Where there are fewer modes than that, the last places go to the best motions that are left over.
+    Where there are fewer modes than that, the last places go to motions whose modes are taken.
     """
     if count == 1:
         return jnp.argmin(errors)[None]

@@ -123,6 +123,8 @@ class Keyframe:
     linked: set[int] = field(default_factory=set)
     """and those to which that led to an edge."""
     features: Features | None = None
+    in_doubt: bool = False
+    """Whether something speaks against the odometry's motion from the keyframe before."""
 
     def give_up_images(self) -> None:
         """Forget all that is heavy; the pose stays."""
@@ -149,11 +151,11 @@ class Keyframes:
 
     Args:
         camera: Of the frames as they come, without distortion.
-        most: Keyframes that keep their images.
+        most: Keyframes that keep their images, at least 2.
     """
 
     def __init__(self, camera: Camera, most: int = MAX_IMAGES):
-        self.full, self.camera, self.most = camera, camera.level(1), most
+        self.full, self.camera, self.most = camera, camera.level(1), max(most, 2)
         self.all: list[Keyframe] = []
 
     def is_due(self, world_T_camera: Float64[np.ndarray, "4 4"], segment: int) -> bool:

@@ -49,6 +49,15 @@ class Loops(NamedTuple):
     solution: Solution
 
 
+class _Way(NamedTuple):
+    """The odometry's motion since the last keyframe."""
+
+    covariance: Float64[np.ndarray, "6 6"]
+    """Of δ in a_T_b · exp(δ), metres and radians."""
+    in_doubt: bool
+    """Whether something speaks against one of its pairs."""
+
+
 class Mapper:
     """Watches a run and keeps its map.
 
@@ -67,11 +76,10 @@ class Mapper:
         self.recogniser = Recogniser(self.keyframes.camera, self.verifier)
         self.edges: list[Edge] = []
         self._place: Place | None = None
-        self._known: OrderedDict[str, Float64[np.ndarray, "6 6"]] = OrderedDict()
+        self._known: OrderedDict[str, _Way] = OrderedDict()
         self._first: Frame | None = None
         self._newest: tuple[Frame, Step, Float64[np.ndarray, " 6"]] | None = None
         self._next, self._scale = FIRST, 1.0
-        self._doubted: set[float] = set()
 
     def warm_up(self) -> float:
         """Compile what is needed, or load it; the seconds this took."""
@@ -96,7 +104,6 @@ class Mapper:
             self._first = None
         if step.lost:
             return
-        self._doubt(step)
         seconds = step.timestamp - step.reference_timestamp
         motion = np.asarray(step.alignment.target_T_reference, np.float64)
         twist = log(motion) / max(seconds, 1e-3)
@@ -111,8 +118,7 @@ class Mapper:
         if frame is not None and _may_be_keyframe(step):
             frame = without_moving(frame, moving(step))
         if frame is not None and due:
-            known = None if is_found else self._known.get(_key(step.timestamp))
-            keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known)
+            keyframe = self._made(frame, step, twist, None if is_found else self._known.get(_key(step.timestamp)))
             self._add(keyframe)
             if is_found:
                 self._tie(keyframe)
@@ -162,13 +168,11 @@ class Mapper:
         Args:
             steps: Of the run, as later ones have shown them to be: more of them may be in doubt.
         """
-        for step in steps:
-            self._doubt(step)
         if self._newest is not None:
             frame, step, twist = self._newest
-            known = self._known.get(_key(step.timestamp))
-            self._add(self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, known))
+            self._add(self._made(frame, step, twist, self._known.get(_key(step.timestamp))))
             self._newest = None
+        self._doubt(steps)
         if not self.keyframes.all:
             return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
         self._optimise(reweighted=1)
@@ -196,24 +200,38 @@ class Mapper:
                     self._link(keyframe, place.edge)
                     break
 
-    def _doubt(self, step: Step) -> None:
-        """Remember a motion that something speaks against: it may be off by more than its covariance says."""
-        if not SPEAKS_AGAINST.isdisjoint(step.alignment.statuses):
-            self._doubted.add(step.timestamp)
+    def _made(self, frame: Frame, step: Step, twist: Float64[np.ndarray, " 6"], way: "_Way | None") -> Keyframe:
+        """A step's frame as a keyframe, and the way to it from the last one."""
+        covariance = None if way is None else way.covariance
+        keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, covariance)
+        keyframe.in_doubt = way is not None and way.in_doubt
+        return keyframe
+
+    def _doubt(self, steps: Iterable[Step]) -> None:
+        """Doubt the ways between keyframes that lead over motions which are in doubt in hindsight."""
+        tracked = {_key(step.timestamp): step for step in steps if not step.lost}
+        stamps = {_key(keyframe.timestamp) for keyframe in self.keyframes.all}
+        for keyframe in self.keyframes.all:
+            step = tracked.get(_key(keyframe.timestamp))
+            while step is not None:
+                keyframe.in_doubt |= is_in_doubt(step)
+                before = _key(step.reference_timestamp)
+                step = None if before in stamps else tracked.get(before)
 
     def _follow(self, step: Step, motion: np.ndarray) -> None:
         """Keep the covariance of the motion since the last keyframe."""
         before = self._known.get(_key(step.reference_timestamp))
         covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
         if before is not None and np.isfinite(covariance).all():
-            self._known[_key(step.timestamp)] = carried(motion, before + covariance)
+            in_doubt = before.in_doubt or is_in_doubt(step)
+            self._known[_key(step.timestamp)] = _Way(carried(motion, before.covariance + covariance), in_doubt)
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
 
     def _add(self, keyframe: Keyframe) -> None:
         self.keyframes.add(keyframe)
         self._known.clear()
-        self._known[_key(keyframe.timestamp)] = np.zeros((6, 6))
+        self._known[_key(keyframe.timestamp)] = _Way(np.zeros((6, 6)), False)
         self._close(self._candidates(keyframe))
         if len(self.keyframes.all) >= self._next:
             self._next = int(GROWTH * len(self.keyframes.all)) + 1
@@ -259,10 +277,15 @@ class Mapper:
         edges = []
         for a, b in zip(keyframes, keyframes[1:], strict=False):
             covariance = UNTIED**2 * np.eye(6) if b.step is None or a.segment != b.segment else b.step
-            if any(a.timestamp < stamp <= b.timestamp for stamp in self._doubted):
+            if b.in_doubt:
                 covariance = covariance + DOUBTED**2 * np.eye(6)
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
+
+
+def is_in_doubt(step: Step) -> bool:
+    """Whether something speaks against a motion that is not lost: it may be off by more than its covariance says."""
+    return not SPEAKS_AGAINST.isdisjoint(step.alignment.statuses)
 
 
 def _may_be_keyframe(step: Step) -> bool:

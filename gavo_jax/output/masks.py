@@ -76,7 +76,7 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
         return
     try:
         for path in inside.glob("*.png"):
-            if _stamp(path) > after:
+            if _stamp(path) > float(f"{after:.6f}"):  # as names have it
                 path.unlink()
         if not any(inside.iterdir()):
             inside.rmdir()

@@ -144,7 +144,8 @@ def test_a_doubted_motion_ties_little():
     for step in steps:
         mapper.watch(WALK[step.index], step)
     later = replace(steps[5], alignment=with_finding(steps[5].alignment, AlignmentStatus.MOVING_BODY))
-    keyframes = mapper.finish([later]).keyframes
+    aside = replace(steps[14], lost=True, alignment=no_alignment(AlignmentStatus.HIGH_ERROR))
+    keyframes = mapper.finish([*steps[:5], later, *steps[6:14], aside, *steps[15:]]).keyframes
     spans = [(a.index, b.index) for a, b in zip(keyframes, keyframes[1:], strict=False)]
     doubted = [any(first < step.index <= last for step in (steps[3], later)) for first, last in spans]
     assert any(doubted) and not all(doubted)

@@ -1,5 +1,6 @@
 """Where bodies are, on disk: written as they are seen, read for maps, gone with the run."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,9 @@ def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
 
 
 def test_what_came_after_a_checkpoint_is_removed(tmp_path: Path):
-    for index in (1, 2, 3):
-        write_masks(tmp_path, stepped(index, body(1, 0, 4)))
-    remove_masks(tmp_path, after=1.0)
-    assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["1.000000.png"]
+    """The last frame's own was removed where its stamp had been rounded up."""
+    stamps = [index / 30 for index in (2, 3, 4)]
+    for stamp in stamps:
+        write_masks(tmp_path, replace(stepped(1, body(1, 0, 4)), timestamp=stamp))
+    remove_masks(tmp_path, after=stamps[0])
+    assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["0.066667.png"]
