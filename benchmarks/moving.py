@@ -44,12 +44,12 @@ from gavo_jax.datasets.moving import body_of_part
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
-from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -199,7 +199,7 @@ def pair_error(step: Step, poses: dict[float, np.ndarray], truth: Trajectory) ->
     if not valid.all() or step.reference_timestamp not in poses:
         return 0.0, 0.0
     error = inverse(inverse(true[0]) @ true[1]) @ inverse(poses[step.reference_timestamp]) @ step.world_T_camera
-    length, angle = size(error)
+    length, angle = length_and_angle(error)
     return float(length), float(np.degrees(angle))
 
 

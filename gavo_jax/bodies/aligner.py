@@ -23,10 +23,10 @@ from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, Look, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 

@@ -24,10 +24,10 @@ from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import carried, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.rigid_motions import length_and_angle, log, transport_covariance
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -288,7 +288,9 @@ def _view(state: AwareState) -> View:
 
 def _in_target(result: Alignment) -> Float64[np.ndarray, "6 6"]:
     """Covariance of a motion by a step on the target's side: results have it by one on the reference's."""
-    return carried(np.asarray(result.target_T_reference, np.float64), np.asarray(result.covariance, np.float64))
+    return transport_covariance(
+        np.asarray(result.target_T_reference, np.float64), np.asarray(result.covariance, np.float64)
+    )
 
 
 def _distance(
@@ -300,7 +302,7 @@ def _distance(
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
-    length, angle = size(inverse(first) @ second)
+    length, angle = length_and_angle(inverse(first) @ second)
     return float(length), float(angle)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.mapping.keyframes import NEAREST, Keyframe
-from gavo_jax.mapping.motions import size
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MOST = 4
@@ -89,5 +89,5 @@ def _was_tried(new: Keyframe, other: Keyframe) -> bool:
     if guess is None:
         return False
     later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
-    changes = size(inverse(guess) @ later_T_earlier)
+    changes = length_and_angle(inverse(guess) @ later_T_earlier)
     return all(change < least for change, least in zip(changes, ANOTHER_GUESS, strict=True))

@@ -11,7 +11,7 @@ from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
 from gavo_jax.image.settling import Still, still
-from gavo_jax.mapping.motions import size
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MAX_IMAGES = 300
@@ -132,7 +132,7 @@ class Keyframe:
 
 def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.ndarray, "*n"]:
     """How far motions shift the image of things at a distance (m), about, in radians."""
-    length, angle = size(a_T_b)
+    length, angle = length_and_angle(a_T_b)
     return angle + length / max(distance, 0.1)
 
 

@@ -13,11 +13,11 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.mapping.candidates import Candidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
-from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
+from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.status import GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -206,7 +206,7 @@ class Mapper:
         before = self._known.get(_key(step.reference_timestamp))
         covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
         if before is not None and np.isfinite(covariance).all():
-            self._known[_key(step.timestamp)] = carried(motion, before + covariance)
+            self._known[_key(step.timestamp)] = transport_covariance(motion, before + covariance)
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
 

@@ -14,8 +14,8 @@ from scipy.sparse.linalg import splu
 from scipy.special import chdtri
 
 from gavo_jax.errors import GavoError
-from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.verification import Edge
+from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.trajectory import inverse
 
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -146,12 +146,12 @@ def _plausible(
     chain, spread = [poses[0]], [np.zeros((6, 6))]
     for edge in odometry:
         chain.append(chain[-1] @ edge.earlier_T_later)
-        spread.append(spread[-1] + carried(chain[-1], edge.covariance))
+        spread.append(spread[-1] + transport_covariance(chain[-1], edge.covariance))
     result = []
     for edge in loops:
         said = inverse(chain[edge.earlier]) @ chain[edge.later]
         residual = log(inverse(edge.earlier_T_later) @ said)
-        drifted = carried(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
+        drifted = transport_covariance(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
         result.append(squared < chdtri(6, 1.0 - IMPOSSIBLE))
     return np.array(result)

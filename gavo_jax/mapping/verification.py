@@ -20,8 +20,8 @@ from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
 from gavo_jax.mapping.candidates import MOST, Candidate
-from gavo_jax.mapping.motions import between, carried, size
 from gavo_jax.precision import in_32_bits
+from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -145,15 +145,15 @@ def _stands(result: Alignment) -> bool:
 def _edge(candidate: Candidate, there: Alignment, back: Alignment) -> Edge | None:
     """The edge of a candidate that was aligned there and back, if these agree."""
     by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
-    metres, radians = (float(part) for part in size(inverse(by_way_there) @ by_way_back))
+    metres, radians = (float(part) for part in length_and_angle(inverse(by_way_there) @ by_way_back))
     if metres > MAX_DISAGREEMENT[0] or radians > MAX_DISAGREEMENT[1]:
         return None
-    covariance = carried(inverse(by_way_there), np.asarray(there.covariance, np.float64))
+    covariance = transport_covariance(inverse(by_way_there), np.asarray(there.covariance, np.float64))
     covariance = 0.5 * (covariance + np.asarray(back.covariance, np.float64))
     return Edge(
         candidate.earlier.number,
         candidate.later.number,
-        between(by_way_there, by_way_back, 0.5),
+        interpolate(by_way_there, by_way_back, 0.5),
         SHARED * (covariance + FLOOR**2 * np.eye(6)),
         float(min(there.overlap, back.overlap)),
         (metres, radians),

@@ -24,9 +24,9 @@ from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
-from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.precision import in_32_bits
+from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse

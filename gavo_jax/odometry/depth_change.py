@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera, inverse_depth, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import exp, log
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.trajectory import inverse
 
 COLUMNS = 60

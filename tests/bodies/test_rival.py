@@ -19,13 +19,13 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
-from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.presets import preset
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus, bit

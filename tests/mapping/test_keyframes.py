@@ -18,12 +18,12 @@ from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, Candidate, fin
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
-from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import doubts_of, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
+from gavo_jax.rigid_motions import exp, length_and_angle, log
 from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
@@ -178,7 +178,7 @@ def test_loops_bring_the_end_back_to_where_it_was():
     trajectory = correct(causal, loops)
     truth = WALK.ground_truth.world_T_camera
     end = inverse(truth[0]) @ truth[-1]
-    before, after = (size(inverse(end) @ of.world_T_camera[-1]) for of in (causal, trajectory))
+    before, after = (length_and_angle(inverse(end) @ of.world_T_camera[-1]) for of in (causal, trajectory))
     assert loop_figures(loops)["loops"] > 0 == loop_figures(loops)["loops_refused"]
     assert before[0] > 0.03 and after[0] < 0.15 * before[0] and after[1] < 0.2 * before[1]
     again = Mapper(CAMERA)
@@ -303,7 +303,7 @@ def test_a_frame_is_found_in_the_map_and_another_room_is_not():
         mapper.keyframes.add(keyframe)
     found = mapper.find(WALK[5], segment=1)
     assert found is not None and found.segment == 0
-    metres, radians = size(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
+    metres, radians = length_and_angle(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
     assert metres < 0.03 and radians < 0.03
     assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0], segment=1) is None
     assert mapper.find(WALK[5], segment=0) is None  # to its own segment nothing has to tie it
