@@ -20,7 +20,7 @@ from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.evidence import inverse_depth_of
 from gavo_jax.bodies.identity import LEAST, Roll, parts
 from gavo_jax.bodies.motions import find_motions
-from gavo_jax.bodies.scene import AwareState, Look, Retina
+from gavo_jax.bodies.scene import AwareState, FrameView, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
@@ -71,7 +71,7 @@ MOST = 0.9
 """of depth so much of what it leaves in view has to agree."""
 
 
-class Candidate(NamedTuple):
+class MotionCandidate(NamedTuple):
     """A motion that may be the camera's."""
 
     attempt: Attempt
@@ -164,7 +164,7 @@ class BodyAware:
         frame: Frame,
         clock: Clock,
         attempt: Attempt,
-        look: Look,
+        look: FrameView,
         found: Integer[np.ndarray, "h w"],
         carried: float,
     ) -> Attempt:
@@ -196,7 +196,7 @@ class BodyAware:
             tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else bodies > 0)
         return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
-    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:
+    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, FrameView]:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion; and
         what is seen by its motion.
         """
@@ -214,7 +214,7 @@ class BodyAware:
             attempt, look = again, other
         return attempt, look
 
-    def _look(self, state: AwareState, attempt: Attempt) -> Look:
+    def _look(self, state: AwareState, attempt: Attempt) -> FrameView:
         return self.retina.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
@@ -233,13 +233,13 @@ class BodyAware:
         scene, tracker, retina = state.scene, state.tracker, self.retina
         known = bool(np.any(np.asarray(scene.roll.labels)))
 
-        def candidate(attempt: Attempt) -> Candidate:
-            return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
+        def candidate(attempt: Attempt) -> MotionCandidate:
+            return MotionCandidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
 
-        def search_from(tracker: TrackerState) -> Candidate:
+        def search_from(tracker: TrackerState) -> MotionCandidate:
             return candidate(self.search.align(tracker, frame, clock))
 
-        def search_without(mask: Any) -> Candidate:
+        def search_without(mask: Any) -> MotionCandidate:
             return search_from(retina.without(tracker, mask))
 
         found = candidate(first)
@@ -301,7 +301,7 @@ def _moved(
     return attempt._replace(state=tracker, result=result, usable=True)
 
 
-def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
+def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) -> Attempt:
     """The best candidate's attempt with what the image as a whole says of it.
 
     What all of the image at rest speaks for is not wrong because a body hides what its points saw; but the image has to

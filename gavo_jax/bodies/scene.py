@@ -62,8 +62,8 @@ class AwareState(NamedTuple):
     """Whether the last motion may be a body's, by a stricter measure than the status's."""
 
 
-class Look(NamedTuple):
-    """A new frame, by some motion."""
+class FrameView(NamedTuple):
+    """A new frame as it looks if some motion is the camera's."""
 
     belief: Belief
     """Of its pixels."""
@@ -131,7 +131,7 @@ class Retina:
         image = jax.tree.map(np.asarray, tracker.previous_image)
         return view_of(image, self.levels, sweep)
 
-    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
+    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> FrameView:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
         keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
         return _look(
@@ -154,7 +154,7 @@ class Retina:
         )
         return jax.device_get(belief)
 
-    def renewed(self, scene: Scene, look: Look, elapsed: float) -> Scene:
+    def renewed(self, scene: Scene, look: FrameView, elapsed: float) -> Scene:
         """The scene with the new frame as its last one, so many seconds later."""
         is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
         age = OLD if is_far_off else _age_after(scene, elapsed)
@@ -176,7 +176,7 @@ def _age_after(scene: Scene, elapsed: float) -> float:
     return age if age < OLD else 0.0
 
 
-@partial(CachedProgram, static=("levels",), returns=(Look,))
+@partial(CachedProgram, static=("levels",), returns=(FrameView,))
 def _look(
     known: tuple[Float[Array, "h w"], Float[Array, "h w"], View, Float[Array, "3 4 4"]],
     new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
@@ -185,7 +185,7 @@ def _look(
     camera: Camera,
     *,
     levels: Levels,
-) -> Look:
+) -> FrameView:
     """One program for all that is asked about every frame: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
     image, passing, seconds = new
@@ -199,7 +199,7 @@ def _look(
     last = jax.tree.map(lambda leaf: leaf[0], views)
     opinion = ask_area(last, here, target_T_reference, credit, seen) if has_blocks(seen) else None
     views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)
-    return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
+    return FrameView(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
 
 
 @partial(CachedProgram, static=("levels",), returns=(Belief,))

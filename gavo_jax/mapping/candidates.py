@@ -28,7 +28,7 @@ ANOTHER_GUESS = (0.02, 0.02)
 """Metres and radians by which a guess has to differ from one that led to nothing."""
 
 
-class Candidate(NamedTuple):
+class LoopCandidate(NamedTuple):
     """A pair of keyframes that may overlap."""
 
     earlier: Keyframe
@@ -41,7 +41,7 @@ class Candidate(NamedTuple):
     """and the correlation."""
 
 
-def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Candidate]:
+def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[LoopCandidate]:
     """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
 
     Args:
@@ -52,15 +52,15 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
     possible = []
     for other in _most_overlapping(new, others, camera):
         later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
-        back = new.look.agreement(other.look, inverse(later_T_earlier), camera)
+        back = new.thumbnail.agreement(other.thumbnail, inverse(later_T_earlier), camera)
         if back[0] < MIN_OVERLAP or back[1] < MIN_LIKENESS:
             continue
-        there = other.look.agreement(new.look, later_T_earlier, camera)
+        there = other.thumbnail.agreement(new.thumbnail, later_T_earlier, camera)
         overlap, likeness = min(there[0], back[0]), min(there[1], back[1])
         if overlap >= MIN_OVERLAP and likeness >= MIN_LIKENESS:
-            possible.append(Candidate(other, new, later_T_earlier, overlap, likeness))
+            possible.append(LoopCandidate(other, new, later_T_earlier, overlap, likeness))
     possible.sort(key=lambda candidate: -candidate.likeness)
-    found: list[Candidate] = []
+    found: list[LoopCandidate] = []
     for candidate in possible:
         if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
             found.append(candidate)
@@ -70,7 +70,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
 def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
     """Those of some earlier keyframes that were not tried yet and see most of what a new one sees."""
     old = [o for o in others if new.timestamp - o.timestamp >= MIN_SECONDS and not _was_tried(new, o)]
-    points = new.look.points[:, :: max(1, new.look.points.shape[1] // FEW_POINTS)]
+    points = new.thumbnail.points[:, :: max(1, new.thumbnail.points.shape[1] // FEW_POINTS)]
     if not old or not points.size:
         return []
     old_T_new = inverse(np.stack([other.world_T_camera for other in old])) @ new.world_T_camera

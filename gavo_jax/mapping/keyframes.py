@@ -32,7 +32,7 @@ USUAL_DISTANCE = 2.0
 """Metres, where depth says nothing."""
 
 
-class Look(NamedTuple):
+class Thumbnail(NamedTuple):
     """A small blurred image, and where the things are that it shows."""
 
     small: Float32[np.ndarray, "h w"]
@@ -58,7 +58,9 @@ class Look(NamedTuple):
         """Median depth, metres."""
         return float(np.median(self.points[2])) if self.points.size else USUAL_DISTANCE
 
-    def agreement(self, other: "Look", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera) -> tuple[float, float]:
+    def agreement(
+        self, other: "Thumbnail", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera
+    ) -> tuple[float, float]:
         """How well another one shows the same from another pose.
 
         Args:
@@ -80,7 +82,7 @@ class Look(NamedTuple):
         return float(inside.mean()), correlation(self.grey[inside], there)
 
 
-NOTHING_SEEN = Look(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
+NOTHING_SEEN = Thumbnail(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
 """Of a keyframe without images."""
 
 
@@ -105,7 +107,7 @@ class Keyframe:
         step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
             unknown.
         images: Of half the size; None once they were given up.
-        look: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
+        thumbnail: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
         features: Its keypoints, once they were needed.
     """
 
@@ -117,7 +119,7 @@ class Keyframe:
     world_T_camera: Float64[np.ndarray, "4 4"]
     step: Float64[np.ndarray, "6 6"] | None
     images: Still | None
-    look: Look
+    thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Earlier keyframes that it was aligned with, and the guess of that,"""
     linked: set[int] = field(default_factory=set)
@@ -126,7 +128,7 @@ class Keyframe:
 
     def give_up_images(self) -> None:
         """Forget all that is heavy; the pose stays."""
-        self.images, self.look, self.features = None, NOTHING_SEEN, None
+        self.images, self.thumbnail, self.features = None, NOTHING_SEEN, None
         self.tried.clear()
 
 
@@ -161,7 +163,7 @@ class Keyframes:
         if not self.all or self.all[-1].segment != segment:
             return True
         last = self.all[-1]
-        return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.look.distance) > SPACING)
+        return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.thumbnail.distance) > SPACING)
 
     def make(
         self,
@@ -193,7 +195,7 @@ class Keyframes:
             world_T_camera=np.array(world_T_odometry),
             step=step,
             images=images,
-            look=Look.of(images, self.camera),
+            thumbnail=Thumbnail.of(images, self.camera),
         )
 
     def add(self, keyframe: Keyframe) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.mapping.candidates import Candidate, find_candidates
+from gavo_jax.mapping.candidates import LoopCandidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
@@ -231,12 +231,12 @@ class Mapper:
             keyframe.linked.add(edge.earlier)
             self.edges.append(edge._replace(alignment=None))
 
-    def _candidates(self, keyframe: Keyframe) -> list[Candidate]:
+    def _candidates(self, keyframe: Keyframe) -> list[LoopCandidate]:
         """The loops that a keyframe may close."""
         earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
         return find_candidates(keyframe, earlier, self.keyframes.camera)
 
-    def _close(self, candidates: list[Candidate]) -> None:
+    def _close(self, candidates: list[LoopCandidate]) -> None:
         """Keep those loops that stand."""
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
             candidate.later.tried[candidate.earlier.number] = candidate.later_T_earlier

@@ -19,7 +19,7 @@ from gavo_jax.alignment.repetition import may_be_any_period
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
-from gavo_jax.mapping.candidates import MOST, Candidate
+from gavo_jax.mapping.candidates import MOST, LoopCandidate
 from gavo_jax.precision import in_32_bits
 from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
 from gavo_jax.settings import AlignmentOptions, Settings
@@ -81,7 +81,7 @@ class Verifier:
         nothing = Images(np.zeros(size, np.uint8), np.zeros(size, np.uint16))
         self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
 
-    def verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+    def verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
         """Edges of the candidates that stand; None for the others. More than one keyframe's are asked about in the end,
         when nothing else is computed: several lots of them are aligned side by side.
         """
@@ -91,7 +91,7 @@ class Verifier:
         with ThreadPoolExecutor(min(SIDE_BY_SIDE, len(lots))) as workers:
             return [edge for edges in workers.map(in_32_bits(self._verify), lots) for edge in edges]
 
-    def _verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+    def _verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
         """Align there, and back only what stands; each from the guess, so that they are two opinions."""
         guesses = [candidate.later_T_earlier for candidate in candidates]
         sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
@@ -105,7 +105,7 @@ class Verifier:
                 edges[k] = _edge(candidates[k], there[k], result)
         return edges
 
-    def _is_unique(self, candidate: Candidate, there: Alignment) -> bool:
+    def _is_unique(self, candidate: LoopCandidate, there: Alignment) -> bool:
         """Whether no other motion explains the images as well, as one does before a pattern that repeats itself. Which
         one it was, the map's guess does not tell: it drifts, and who knows by how much.
         """
@@ -142,7 +142,7 @@ def _stands(result: Alignment) -> bool:
     return result.status == AlignmentStatus.OK and float(result.overlap) >= MIN_OVERLAP
 
 
-def _edge(candidate: Candidate, there: Alignment, back: Alignment) -> Edge | None:
+def _edge(candidate: LoopCandidate, there: Alignment, back: Alignment) -> Edge | None:
     """The edge of a candidate that was aligned there and back, if these agree."""
     by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
     metres, radians = (float(part) for part in length_and_angle(inverse(by_way_there) @ by_way_back))

@@ -120,7 +120,7 @@ def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:
     return step.moving
 
 
-class Outcome(NamedTuple):
+class FrameOutcome(NamedTuple):
     """What became of a frame, before a map is asked."""
 
     after: Progress
@@ -268,19 +268,19 @@ class Odometry:
             raise frame or FrameError("the first frame could not be read")
         return frame
 
-    def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> Outcome:
+    def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
         """Of a frame of which nothing can be used."""
         revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         after = self._lose(before, None, timestamp)
-        return Outcome(after, no_alignment(finding.status), lost=True, revises=revises)
+        return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
-    def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
+    def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
         """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
-            return Outcome(before, no_alignment(finding.status), lost=True)
-        return Outcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
+            return FrameOutcome(before, no_alignment(finding.status), lost=True)
+        return FrameOutcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
-    def _align(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
+    def _align(self, before: Progress, frame: Frame, finding: Finding) -> FrameOutcome:
         """Of a frame that is aligned."""
         clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
@@ -303,7 +303,7 @@ class Odometry:
             after = after._replace(depth=watch)
             if watch.told and not before.depth.told:
                 revises = max(revises, watch.spoken_of(before.last_index))
-        return Outcome(after, result, lost, attempt.candidates, bodies, revises)
+        return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
         """Look for a frame in the map, where it is the reference of a segment that is adrift."""

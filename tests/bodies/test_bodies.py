@@ -17,7 +17,7 @@ from gavo_jax import program_cache
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies import motions
-from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, Candidate, _judged
+from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
 from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
@@ -358,7 +358,7 @@ def judged(finding: AlignmentStatus, *, grey: float, depth: float, support: floa
     belief = Belief(2 * covered - 1, 2 * covered - 1, *shares, image, image, jnp.ones(2))
     result = no_alignment(finding)
     result = result._replace(explained=result.explained._replace(grey=np.float32(grey), depth=np.float32(depth)))
-    best = Candidate(Attempt(None, result, usable=False), belief)
+    best = MotionCandidate(Attempt(None, result, usable=False), belief)
     return _judged(best, [best], known=True).result
 
 

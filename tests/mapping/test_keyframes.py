@@ -14,7 +14,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.sensor_noise import NONE
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.image.settling import still
-from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, Candidate, find_candidates
+from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
@@ -363,7 +363,7 @@ def test_before_tiles_that_repeat_nothing_ties_two_keyframes():
     earlier, later = (mapper.keyframes.make(tiled(s), 0, 0, np.eye(4), np.zeros(6)) for s in (0.0, 96.0))
     mapper.keyframes.add(earlier)
     near_the_last_tile = exp(np.array([-24.0 * 1.5 / 525, 0, 0, 0, 0, 0]))
-    assert mapper.verifier.verify([Candidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
+    assert mapper.verifier.verify([LoopCandidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
     assert mapper.find(tiled(96.0), segment=1) is None
 
 
@@ -375,7 +375,7 @@ def test_many_candidates_are_verified_side_by_side_to_the_same_edges():
         mapper.keyframes.add(keyframe)
     poses = sequence.ground_truth.world_T_camera
     guesses = [inverse(pose) @ poses[0] for pose in poses[1:]]
-    many = [Candidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
+    many = [LoopCandidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
     alone = [edge for candidate in many for edge in mapper.verifier.verify([candidate])]
     together = mapper.verifier.verify(many)
     assert len(many) > MOST and [edge is None for edge in together] == [edge is None for edge in alone]

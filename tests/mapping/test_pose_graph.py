@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import csc_array
 
 from gavo_jax.mapping.correction import Doubts, correct, joined
-from gavo_jax.mapping.keyframes import Keyframe, Look
+from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import Solution, _leverage, optimise
 from gavo_jax.mapping.verification import Edge
@@ -74,8 +74,8 @@ def test_false_loops_alone_leave_the_odometry_as_it_was():
 
 
 def keyframe(number: int, timestamp: float, odometry: np.ndarray, corrected: np.ndarray, segment: int = 0) -> Keyframe:
-    look = Look(np.zeros((3, 4), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
-    return Keyframe(number, number, timestamp, segment, odometry, corrected, None, None, look)
+    thumbnail = Thumbnail(np.zeros((3, 4), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
+    return Keyframe(number, number, timestamp, segment, odometry, corrected, None, None, thumbnail)
 
 
 def solved(keyframes: list[Keyframe], edges: list[Edge]) -> Loops:
