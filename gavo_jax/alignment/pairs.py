@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
+from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
@@ -168,9 +168,9 @@ def with_repetitions(
     for k in np.flatnonzero((status == AlignmentStatus.OK) | (status == AlignmentStatus.LOW_TEXTURE)):
         motion, images = np.asarray(result.target_T_reference[k]), (greys[k], depths[k], camera)
         if guesses is None:
-            is_open = may_be_any_period(motion, result.error[k], np.inf, *images)
+            is_open = another_period_is_in_reach(motion, result.error[k], np.inf, *images)
         else:
-            is_open = may_be_another_period(motion, result.error[k], guesses[k], *images)
+            is_open = another_period_fits_expected(motion, result.error[k], guesses[k], *images)
         if is_open:
             status[k] = status[k] or AlignmentStatus.AMBIGUOUS
             findings[k] |= bit(AlignmentStatus.AMBIGUOUS)

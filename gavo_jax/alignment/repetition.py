@@ -161,7 +161,7 @@ MOST = 8
 """Repetitions of each plane that are compared, the nearest."""
 
 
-def may_be_another_period(
+def another_period_fits_expected(
     found: Float64[np.ndarray, "4 4"],
     error: Any,
     expected: Float64[np.ndarray, "4 4"],
@@ -190,7 +190,7 @@ def may_be_another_period(
     return _is_any_as_good(near, error, grey, depth, camera)
 
 
-def may_be_any_period(
+def another_period_is_in_reach(
     found: Float64[np.ndarray, "4 4"], error: Any, seconds: float, grey: Any, depth: Any, camera: Camera
 ) -> bool:
     """The same, where nothing was known before: whether another repetition is a motion that a hand makes in that time.

@@ -18,7 +18,7 @@ from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.evidence import inverse_depth_of
-from gavo_jax.bodies.identity import LEAST, Roll, parts
+from gavo_jax.bodies.identity import LEAST, Roll, body_components
 from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, FrameView, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
@@ -138,8 +138,8 @@ class BodyAware:
         known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
-        explains = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
-        attempt, found, carried = seen, _bodies(look.belief, before, explains), 0.0
+        depth_disagrees = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
+        attempt, found, carried = seen, _bodies(look.belief, before, depth_disagrees), 0.0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (known or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
@@ -148,14 +148,14 @@ class BodyAware:
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 found_none = attempt
-                attempt = self._go_on(state, clock, found_none, covered)
+                attempt = self._helped_by_prediction(state, clock, found_none, covered)
                 carried = 0.0 if attempt is found_none else float(scene.carried + clock.elapsed)
         is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
         if is_vague and known and not self.is_eager:
-            attempt = self._completed(state, clock, attempt)
+            attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
             look = self._look(state, attempt)
-            found = _bodies(look.belief, before, explains)
+            found = _bodies(look.belief, before, depth_disagrees)
         return self._remember(state, frame, clock, attempt, look, found, carried)
 
     def _remember(
@@ -261,16 +261,16 @@ class BodyAware:
                 break
         return _judged(best, tried, known)
 
-    def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
+    def _helped_by_prediction(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion
         or, of an image that is covered for the most part, nothing; else the attempt as it is.
         """
         result = attempt.result
         if int(result.findings) == bit(AlignmentStatus.LOW_TEXTURE) and np.all(np.isfinite(result.covariance)):
-            return self._completed(state, clock, attempt)
-        return self._carry_on(state, clock, attempt) if covered > LARGE else attempt
+            return self._fused_with_prediction(state, clock, attempt)
+        return self._extrapolated(state, clock, attempt) if covered > LARGE else attempt
 
-    def _completed(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+    def _fused_with_prediction(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
         both, weighted by their covariances.
         """
@@ -281,7 +281,7 @@ class BodyAware:
         motion = found @ exp(share @ onward)
         return _moved(state, attempt, motion, share @ prior)
 
-    def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+    def _extrapolated(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with the motion that the camera has if it goes on as before."""
         motion = self.predict(state, float(clock.elapsed))
         attempt = _moved(state, attempt, motion, UNKNOWN)
@@ -297,7 +297,9 @@ def _moved(
     xi: Any = log(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
-    tracker = tracker._replace(keyframe=tracker.previous, motion=xi, guess=xi, passing=xi, usual=state.tracker.usual)
+    tracker = tracker._replace(
+        keyframe=tracker.previous, motion=xi, guess=xi, instant_motion=xi, usual=state.tracker.usual
+    )
     return attempt._replace(state=tracker, result=result, usable=True)
 
 
@@ -333,9 +335,9 @@ def deviation(attempt: Attempt) -> float:
     return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
-def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], explains: bool) -> Integer[np.ndarray, "h w"]:
+def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], depth_disagrees: bool) -> Integer[np.ndarray, "h w"]:
     moving, known = jax.device_get((belief.moving, belief.known))
-    return parts(moving, known, before, explains)
+    return body_components(moving, known, before, depth_disagrees)
 
 
 def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -50,11 +50,11 @@ class Roll(NamedTuple):
         )
 
 
-def parts(
+def body_components(
     moving: Float[np.ndarray, "h w"],
     known: Float[np.ndarray, "h w"],
     before: Bool[np.ndarray, "h w"],
-    explains: bool = False,
+    depth_disagrees: bool = False,
 ) -> Integer[np.ndarray, "h w"]:
     """Parts of a mask that hang together and are bodies: 1, 2, … from the largest one; else 0.
 
@@ -65,7 +65,7 @@ def parts(
         moving: Positive where something moves; see `Belief`.
         known: See `Belief`.
         before: Where bodies were in the frame before.
-        explains: Whether depth disagrees with the motion found.
+        depth_disagrees: Whether depth disagrees with the motion found.
     """
     mask = moving > 0
     labels = np.zeros(mask.shape, np.int32)
@@ -81,18 +81,18 @@ def parts(
         part = split == k
         was_known = np.mean(before[part]) > 0.3
         evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
-        shows = EXPLAINS if explains and found == 0 else SHOWS
+        shows = EXPLAINS if depth_disagrees and found == 0 else SHOWS
         if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else shows):
             found += 1
             labels[part] = found
     return labels
 
 
-def identify(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
+def associate(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
     """Give each part of a mask the number of the known body that it overlaps most, or a new one.
 
     Args:
-        found: Of `parts`, in the new frame.
+        found: Of `body_components`, in the new frame.
         roll: Of the frame before, its labels moved to where they are expected in the new one.
     """
     overlaps = sorted(

@@ -108,7 +108,7 @@ class Retina:
 
     def view(self, tracker: TrackerState) -> View:
         """Of a tracker's last frame, on the host: to slice a device's array takes a program."""
-        sweep = np.asarray(tracker.passing) * (self.full.readout / np.asarray(tracker.seconds))
+        sweep = np.asarray(tracker.instant_motion) * (self.full.readout / np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
     def blank(self) -> Scene:
@@ -136,7 +136,7 @@ class Retina:
         keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
-            (tracker.previous_image, tracker.passing, tracker.seconds),
+            (tracker.previous_image, tracker.instant_motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             np.array(keep, np.int32),
             self.full,
@@ -147,7 +147,7 @@ class Retina:
         """What a motion makes of the last frame's pixels, on the host."""
         belief = _look_back(
             (scene.known, scene.views),
-            (tracker.previous_image, tracker.passing, tracker.seconds),
+            (tracker.previous_image, tracker.instant_motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             self.full,
             levels=self.levels,
@@ -188,8 +188,8 @@ def _look(
 ) -> FrameView:
     """One program for all that is asked about every frame: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
-    image, passing, seconds = new
-    here = view_of(image, levels, passing * (camera.readout / seconds))
+    image, instant_motion, seconds = new
+    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
     views = views.moving_as(here.sweep)
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
@@ -213,8 +213,8 @@ def _look_back(
 ) -> Belief:
     """One program, so that it is kept between processes: it is asked for in the middle of a run."""
     before, views = known
-    image, passing, seconds = new
-    here = view_of(image, levels, passing * (camera.readout / seconds))
+    image, instant_motion, seconds = new
+    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
     last = jax.tree.map(lambda leaf: leaf[0], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
     here = jax.tree.map(lambda leaf: leaf[None], here)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, middle_of_many, surface_area
+from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, median_by_bisection, surface_area
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.program_cache import CachedProgram
@@ -52,7 +52,7 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     for residual, mask, least in ((r.grey, r.inside, LEAST_GREY), (r.depth, r.depth_valid, LEAST_DEPTH)):
         both = jnp.all(mask > 0, axis=0) & has
         better = jnp.where(both, jnp.min(jnp.abs(residual), axis=0), 0.0)
-        scale = jnp.maximum(1.48 * middle_of_many(better, both), least)
+        scale = jnp.maximum(1.48 * median_by_bisection(better, both), least)
         t = jnp.log1p((residual / scale) ** 2 / FREEDOM)
         cost += jnp.where(both, 0.5 * (FREEDOM + 1.0) * t, 0.0)
     seen = jnp.all(r.inside > 0, axis=0) & has

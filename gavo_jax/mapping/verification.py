@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.pairs import Images, align_rows
-from gavo_jax.alignment.repetition import may_be_any_period
+from gavo_jax.alignment.repetition import another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
@@ -112,7 +112,7 @@ class Verifier:
         images = candidate.earlier.images
         assert images is not None
         motion = np.asarray(there.target_T_reference)
-        return not may_be_any_period(motion, there.error, np.inf, images.grey, images.depth, self.camera)
+        return not another_period_is_in_reach(motion, there.error, np.inf, images.grey, images.depth, self.camera)
 
     def _one_way(
         self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax.alignment.judgement import is_unknown
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
+from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
@@ -160,9 +160,9 @@ class Search:
         images = frame.grey, frame.depth, self.camera
         is_known = bool(np.any(np.asarray(state.motion)))
         if is_known:
-            is_open = may_be_another_period(motion, result.error, self.predict(state, seconds), *images)
+            is_open = another_period_fits_expected(motion, result.error, self.predict(state, seconds), *images)
         else:
-            is_open = may_be_any_period(motion, result.error, seconds, *images)
+            is_open = another_period_is_in_reach(motion, result.error, seconds, *images)
         if not is_open:
             return attempt
         attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
@@ -189,7 +189,7 @@ def expecting(state: Any, xi: Float64[np.ndarray, " 6"], seconds: float) -> Any:
 def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)
-    return state._replace(motion=still, guess=still, passing=still, seconds=jnp.float32(1.0))
+    return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(1.0))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:
