@@ -307,9 +307,9 @@ class Row(NamedTuple):
     false_alarms: float
     """Share of the other pairs."""
     wrong: int
-    """Pairs whose motion is wrong, wherever they are;"""
+    """Pairs whose motion is wrong, wherever they are."""
     silent: int
-    """of which so many are `ok`."""
+    """Pairs whose motion is wrong and whose status is `ok`."""
     drift: float
     """m/s, over the frames left alone; median over the seeds."""
     clean_drift: float

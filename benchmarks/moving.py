@@ -54,9 +54,10 @@ from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
 WRONG = (0.02, 1.5)
-"""Metres and degrees: a pair whose motion is further from the truth is wrong,"""
+"""Metres and degrees: a pair whose motion is further from the truth is wrong."""
 EXACT = (0.008, 0.6)
-"""and one that is nearer than this is exact: a body that moves by 30 cm/s takes the camera along by 10 mm a frame."""
+"""Metres and degrees: a pair whose motion is nearer is exact. A body at 30 cm/s takes the camera along by
+10 mm a frame."""
 LEAST_SHARE = 0.01
 """Of the image: less of a body than this need not be found."""
 TOLD, ABOUT = "told", 4
@@ -351,9 +352,9 @@ class Summary(NamedTuple):
     precision: float | None
     """Share of the flagged pairs that are wrong."""
     false_alarms: float | None
-    """Share of the right pairs that are flagged,"""
+    """Share of the right pairs that are flagged."""
     exact_flagged: float | None
-    """and of the exact ones."""
+    """Share of the exact pairs that are flagged."""
     runs: int
 
 

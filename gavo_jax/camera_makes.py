@@ -97,7 +97,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
 
 
 def of_matrix(place: str, numbers: list[Any]) -> Table:
-    """fx, fy, cx and cy of a 3×3 matrix, row by row or, as Open3D and MATLAB have it, column by column.
+    """Intrinsics fx, fy, cx and cy of a 3×3 matrix, row by row or, as Open3D and MATLAB have it, column by column.
 
     Args:
         place: names the file in messages.

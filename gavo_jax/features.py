@@ -51,9 +51,9 @@ class FeatureMotion(NamedTuple):
     target_T_reference: Float64[np.ndarray, "4 4"]
     """Maps points of the reference camera into the target camera, metres."""
     inliers: int
-    """Matches that agree,"""
+    """Number of matches that agree with the motion."""
     share: float
-    """and their share of all matches with a reading in the reference."""
+    """Share of the matches with a reading in the reference that agree."""
 
 
 @cache

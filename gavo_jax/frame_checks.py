@@ -92,10 +92,10 @@ RANGE_QUANTILES = (25.0, 50.0, 75.0)
 """Per cent of the readings. Other units change all of them by one factor; a near body changes the lower ones alone.
 Higher ones would often be at the end of what the image's numbers can hold."""
 MAX_RANGE_RATIO = 2.5
-"""Depth that grows or shrinks by more than this from a frame to the next, at all those quantiles, is in other units;
-handheld motion stays within 1.4 a frame. The limit's logarithm grows with the time between,"""
+"""Factor by which depth at all those quantiles grows or shrinks from a frame to the next, above which it is in other
+units; handheld motion stays within 1.4 a frame."""
 RANGE_AGE = 0.1
-"""in seconds, beyond this."""
+"""Seconds between two frames beyond which that limit's logarithm grows with the time."""
 MAX_DUPLICATE_DIFFERENCE = 2
 """Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
 MIN_FROZEN_PART = 0.2

@@ -28,7 +28,7 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
     name: getattr(optax, name)
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 }
-"""optax's optimisers that need nothing but a learning rate."""
+"""Optimisers of optax that need nothing but a learning rate, by name."""
 CONFIG_KEYS = ("options", "sequence", *ROOMS, "device", "versions")
 """Of a run's config.json."""
 MAX_FILE_BYTES = 2**20

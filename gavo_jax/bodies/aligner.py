@@ -37,9 +37,9 @@ MAJORITY = 0.5
 ROUNDS = 3
 """Of searching without what moves by the last round's motion, at most."""
 RELUCTANT = 2.0
-"""Ratio of dissents from which on the area asks for another motion,"""
+"""Dissent from a motion, over that from the one which the area asks for, from which on another one is searched for."""
 BETTER = 1.2
-"""and from which on one that was found is taken."""
+"""Dissent from a motion, over that from the one found instead, from which on the new one is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
 """Dissents from which on a motion may be a body's, without bodies in view and with some. Where only noise is left the
 middle block gains 5.3, the median of chi-squared with six degrees of freedom; real clips have about 9 in the middle
@@ -48,17 +48,17 @@ pair and 17 in the worst.
 GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
-"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
+"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found."""
 MAX_CARRIED = 0.5
-"""for so many seconds."""
+"""Seconds for which the last motion may stand for one that cannot be found."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
 SUSPICIOUS = 0.02
 """Share of the image with bodies, away from where some were, from which on other motions are asked."""
 SUSPECTED = 0.3
-"""Suspicion from which on a pixel's points do not take part,"""
+"""Suspicion from which on a pixel's points take no part in the search."""
 MOST_ASIDE = 0.6
-"""unless so much of the image is suspected: then only what moves does not."""
+"""Share of the image that may be set aside on suspicion; where more is suspected, only what moves is set aside."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
@@ -66,9 +66,9 @@ GOES_ON = (0.01, 0.01)
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
-"""What a body may cause by hiding what the points saw;"""
+"""Findings that a body may cause by hiding what the points saw."""
 MOST = 0.9
-"""of depth so much of what it leaves in view has to agree."""
+"""Share of the depth left in view by bodies that has to agree with a motion for `DEPTH_MISMATCH` to be excused."""
 
 
 class MotionCandidate(NamedTuple):

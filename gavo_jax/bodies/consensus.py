@@ -20,9 +20,9 @@ from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp
 
 STRIDE = 2
-"""Every so many pixels along either side are asked;"""
+"""Pixels of the image from one that is asked to the next, along either side."""
 CELL = 4
-"""so many of these along either side are a block."""
+"""Asked pixels along either side of a block."""
 LEAST_GREY, LEAST_DEPTH = 1.0, 8e-4
 """Smallest deviations of a pixel's residuals: grey levels, 1/m."""
 BOUND = 6.0

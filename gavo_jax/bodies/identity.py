@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Integer
 LEAST = 0.008
 """Share of the image that a body covers at least."""
 SHOWS = 0.03
-"""Evidence, as a share of the image that is known to move, that shows a body,"""
+"""Evidence (belief that pixels move, summed, as a share of the image) from which on a component is a new body."""
 EXPLAINS = 0.015
-"""the largest part where depth disagrees with the motion found, which it explains,"""
+"""The same for the largest component where depth disagrees with the motion found: a body would explain that."""
 KEEPS = 0.006
-"""and that one needs that was known in the frame before."""
+"""The same for a body that was known in the frame before."""
 THICK = 6 / 160
 """Radius, over the image's width, of a disc that lies within a body."""
 MOST = 8

@@ -32,9 +32,9 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 TOGETHER = (0.008, np.radians(0.5))
-"""Metres and radians within which the two are the same motion,"""
+"""Metres and radians within which the two motions are the same."""
 APART = (0.025, np.radians(1.0))
-"""and from which on it matters which one is taken."""
+"""Metres and radians between the two motions from which on it matters which one is taken."""
 AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
 """Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
 away, however many frames are taken meanwhile."""
@@ -43,16 +43,16 @@ DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
 FORGOTTEN = 1.0
 """Seconds after which it counts as clear whose motion the first one's is."""
 LARGEST = 100.0
-"""Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ;"""
+"""Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ."""
 CONTRADICTED = 30.0
-"""and from which on the far part contradicts the first motion;"""
+"""The same distance from which on the far part contradicts the first motion."""
 CLEAR, DOUBTFUL = 0.75, 0.5
-"""as a share of the largest, together with the far part's margin: from the first on the rival is taken, from the second
-on the first one's motion may be a body's."""
+"""Certainty (that distance over `LARGEST`, at most 1, plus the far part's margin) above which the rival is taken, and
+above which the first search's motion may be a body's."""
 MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
-"""Margins in the whole image and in its far part that decide if they hold for so many frames,"""
+"""Margins in the whole image and in its far part that decide for the rival, and frames for which they have to hold."""
 LANDSLIDE = 0.6
-"""and one in the whole image that does at once."""
+"""Margin in the whole image that decides for the rival at once."""
 EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
 """Metres: deviation of the rival's translation up to which votes can have it taken, up to which the contradiction can,
 and from which on it tells nothing."""
@@ -89,9 +89,9 @@ class Rival(NamedTuple):
     stands_before: Any
     """Whether these stand before the rest: only then it says something that both searches agree."""
     first_T_anchor: Float[np.ndarray, "4 4"]
-    """Motion since the anchor by the first search,"""
+    """Motion since the anchor by the first search."""
     rival_T_anchor: Float[np.ndarray, "4 4"]
-    """and by the rival's."""
+    """Motion since the anchor by the rival's search."""
     vaguest: Float[np.ndarray, "6 6"]
     """Covariance of the rival's motion where it was known least well since the anchor; see `_in_target`."""
     age: Span

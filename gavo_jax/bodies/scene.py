@@ -25,10 +25,10 @@ from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
 OLD = 0.22
-"""Seconds after which an older view takes the place of the one before,"""
+"""Age in seconds at which the view between takes the place of the older one."""
 FAR_OFF = 0.7
-"""or part of what is at rest that it sees, below which it does at once: over a long way, errors of the poses and other
-light look like bodies."""
+"""Share of what is at rest that the older view sees, below which it is replaced at once: over a long way, errors of the
+poses and other light look like bodies."""
 
 
 class Scene(NamedTuple):

@@ -28,9 +28,9 @@ class Margin(NamedTuple):
     """By how much the second motion is ahead of the first, from -1 to 1."""
 
     whole: Float[Array, ""]
-    """In the whole image,"""
+    """The margin in the whole image."""
     far: Float[Array, ""]
-    """and in its far part alone."""
+    """The margin in the far part of the image alone."""
 
 
 @partial(CachedProgram, returns=(Margin,))

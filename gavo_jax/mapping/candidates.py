@@ -15,13 +15,13 @@ MOST = 4
 LOOKED_AT = 48
 """Earlier keyframes, those that see most of what the new one sees, that are compared with it: this bounds the work."""
 FEW_POINTS = 60
-"""Points that tell which these are."""
+"""Points of the new keyframe by which these are chosen."""
 MIN_SECONDS = 0.2
-"""Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
+"""Least time between the two keyframes: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
-"""Predicted share of either one's points that the other sees,"""
+"""Smallest predicted share of either keyframe's points that the other one sees."""
 MIN_LIKENESS = 0.88
-"""and correlation of what both see."""
+"""Smallest correlation of the grey of what both keyframes see."""
 APART = 2
 """Keyframes between two candidates: neighbours would say the same twice."""
 ANOTHER_GUESS = (0.02, 0.02)
@@ -34,11 +34,11 @@ class LoopCandidate(NamedTuple):
     earlier: Keyframe
     later: Keyframe
     later_T_earlier: Float64[np.ndarray, "4 4"]
-    """As it is known now: the guess."""
+    """The motion between the two as it is known now: the guess."""
     overlap: float
-    """Predicted, the smaller one of the two directions,"""
+    """Predicted share of the points of either keyframe that the other one sees, the smaller one of the two."""
     likeness: float
-    """and the correlation."""
+    """Correlation of the grey of what both see, the smaller one of the two directions."""
 
 
 def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[LoopCandidate]:

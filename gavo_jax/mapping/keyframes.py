@@ -25,9 +25,9 @@ SMALLER = 3
 BLUR = 1.0
 """Its pixels."""
 NEAREST = 0.05
-"""Metres in front of a camera from which on a point counts as seen,"""
+"""Metres in front of a camera from which on a point counts as seen."""
 FEWEST = 30
-"""and how many such points there have to be for two looks to be compared."""
+"""Fewest points that have to be seen for two thumbnails to be compared."""
 USUAL_DISTANCE = 2.0
 """Metres, where depth says nothing."""
 
@@ -121,9 +121,9 @@ class Keyframe:
     images: Still | None
     thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Earlier keyframes that it was aligned with, and the guess of that,"""
+    """Earlier keyframes that it was aligned with, by number, with the guess of that."""
     linked: set[int] = field(default_factory=set)
-    """and those to which that led to an edge."""
+    """Numbers of the earlier keyframes that it has an edge to."""
     features: Features | None = None
 
     def give_up_images(self) -> None:

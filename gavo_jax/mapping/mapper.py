@@ -24,9 +24,9 @@ from gavo_jax.trajectory import inverse
 STEP_FLOOR = 5e-4
 """Metres and radians that a step of the odometry is off by beside what its covariance says."""
 DOUBTED = 0.1
-"""Metres and radians that stand for a motion which something speaks against,"""
+"""Metres and radians: standard deviation given to a motion that something speaks against."""
 UNTIED = 1.0
-"""and for one of which nothing is known."""
+"""Metres and radians: standard deviation given to a motion of which nothing is known."""
 GROWTH = 1.25
 """Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
 FIRST = 20

@@ -31,9 +31,9 @@ IMPOSSIBLE = 1.0 - 1e-6
 MISTRUST = 4.0
 """On the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
 SCALES = (0.1, MISTRUST)
-"""Smallest and largest factor on the odometry's covariances that the loops may tell,"""
+"""Smallest and largest factor on the odometry's covariances that the loops may ask for."""
 BELIEF = 20.0
-"""and how many residuals' worth its covariances are believed beforehand."""
+"""Weight of the odometry's own covariances against what the loops say of them, as a number of residuals."""
 COUNTED = 0.5
 """Weight from which on a loop counts as right."""
 MOST_ROWS, PROBES = 512, 128

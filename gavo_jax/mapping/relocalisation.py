@@ -18,9 +18,9 @@ from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.verification import Edge, Verifier
 
 LOOKED_AT = 8
-"""Keyframes, those most like the frame, whose features are matched,"""
+"""Keyframes whose features are matched, those most like the frame."""
 ALIGNED = 4
-"""and of these those that are aligned, the best by matches."""
+"""Of these, the keyframes that are aligned, the best ones by matches."""
 MARGIN = 0.2
 """Share of a small image's width and height by which two may be shifted against each other and still look alike."""
 MIN_MATCHES = 15

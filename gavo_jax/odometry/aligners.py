@@ -40,9 +40,9 @@ class Attempt(NamedTuple):
     result: Alignment
     """On the host."""
     usable: bool
-    """Whether the motion can be used,"""
+    """Whether the motion can be used."""
     fit: bool = True
-    """and whether the frame may then become the reference."""
+    """Whether the frame may become the reference, should its motion be usable."""
     candidates: tuple[Population, ...] = ()
     """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
     bodies: tuple[Seen, ...] = ()

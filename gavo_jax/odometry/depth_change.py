@@ -18,12 +18,12 @@ from gavo_jax.trajectory import inverse
 COLUMNS = 60
 """Points across an image, on a regular grid: points of much contrast would lie at the edges of things."""
 SMALLEST_CHANGE = 0.01
-"""1/m, three times the noise of a structured-light sensor: points at which the motion and rest differ by less say
-nothing;"""
+"""1/m by which the motion and rest have to differ at a point for it to tell anything: three times the noise of a
+structured-light sensor."""
 CHANGED = 0.25
-"""nor do those that are not among this share of all, at which they differ most;"""
+"""Share of all points that are asked: those at which the motion and rest differ most."""
 LEAST_POINTS = 50
-"""nor so few."""
+"""Fewest points that tell anything."""
 EDGE = 0.05
 """1/m between neighbouring pixels, from which on two things lie beside each other."""
 REMEMBERED, MIN_REMEMBERED = 15, 8

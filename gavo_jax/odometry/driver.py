@@ -102,11 +102,11 @@ MAX_HELD = 3
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
 POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
-"""Of frames that have a motion, but become the reference only where the old one is out of reach,"""
+"""Statuses of frames that have a motion, but become the reference only where the old one is out of reach."""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
-"""and of those that never do."""
+"""Statuses of frames that have a motion, but never become the reference."""
 DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
-"""Of frames that have a motion, but no depth of their own that could be trusted."""
+"""Statuses of frames that have a motion, but no depth of their own that could be trusted."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 

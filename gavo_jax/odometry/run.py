@@ -39,11 +39,11 @@ class OdometryRun:
     steps: list[Step]
     metrics: RunMetrics
     sequence: Sequence | None = field(default=None, repr=False)
-    """What was run over."""
+    """The frames that were run over; None where they are not kept."""
     odometry: Trajectory | None = None
-    """With loops: the trajectory before they corrected it,"""
+    """With loops, the trajectory before they corrected it."""
     loops: Loops | None = None
-    """and the map of keyframes."""
+    """With loops, the map of keyframes."""
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -135,7 +135,7 @@ class RunOutcome(NamedTuple):
     figures: dict[str, Any]
     """As metrics.json names them: `Metrics`, and with loops the errors before them and what the map holds."""
     odometry: Trajectory | None = None
-    """With loops: the trajectory before they corrected it."""
+    """With loops, the trajectory before they corrected it; else None."""
     loops: Loops | None = None
 
 

@@ -103,9 +103,9 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
 
 
 KEYFRAME_SHARES = 16
-"""Shares of a keyframe's points that are renewed independently,"""
+"""Number of shares that a keyframe's points are dealt into, each renewed on its own."""
 KEYFRAME_SPREAD = 0.2
-"""each at its own overlap, evenly spread over a range of this width."""
+"""Width of the range over which the overlaps at which they are renewed are evenly spread."""
 
 
 def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overlap: Any) -> Reference:

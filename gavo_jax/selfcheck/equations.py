@@ -51,7 +51,7 @@ class Scene(NamedTuple):
     target_grey: np.ndarray
     """[h, w], whole grey levels."""
     plane: tuple[float, float, float]
-    """a, b, c of the target's inverse depth a + b u + c v, 1/m and 1/m a pixel."""
+    """Coefficients a, b, c of the target's inverse depth a + b u + c v, 1/m and 1/m per pixel."""
     x: np.ndarray
     """[n] of the points' rays (x, y, 1), float32 like all that the kernels are given."""
     y: np.ndarray
