@@ -18,7 +18,7 @@ from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, besid
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 PROJECTION = "projection_matrix"
-"""Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
+"""Key of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
 NESTED = ("camera", "cam", "camera_params", "cam_params")
 """Tables in which Replica, NICE-SLAM, SplaTAM and others keep a camera."""
@@ -388,4 +388,4 @@ PARSERS: dict[str, Callable[[Path, str], Table]] = {
     ".csv": _parse_numbers,
     ".pincam": _parse_numbers,
 }
-"""By a file's ending."""
+"""Parser of a camera file, by the file's ending."""

@@ -18,7 +18,7 @@ from gavo_jax.image.numbers import grey_bytes
 FeatureKind = Literal["sift", "orb"]
 
 KEYPOINTS = 2000
-"""Of one image at most."""
+"""Most keypoints of one image."""
 CONTRAST = 0.01
 """SIFT's threshold (OpenCV's default: 0.04, at which a blurred image has a few hundred keypoints)."""
 RATIO = 0.8

@@ -188,10 +188,10 @@ def concluded(
     """A batch's results on the host, with all that is looked at there.
 
     Args:
-        result: Of `align_rows`.
+        result: The result of `align_rows`.
         frames: References and targets as they were given, whose stamps tell the delays of depth.
-        sides: The same, of `stacked_images`.
-        camera: Theirs.
+        sides: The same images as `stacked_images` gives them.
+        camera: Camera of both frames.
         settings: What searched.
         expected: Motions to start from, where any were given.
     """

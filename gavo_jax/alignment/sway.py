@@ -76,6 +76,7 @@ class Swaying(NamedTuple):
     elapsed: Float[Array, ""]
     """Seconds since the last frame."""
     velocity_change: VelocityChange
+    """How the run's velocity has changed so far."""
 
 
 class Swayed(NamedTuple):
@@ -83,8 +84,8 @@ class Swayed(NamedTuple):
 
     motion: Float[Array, "4 4"]
     twist: Float[Array, " 6"]
-    """Of the points in the target camera at its moment, less the mean since the last frame; metres and radians over the
-    time between the two."""
+    """Velocity of the points in the target camera at its moment less the mean since the last frame, as a twist: metres
+    and radians over the time between the two."""
     covariance: Float[Array, "6 6"]
     """What not knowing the sway adds to that of δ in motion · exp(δ)."""
     residuals: Residuals

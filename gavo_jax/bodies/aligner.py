@@ -35,7 +35,7 @@ DOUBTFUL = 0.1
 MAJORITY = 0.5
 """Support from which on a motion is taken for the camera's although its points agree badly."""
 ROUNDS = 3
-"""Of searching without what moves by the last round's motion, at most."""
+"""Most rounds of searching without what moves by the last round's motion."""
 RELUCTANT = 2.0
 """Dissent from a motion, over that from the one which the area asks for, from which on another one is searched for."""
 BETTER = 1.2
@@ -64,7 +64,7 @@ SAME = (0.01, 0.01)
 GOES_ON = (0.01, 0.01)
 """Deviation, metres and radians, of a motion that goes on as before."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
-"""Of a motion that is worth asking about."""
+"""Statuses of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """Findings that a body may cause by hiding what the points saw."""
 MOST = 0.9
@@ -76,7 +76,7 @@ class MotionCandidate(NamedTuple):
 
     attempt: Attempt
     belief: Belief
-    """Of the last frame's pixels."""
+    """What the motion says of the last frame's pixels."""
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -331,7 +331,7 @@ def mistrusted(attempt: Attempt) -> Attempt:
 
 
 def deviation(attempt: Attempt) -> float:
-    """Of an attempt's translation, metres."""
+    """Standard deviation of an attempt's translation, metres."""
     return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 

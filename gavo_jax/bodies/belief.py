@@ -186,7 +186,7 @@ def _box(image: Float[Array, "h w"], radius: int = 2) -> Float[Array, "h w"]:
 
 
 ROUNDS = (8, 12, 50)
-"""Of smoothing at each resolution, finest first, each half the one before."""
+"""Rounds of smoothing at each resolution, finest first; each resolution is half the one before."""
 DATA_WEIGHT = 0.3
 DEPTH_EDGE = 0.015
 """Relative step of inverse depth across which neighbours are hardly tied."""

@@ -30,9 +30,9 @@ BOUND = 6.0
 FARTHER = 2.0
 """A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
 ROUNDS = 4
-"""Of re-weighting the blocks, about their median."""
+"""Rounds of re-weighting the blocks, about their median."""
 DRAWS, DRAWN = 48, 6
-"""Of blocks to begin from: where a body is strong, the median's next minimum is not its least one."""
+"""Draws to begin from, and blocks of each: where a body is strong, the median's next minimum is not its least one."""
 HALVINGS = 16
 DISSENT = 6.0
 """Times the usual: from there on a block does not move as the others do."""
@@ -44,7 +44,7 @@ class Blocks(NamedTuple):
     hessian: Float[Array, "b 6 6"]
     gradient: Float[Array, "b 6"]
     inverse: Float[Array, "b 6 6"]
-    """Of the Hessians, damped."""
+    """Inverses of the Hessians, damped."""
     credit: Float[Array, " b"]
 
 

@@ -28,7 +28,7 @@ class Roll(NamedTuple):
     labels: Integer[np.ndarray, "h w"]
     """Number of the body that each pixel of the last frame shows, 0 for none."""
     numbers: Integer[np.ndarray, " n"]
-    """Of the bodies that are known; 0 where there is none."""
+    """Numbers of the bodies that are known; 0 where there is none."""
     ages: Integer[np.ndarray, " n"]
     """Frames since each was seen."""
     motions: Float[np.ndarray, "n 6"]

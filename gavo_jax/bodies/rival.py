@@ -62,7 +62,7 @@ class Span(NamedTuple):
     """How long something has been so."""
 
     frames: Any
-    """-1 where it is not."""
+    """Number of frames; -1 where it is not so."""
     seconds: Any
 
     @property
@@ -82,7 +82,7 @@ class Rival(NamedTuple):
     """Another motion that may be the camera's, since some frame, its anchor."""
 
     state: AwareState
-    """Of its own search."""
+    """State of the rival's own search."""
     anchor: View
     near: Bool[np.ndarray, "h w"]
     """What the anchor shows of surfaces that are taken for bodies."""
@@ -95,7 +95,7 @@ class Rival(NamedTuple):
     vaguest: Float[np.ndarray, "6 6"]
     """Covariance of the rival's motion where it was known least well since the anchor; see `_in_target`."""
     age: Span
-    """Since the anchor."""
+    """Time since the anchor."""
     ahead: Any
     """Frames for which the margins have held."""
 
@@ -226,8 +226,8 @@ class WithRival:
         Args:
             other: The rival's.
             rival: Before it, of the age it has then.
-            open_for: How long it was open whose motion the first one's is,
-            open_after: and how long it is from now on.
+            open_for: How long it was open whose motion the first one's is.
+            open_after: How long it is from now on.
         """
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))

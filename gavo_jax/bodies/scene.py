@@ -35,13 +35,13 @@ class Scene(NamedTuple):
     """What is known of the last frame's image, and of older ones to compare the next one with."""
 
     known: Float[Array, "h w"]
-    """See `Belief`; of the last frame's pixels."""
+    """What is known of the last frame's pixels; see `Belief.known`."""
     suspected: Float[Array, "h w"]
-    """See `belief.suspect`; the same."""
+    """Which of these pixels are suspected; see `belief.suspect`."""
     roll: Roll
     """The bodies that it shows."""
     views: View
-    """Of the last frame, of an older one and of one between them, [3]: what moves slowly shows in the older one."""
+    """Views of the last frame, an older one and one between them, [3]: what moves slowly shows in the older one."""
     views_T_last: Float[Array, "3 4 4"]
     """Motions from the last frame's camera into these."""
     age: Float[np.ndarray, ""]
@@ -66,7 +66,7 @@ class FrameView(NamedTuple):
     """A new frame as it looks if some motion is the camera's."""
 
     belief: Belief
-    """Of its pixels."""
+    """What the motion says of the new frame's pixels."""
     views: View
     """The scene's, should that be its motion, and `views_T_here` the motions into them."""
     views_T_here: Float[Array, "3 4 4"]
@@ -93,12 +93,12 @@ class Retina:
 
     @cached_property
     def camera(self) -> Camera:
-        """Of the level that bodies are seen on."""
+        """Camera of the level that bodies are seen on."""
         return self.full.level(self.levels.numbers[seen_level(self.levels)])
 
     @cached_property
     def planes(self) -> ImagePlane:
-        """Of the levels searched, on the host."""
+        """Image planes of the levels searched, on the host."""
         return jax.tree.map(np.asarray, self.levels.planes(self.full))
 
     @property

@@ -38,11 +38,11 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     """Have the blocks of a view choose between two motions into another; a block counts by the area of its surface.
 
     Args:
-        here: The view.
-        there: The other.
-        motions: there_T_here, twice.
-        near: Which pixels are not of the far part.
-        camera: Of the views' level.
+        here: The view whose blocks are asked.
+        there: The other view.
+        motions: The two motions there_T_here.
+        near: Pixels of `here` that are not of its far part.
+        camera: Camera of the views' level.
     """
     others = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), there)
     compared = compare(here, others, motions, camera, STRIDE)

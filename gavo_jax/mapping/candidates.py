@@ -45,9 +45,9 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
     """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
 
     Args:
-        new: The later one.
-        others: The earlier ones.
-        camera: Of their images.
+        new: The later keyframe.
+        others: The earlier keyframes.
+        camera: Camera of the keyframes' images.
     """
     possible = []
     for other in _most_overlapping(new, others, camera):

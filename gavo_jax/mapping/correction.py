@@ -19,17 +19,17 @@ class Doubts(NamedTuple):
     """Which poses of a trajectory are no more than guesses."""
 
     guessed: Bool[np.ndarray, " n"]
-    """Of the motion to them: lost, or gone on with behind a body."""
+    """Poses whose motion from the one before is a guess: lost, or taken to have gone on behind a body."""
     lost: Bool[np.ndarray, " n"]
-    """Those of these that nothing was seen of."""
+    """Guessed poses of frames that were lost."""
 
 
 def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) -> Trajectory:
     """A trajectory of the odometry corrected as its keyframes were.
 
     Args:
-        odometry: It.
-        loops: The map.
+        odometry: The trajectory, as the odometry has it.
+        loops: The map, with its keyframes as they were corrected.
         doubts: Which poses are guesses; those that are lost are put between those around, if these belong together.
 
     Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two

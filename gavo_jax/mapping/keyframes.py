@@ -23,13 +23,13 @@ SMALLER = 3
 """Pyramid level, from the keyframe's images, of the small blurred image that tells whether two keyframes look alike
 (Klein and Murray, ECCV 2008); 40 x 30 pixels of a frame of 640 x 480."""
 BLUR = 1.0
-"""Its pixels."""
+"""Standard deviation of that image's blur, in its pixels."""
 NEAREST = 0.05
 """Metres in front of a camera from which on a point counts as seen."""
 FEWEST = 30
 """Fewest points that have to be seen for two thumbnails to be compared."""
 USUAL_DISTANCE = 2.0
-"""Metres, where depth says nothing."""
+"""Median depth, metres, that is taken where depth says nothing."""
 
 
 class Thumbnail(NamedTuple):
@@ -37,9 +37,9 @@ class Thumbnail(NamedTuple):
 
     small: Float32[np.ndarray, "h w"]
     points: Float64[np.ndarray, "3 n"]
-    """Of its pixels that have a reading, metres in the camera."""
+    """Points that its pixels with a reading show, metres in the camera."""
     grey: Float32[np.ndarray, " n"]
-    """Of these pixels."""
+    """Grey of these pixels."""
 
     @classmethod
     def of(cls, images: Still, camera: Camera) -> Self:
@@ -64,9 +64,9 @@ class Thumbnail(NamedTuple):
         """How well another one shows the same from another pose.
 
         Args:
-            other: The other one.
-            other_T_self: The motion between them.
-            camera: Of the keyframes' images.
+            other: The other keyframe's thumbnail.
+            other_T_self: Maps points of this keyframe's camera into the other one's.
+            camera: Camera of the keyframes' images, half the size of the frames.
 
         Returns:
             Share of the points that it sees, and the correlation of their grey in the two; 0 where too few are seen.
@@ -83,7 +83,7 @@ class Thumbnail(NamedTuple):
 
 
 NOTHING_SEEN = Thumbnail(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
-"""Of a keyframe without images."""
+"""Thumbnail of a keyframe without images."""
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -99,14 +99,14 @@ class Keyframe:
 
     Attributes:
         number: Its place among the keyframes.
-        index: In the sequence.
-        timestamp: Seconds.
-        segment: Of the odometry's trajectory.
+        index: Index of the frame in the sequence.
+        timestamp: Colour stamp, seconds.
+        segment: Segment of the odometry's trajectory that it belongs to.
         world_T_odometry: Its pose by the odometry alone.
         world_T_camera: Its pose as it is known now.
         step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
             unknown.
-        images: Of half the size; None once they were given up.
+        images: Grey and depth at half the size; None once they were given up.
         thumbnail: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
         features: Its keypoints, once they were needed.
     """
@@ -150,8 +150,8 @@ class Keyframes:
     """The keyframes of a run, in their order.
 
     Args:
-        camera: Of the frames as they come, without distortion.
-        most: Keyframes that keep their images.
+        camera: Camera of the frames as they come, without distortion.
+        most: Largest number of keyframes that keep their images.
     """
 
     def __init__(self, camera: Camera, most: int = MAX_IMAGES):
@@ -178,9 +178,9 @@ class Keyframes:
 
         Args:
             frame: The images.
-            index: In the sequence.
-            segment: Of the odometry's trajectory.
-            world_T_odometry: Its pose.
+            index: Index of the frame in the sequence.
+            segment: Segment of the odometry's trajectory that it belongs to.
+            world_T_odometry: Pose of the frame by the odometry alone.
             twist: Motion of the points in the camera at its moment, m/s and rad/s.
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """

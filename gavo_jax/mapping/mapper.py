@@ -85,8 +85,8 @@ class Mapper:
         What moves on its own is no part of a map: two frames that show the same body would be tied by it.
 
         Args:
-            frame: It.
-            step: It.
+            frame: The frame.
+            step: What the driver says of it.
             moving: Where bodies are in the frame of a step.
         """
         if step is None:
@@ -143,8 +143,8 @@ class Mapper:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded.
 
         Args:
-            sequence: The run's.
-            steps: It had made.
+            sequence: The frames that the run is over.
+            steps: The steps that it had made.
             moving: Where bodies are in the frame of a step.
         """
         self.watch(_decoded(sequence, 0), None)
@@ -160,7 +160,7 @@ class Mapper:
         """Make the last frame a keyframe, look for loops once more with what is known now, and optimise.
 
         Args:
-            steps: Of the run, as later ones have shown them to be: more of them may be in doubt.
+            steps: The run's steps, as later ones have shown them to be: more of them may be in doubt.
         """
         for step in steps:
             self._doubt(step)

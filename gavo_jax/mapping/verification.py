@@ -36,16 +36,16 @@ SETTINGS = Settings(
 """Gauss-Newton from the guess, both ways. The images have half the size, so that a level here is the next coarser one
 of the frame's."""
 MIN_OVERLAP = 0.5
-"""Of the alignment, either way."""
+"""Smallest overlap of the alignment, there and back."""
 MAX_DISAGREEMENT = (0.02, 0.02)
 """Metres and radians between the motions found there and back."""
 FLOOR = 1e-3
 """Metres and radians that a pair of keyframes is off by beside what its covariance says: each keyframe's velocity,
 hence its rolling shutter, is known to a few per cent."""
 SIDE_BY_SIDE = min(os.cpu_count() or 1, 8)
-"""Lots of candidates."""
+"""Lots of candidates that are aligned at once."""
 SHARED = 4.0
-"""On the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
+"""Factor on the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
 
 
 class Edge(NamedTuple):
@@ -55,7 +55,7 @@ class Edge(NamedTuple):
     later: int
     earlier_T_later: Float64[np.ndarray, "4 4"]
     covariance: Float64[np.ndarray, "6 6"]
-    """Of δ in earlier_T_later · exp(δ), metres and radians."""
+    """Covariance of δ in earlier_T_later · exp(δ), metres and radians."""
     overlap: float = 1.0
     disagreement: tuple[float, float] = (0.0, 0.0)
     """Metres and radians between there and back."""

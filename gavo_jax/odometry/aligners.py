@@ -38,13 +38,13 @@ class Attempt(NamedTuple):
     state: Any
     """What it knows then, should the frame become the reference."""
     result: Alignment
-    """On the host."""
+    """The motion and what is known of it, on the host."""
     usable: bool
     """Whether the motion can be used."""
     fit: bool = True
     """Whether the frame may become the reference, should its motion be usable."""
     candidates: tuple[Population, ...] = ()
-    """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
+    """Candidates of the search, one entry per level, coarsest first; empty unless they are recorded."""
     bodies: tuple[Seen, ...] = ()
     """What moves on its own, as far as that was asked."""
     unknown: int = 0
@@ -79,7 +79,7 @@ class Aligner(Protocol):
 
 
 BEGINNING = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
-"""Of a first frame."""
+"""Clock of a first frame."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +147,10 @@ class Search:
         and the next frame has no motion to expect: it would only repeat the error.
 
         Args:
-            state: Before the frame,
-            after: and with it.
-            result: On the host.
-            frame: The new one.
+            state: State before the frame.
+            after: State with the frame as the reference.
+            result: The search's result, on the host.
+            frame: The new frame.
             clock: When it was taken.
         """
         attempt = Attempt(after, result, result.status == AlignmentStatus.OK)

@@ -29,8 +29,8 @@ EDGE = 0.05
 REMEMBERED, MIN_REMEMBERED = 15, 8
 """Pairs of which the median tells, and the fewest that do."""
 MOST_LEFT = 0.7
-"""Of how depth changed, the part that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and 0.42
-with a body over 40 % of the image."""
+"""Largest part of the change of depth that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and
+0.42 with a body over 40 % of the image."""
 FLAT = 1e-4
 """Share of the nearest reading, in 1/m, by which readings differ at most that are one number."""
 LEAST_EXPLAINED = 0.95
@@ -46,9 +46,9 @@ class DepthChange(NamedTuple):
     delay: float
     """From its image to its depth, seconds."""
     velocity: tuple[float, ...] = ()
-    """Of the last motion that was found, a twist a second; empty before the first."""
+    """Velocity of the last motion that was found, a twist per second; empty before the first."""
     left: tuple[float, ...] = ()
-    """Of the last pairs, how much of what rest would leave unexplained the motion leaves."""
+    """Part of what rest would leave unexplained that the motion leaves, of each of the last pairs."""
 
     @property
     def usually_left(self) -> float:

@@ -40,7 +40,7 @@ class Step:
     """What the driver says of one new frame."""
 
     index: int
-    """Of the frame in the sequence; the first frame, 0, makes no step."""
+    """Index of the frame in the sequence; the first frame, 0, makes no step."""
     reference_timestamp: float
     """Colour stamp of the reference, the last frame that was not lost, seconds."""
     timestamp: float
@@ -58,7 +58,7 @@ class Step:
     segment: int = 0
     """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
     origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
-    """Of the pose: from the reference, from a keyframe of the map (then that is the pair's reference), or from nothing
+    """Where the pose comes from: the reference, a keyframe of the map (then that is the pair's reference), or nothing
     (a lost pair, or a motion that is taken to have gone on behind a body)."""
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
@@ -83,9 +83,9 @@ class Found(NamedTuple):
     alignment: Alignment
     """With a keyframe as the reference."""
     timestamp: float
-    """Of the keyframe, seconds."""
+    """Colour stamp of the keyframe, seconds."""
     world_T_camera: Float64[np.ndarray, "4 4"]
-    """Of the frame, in the world of the odometry's segment that the keyframe belongs to."""
+    """Pose of the frame, in the world of the odometry's segment that the keyframe belongs to."""
     segment: int
 
 
@@ -112,7 +112,7 @@ SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 
 
 Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
-"""Tells what moves in the frame of a step: `Step.moving`, or where the steps were read from files these."""
+"""Says which pixels move in a step's frame: `Step.moving`, or the masks of the run's folder."""
 
 
 def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:

@@ -30,9 +30,9 @@ class Leap(NamedTuple):
 
     target_T_reference: Float64[np.ndarray, "4 4"]
     seconds: float
-    """In which a camera would have made it."""
+    """Seconds in which a camera would have made it."""
     timestamp: float
-    """Of the frame it leads to."""
+    """Stamp of the frame that it leads to, seconds."""
 
 
 def align_leaping(
@@ -42,7 +42,7 @@ def align_leaping(
 
     Args:
         aligner: Who aligns.
-        state: Its own.
+        state: The aligner's state before the frame.
         frame: The new frame.
         clock: When it was taken.
         leap: What the frame before may have been.

@@ -39,7 +39,7 @@ def arrival_of(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) 
         aligner: Who aligned.
         state: What it knew before.
         clock: When the frame was taken.
-        attempt: Its own.
+        attempt: What it made of the frame.
     """
     seconds = float(clock.elapsed)
     expected = aligner.predict(state, seconds)

@@ -68,7 +68,7 @@ class Usual(NamedTuple):
     """How far the image moved, radians."""
     explained_depths: Float[Array, " n"]
     depth_scales: Float[Array, " n"]
-    """1/m."""
+    """Scales of the depth residuals, 1/m."""
 
     @classmethod
     def unknown(cls) -> "Usual":

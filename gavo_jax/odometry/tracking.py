@@ -71,11 +71,11 @@ class TrackerState(NamedTuple):
     velocity_change: VelocityChange
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
-    """Time that motion took."""
+    """Time that the last motion took, seconds."""
     share: Float[Array, ""]
-    """Of the image, whose points take part in the next search: less where those of bodies are left out."""
+    """Share of the image whose points take part in the next search: less where those of bodies are left out."""
     exposure: Exposure
-    """Of the previous frame; the keyframe's points are as if taken with it."""
+    """Exposure of the previous frame; the keyframe's points are as if taken with it."""
     usual: Usual
 
 
@@ -83,9 +83,9 @@ class Clock(NamedTuple):
     """When a new frame was taken, as numbers of the program."""
 
     elapsed: Any
-    """Since the reference's colour image, seconds."""
+    """Time since the reference's colour image, seconds."""
     depth_delay: Any
-    """From the new colour image to the new depth image, seconds."""
+    """Time from the new colour image to the new depth image, seconds."""
     index: Any
     """Index in the sequence; with the run's key it makes the frame's random numbers."""
 

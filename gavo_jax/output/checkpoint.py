@@ -32,9 +32,9 @@ class Mark(NamedTuple):
     """How far a growing file was."""
 
     size: int
-    """Bytes."""
+    """Length of the file, bytes."""
     sha256: str
-    """Of these bytes."""
+    """SHA-256 of these bytes."""
 
 
 class Checkpoint(NamedTuple):
@@ -43,7 +43,7 @@ class Checkpoint(NamedTuple):
     progress: Progress
     """After a usable frame, so that it has a tracker."""
     files: dict[str, Mark]
-    """By name, the files that grow with the run."""
+    """The files that grow with the run, by name."""
     images: str = ""
     """Digest of the images that were seen; see `SeenImages`."""
 
