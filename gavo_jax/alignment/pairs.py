@@ -202,8 +202,8 @@ def concluded(
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
-    """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
-    first `count` rows alone, where that is given.
+    """`align_batch` of images that are stacked already, from the guesses of `starts_of`, its results on the device; of
+    the first `count` rows alone, where that is given.
     """
     rows = len(guesses)
     count = rows if count is None else count

@@ -42,7 +42,7 @@ class Step:
     index: int
     """Index of the frame in the sequence; the first frame, 0, makes no step."""
     reference_timestamp: float
-    """Colour stamp of the reference, the last frame that was not lost, seconds."""
+    """Colour stamp of the frame that this one was aligned with, seconds."""
     timestamp: float
     alignment: Alignment
     """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded. Its status may be

@@ -41,7 +41,7 @@ class Checkpoint(NamedTuple):
     """Where a run stood."""
 
     progress: Progress
-    """After a usable frame, so that it has a tracker."""
+    """All that the driver knows; without a tracker where no usable frame was seen yet."""
     files: dict[str, Mark]
     """The files that grow with the run, by name."""
     images: str = ""

@@ -88,6 +88,14 @@ def test_names_in_docstrings_are_there() -> None:
     assert not wrong
 
 
+def test_names_on_the_page_of_the_method_are_there_and_whole() -> None:
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    names = {name.removeprefix("gavo_jax.") for name in DOTTED.findall(text) if not name.endswith(".py")}
+    ours = sorted(name for name in names if name.partition(".")[0] in MODULES)
+    tops = {path.stem for path in PACKAGE.iterdir()}
+    assert ours and not [name for name in ours if name.partition(".")[0] not in tops or not is_there(name)]
+
+
 def test_what_is_not_there_is_told() -> None:
     assert is_there("objective.losses.LOSSES") and is_there("alignment.points") and is_there("pyramid.halve_grey")
     assert not is_there("objective.LOSSES") and not is_there("camera.focal") and not is_there("solvers.base.Nobody")
