@@ -30,12 +30,12 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.files import open_pair
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error
-from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import Trajectory, inverse
 
 PLACES = 5
@@ -307,9 +307,9 @@ class Row(NamedTuple):
     false_alarms: float
     """Share of the other pairs."""
     wrong: int
-    """Pairs whose motion is wrong, wherever they are;"""
+    """Pairs whose motion is wrong, wherever they are."""
     silent: int
-    """of which so many are `ok`."""
+    """Pairs whose motion is wrong and whose status is `ok`."""
     drift: float
     """m/s, over the frames left alone; median over the seeds."""
     clean_drift: float
@@ -331,7 +331,7 @@ def is_wrong(step: Step, sequence: Damaged, truth: Trajectory) -> bool:
     if not valid.all():
         return False
     error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
-    length, angle = size(error)
+    length, angle = length_and_angle(error)
     return bool(length > WRONG[0] or np.degrees(angle) > WRONG[1])
 
 

@@ -34,7 +34,6 @@ from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error
 from gavo_jax.mapping.correction import correct
 from gavo_jax.mapping.mapper import Loops, Mapper
-from gavo_jax.mapping.motions import exp, size
 from gavo_jax.mapping.pose_graph import COUNTED, optimise
 from gavo_jax.mapping.verification import Edge
 from gavo_jax.odometry.driver import Odometry, Step
@@ -42,6 +41,7 @@ from gavo_jax.odometry.metrics import ABSOLUTE_ERROR, DRIFT, FRAMES_PER_SECOND, 
 from gavo_jax.odometry.run import run_odometry, trajectory_of
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import number
+from gavo_jax.rigid_motions import exp, length_and_angle
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -155,7 +155,7 @@ def measure_walks(settings: Settings, seeds: int) -> list[dict[str, Any]]:
         truth = sequence.ground_truth.world_T_camera
         end = inverse(truth[0]) @ truth[-1]
         assert run.odometry is not None
-        errors = [size(inverse(end) @ poses.world_T_camera[-1]) for poses in (run.odometry, run.trajectory)]
+        errors = [length_and_angle(inverse(end) @ poses.world_T_camera[-1]) for poses in (run.odometry, run.trajectory)]
         rows.append({"seed": seed, "before": errors[0], "after": errors[1]})
     return rows
 
@@ -246,7 +246,9 @@ def try_covered(
             assert truth is not None
             stamps = np.array([step.reference_timestamp, float(other.timestamps[int(first) + after])])
             poses, _ = truth.interpolate(stamps)
-            error = size(inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference))
+            error = length_and_angle(
+                inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
+            )
             rows[-1] |= {"after": after + 1, "error_m": error[0], "error_rad": error[1], "seconds": seconds}
             rows[-1]["origin"] = step.origin
     false = 0

@@ -44,19 +44,20 @@ from gavo_jax.datasets.moving import body_of_part
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
-from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
 WRONG = (0.02, 1.5)
-"""Metres and degrees: a pair whose motion is further from the truth is wrong,"""
+"""Metres and degrees: a pair whose motion is further from the truth is wrong."""
 EXACT = (0.008, 0.6)
-"""and one that is nearer than this is exact: a body that moves by 30 cm/s takes the camera along by 10 mm a frame."""
+"""Metres and degrees: a pair whose motion is nearer is exact. A body at 30 cm/s takes the camera along by
+10 mm a frame."""
 LEAST_SHARE = 0.01
 """Of the image: less of a body than this need not be found."""
 TOLD, ABOUT = "told", 4
@@ -199,7 +200,7 @@ def pair_error(step: Step, poses: dict[float, np.ndarray], truth: Trajectory) ->
     if not valid.all() or step.reference_timestamp not in poses:
         return 0.0, 0.0
     error = inverse(inverse(true[0]) @ true[1]) @ inverse(poses[step.reference_timestamp]) @ step.world_T_camera
-    length, angle = size(error)
+    length, angle = length_and_angle(error)
     return float(length), float(np.degrees(angle))
 
 
@@ -351,9 +352,9 @@ class Summary(NamedTuple):
     precision: float | None
     """Share of the flagged pairs that are wrong."""
     false_alarms: float | None
-    """Share of the right pairs that are flagged,"""
+    """Share of the right pairs that are flagged."""
     exact_flagged: float | None
-    """and of the exact ones."""
+    """Share of the exact pairs that are flagged."""
     runs: int
 
 

@@ -183,9 +183,9 @@ class Case(NamedTuple):
     status: str
     undetermined: str
     translation: float
-    """Error, metres;"""
+    """Error of the translation, metres."""
     rotation: float
-    """radians."""
+    """Error of the rotation, radians."""
     fine: bool
 
 

@@ -104,7 +104,7 @@ class Camera:
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=self.width >> k, height=self.height >> k)
 
     def scaled(self, scale: Any) -> tuple[Any, Any, Any, Any]:
-        """fx, fy, cx, cy of an image `scale` times as large, or of several; see `level`."""
+        """Intrinsics fx, fy, cx, cy of an image `scale` times as large, or of several; see `level`."""
         return (
             self.fx * scale,
             self.fy * scale,

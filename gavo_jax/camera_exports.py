@@ -18,7 +18,7 @@ GRID = 25
 """Points along either side of the image to which OpenCV's model is fitted."""
 
 SDK_MODELS = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
-"""Of RealSense's SDK, in the order of its numbers for them."""
+"""Lens models of RealSense's SDK, in the order of its numbers for them."""
 
 
 def _brown(x: np.ndarray, y: np.ndarray, k: np.ndarray, scaled: bool = False) -> Rays:
@@ -95,7 +95,7 @@ LIKE = 0.01
 """By how much of the focal length the cameras of single frames may differ; a phone's autofocus moves it by less."""
 
 FOCUS_KEYS = ("fx", "fl_x", "fy", "fl_y", "cx", "cy")
-"""Of a camera, what its focus moves; a focal length first."""
+"""Keys of a camera that its focus changes; a focal length first."""
 
 
 def common_camera(place: str, cameras: list[Table]) -> Table:
@@ -130,7 +130,7 @@ def common_camera(place: str, cameras: list[Table]) -> Table:
 
 
 NERF_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
-"""Of a camera in NeRF's transforms, where each frame has its own."""
+"""Keys of a camera in NeRF's transforms, where each frame has its own."""
 
 
 def is_nerfstudio(values: Table) -> bool:

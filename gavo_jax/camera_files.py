@@ -14,7 +14,7 @@ from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, mo
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
-"""Of a file; one of JSON may hold the pose of every frame, too."""
+"""Largest camera file, bytes; one of JSON may hold the pose of every frame, too."""
 
 LONGEST_LENS = 20
 """Focal length over the image's side: a view of 3 degrees. More is a unit mistaken, or a digit too many."""
@@ -27,7 +27,7 @@ OFF_CENTRE, LIKE = 0.25, 0.1
 the numbers are of an image of another size."""
 
 MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
-"""Of OpenCV's coefficients; what is larger was meant as something else."""
+"""Largest of OpenCV's coefficients; what is larger was meant as something else."""
 
 DEPTH_SCALE = 5000.0
 """Where nobody says it: that of the TUM benchmark."""

@@ -18,7 +18,7 @@ from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, besid
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 PROJECTION = "projection_matrix"
-"""Of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
+"""Key of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
 
 NESTED = ("camera", "cam", "camera_params", "cam_params")
 """Tables in which Replica, NICE-SLAM, SplaTAM and others keep a camera."""
@@ -97,7 +97,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
 
 
 def of_matrix(place: str, numbers: list[Any]) -> Table:
-    """fx, fy, cx and cy of a 3×3 matrix, row by row or, as Open3D and MATLAB have it, column by column.
+    """Intrinsics fx, fy, cx and cy of a 3×3 matrix, row by row or, as Open3D and MATLAB have it, column by column.
 
     Args:
         place: names the file in messages.
@@ -388,4 +388,4 @@ PARSERS: dict[str, Callable[[Path, str], Table]] = {
     ".csv": _parse_numbers,
     ".pincam": _parse_numbers,
 }
-"""By a file's ending."""
+"""Parser of a camera file, by the file's ending."""

@@ -17,41 +17,41 @@ Table = dict[str, Any]
 FOCAL = ("fx", "fy", "cx", "cy")
 REQUIRED = (*FOCAL, "width", "height")
 CAMERA_KEYS = (*REQUIRED, "distortion", "model", "depth_scale", "readout")
-"""Keys of a camera in our own files, the first ones in every one;"""
+"""Keys of a camera in our own files; `REQUIRED` ones are in every file."""
 DEVICE_KEYS = ("depth_delay",)
-"""and beside the cameras of a device."""
+"""Keys of our own files that stand beside the cameras of a device."""
 
 MATRIX = ("cameramatrix", "k", "m1")
-"""Of fx, fy, cx and cy."""
+"""Names of a camera matrix: fx, fy, cx and cy."""
 
 LENS = (
     *("distortion", "distortioncoefficients", "distortioncoeffs", "distortioncoeff", "distortionparameters"),
     *("distcoeffs", "distcoeff", "distcoefs", "distcoefficients", "dist", "coeffs", "d", "d1"),
 )
-"""Of a list of coefficients, or a table of them by name."""
+"""Names of a list of distortion coefficients, or of a table of them by name."""
 
 LENS_MODEL = ("distortionmodel", "distortiontype", "modeltype")
-"""Of a lens model, whatever it is;"""
+"""Names of a lens model, whatever it is."""
 ANY_MODEL = ("model", "cameramodel")
-"""of one, or of the device's make."""
+"""Names of a lens model, or of the device's make."""
 
 IS_FISHEYE = ("fisheye", "fisheyemodel", "isfisheye")
-"""Of a flag."""
+"""Names of a flag that says whether the lens is a fisheye."""
 
 UNIT = ("depthscale", "depthfactor", "pngdepthscale", "depthmapfactor")
-"""Of raw depth units per metre, or metres per unit."""
+"""Names of raw depth units per metre, or of metres per unit."""
 
 WIDTH, HEIGHT, SIZE = ("width", "imagewidth", "w"), ("height", "imageheight", "h"), ("imagesize", "resolution")
-"""Of the image's sides, pixels, and of both."""
+"""Names of the image's width, of its height and of both, pixels."""
 
 KEPT = ("readout", "depth_delay")
-"""As in our own files."""
+"""Keys that are taken as in our own files."""
 
 LEAST_UNITS = 0.05
-"""Per metre: fewer are metres per unit."""
+"""Raw depth units per metre; a smaller number is metres per unit."""
 
 ORDER = {"pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
-"""Of OpenCV's coefficients, by model."""
+"""Order of OpenCV's distortion coefficients, by model."""
 
 LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor)")
 

@@ -23,7 +23,7 @@ to the image (20 of 640 in 7-Scenes are 5)."""
 JUMP = 0.08
 """1/m between neighbours of these pixels, from which on depth jumps."""
 FEWEST_JUMPS = 0.003
-"""Of all pixels; a frame with fewer says nothing."""
+"""Fewest jumps, as a share of all pixels, for a frame to tell anything."""
 CONTRAST = 21
 """Pixels across the surroundings that an edge of the image is set against."""
 ZOOMS = (1.5, 1.3, 0.77, 0.67)
@@ -32,9 +32,9 @@ that is not registered (1.11 in 7-Scenes) lies nearer to 1."""
 FAULTS = ("shifted", "mirrored", "upside down", "turned by half", *("of another angle of view" for _ in ZOOMS))
 """What depth is that would lie better elsewhere, or each other way."""
 EVERY, SELDOM, EARLY = 3, 30, 24
-"""Of the references every so many are looked at, and fewer of those that come after the first so many."""
+"""One in `EVERY` references is looked at among the first `EARLY`, one in `SELDOM` after them."""
 KEPT = 0.95
-"""Of what the ones before said, at each."""
+"""Factor at each reference on what the ones before said."""
 MIN_SEEN = 5
 """Frames that have to be seen before anything is said."""
 BETTER, CLEAR = 2.0, 5.0

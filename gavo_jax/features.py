@@ -18,7 +18,7 @@ from gavo_jax.image.numbers import grey_bytes
 FeatureKind = Literal["sift", "orb"]
 
 KEYPOINTS = 2000
-"""Of one image at most."""
+"""Most keypoints of one image."""
 CONTRAST = 0.01
 """SIFT's threshold (OpenCV's default: 0.04, at which a blurred image has a few hundred keypoints)."""
 RATIO = 0.8
@@ -51,9 +51,9 @@ class FeatureMotion(NamedTuple):
     target_T_reference: Float64[np.ndarray, "4 4"]
     """Maps points of the reference camera into the target camera, metres."""
     inliers: int
-    """Matches that agree,"""
+    """Number of matches that agree with the motion."""
     share: float
-    """and their share of all matches with a reading in the reference."""
+    """Share of the matches with a reading in the reference that agree."""
 
 
 @cache

@@ -44,11 +44,11 @@ class History(NamedTuple):
     timestamp: float | None = None
     """Latest stamp, seconds."""
     checksum: int | None = None
-    """Of the last readable image."""
+    """Checksum of the last readable image."""
     thumbnail: tuple[int, ...] = ()
-    """Some of its pixels."""
+    """Some pixels of that image."""
     depth_checksum: int | None = None
-    """Of the last depth image, and the stamp that came with it."""
+    """Checksum of the last depth image; `depth_timestamp` is the stamp that came with it."""
     depth_timestamp: float | None = None
     intervals: tuple[float, ...] = ()
     """Between the last frames, seconds."""
@@ -84,18 +84,18 @@ MAX_CLIPPED = 0.75
 MAX_CLIPPED_JUMP = 0.3
 """The same, above the usual share: twice what the TUM clips show within half a second (a lamp, a window)."""
 MIN_CORRELATION = 0.7
-"""Of neighbouring pixels; below it an image is noise. Scenes have 0.93 and more at 160 pixels across, noise has 0, and
-up to a half where undistortion interpolated it."""
+"""Correlation of neighbouring pixels below which an image is noise. Scenes have 0.93 and more at 160 pixels across,
+noise has 0, and up to a half where undistortion interpolated it."""
 MIN_COVERAGE_RATIO = 0.7
 """Depth readings, against their usual number, below which depth is partial; the TUM clips stay above 0.92."""
 RANGE_QUANTILES = (25.0, 50.0, 75.0)
 """Per cent of the readings. Other units change all of them by one factor; a near body changes the lower ones alone.
 Higher ones would often be at the end of what the image's numbers can hold."""
 MAX_RANGE_RATIO = 2.5
-"""Depth that grows or shrinks by more than this from a frame to the next, at all those quantiles, is in other units;
-handheld motion stays within 1.4 a frame. The limit's logarithm grows with the time between,"""
+"""Factor by which depth at all those quantiles grows or shrinks from a frame to the next, above which it is in other
+units; handheld motion stays within 1.4 a frame."""
 RANGE_AGE = 0.1
-"""in seconds, beyond this."""
+"""Seconds between two frames beyond which that limit's logarithm grows with the time."""
 MAX_DUPLICATE_DIFFERENCE = 2
 """Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
 MIN_FROZEN_PART = 0.2
@@ -112,12 +112,12 @@ MIN_FAR = 0.8
 MAX_INTERVAL_RATIO = 2.5
 """An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
 MAX_USUAL_INTERVAL = 1.5
-"""Of usual ones: a longer interval may be that of two frames."""
+"""Interval, over the usual one, above which it may be that of two frames."""
 MIN_INTERVALS = 3
 """Intervals that have to be known before one can be unusual."""
 ROW_STEP = 4
 DEPTH_STEP = 7
-"""Of so many pixels of a depth image, row after row, one is looked at: some of every row and, as few widths are
+"""Pixels of a depth image, row after row, of which one is looked at: some of every row and, as few widths are
 multiples of this, of every column. Every fourth row may be one of those that a spinning sensor leaves out."""
 
 

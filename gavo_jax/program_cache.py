@@ -60,7 +60,7 @@ class Kind(NamedTuple):
 
     shape: tuple[int, ...]
     type: Any
-    """Of numbers: NumPy's or JAX's, or a Python number's own."""
+    """Type of the numbers: NumPy's or JAX's, or a Python number's own."""
     weak: bool
     """Whether the type gives way to others', as a Python number's does."""
 

@@ -40,8 +40,8 @@ class AlignmentOptions:
             (static); None takes every pixel.
         estimation_points: Largest number of points per view from which brightness, scales and curvature are estimated
             before a level is searched (static); None takes all.
-        views: Largest number of reference frames that are scored together, an entry per level (static); the first ones
-            are.
+        views: Largest number of reference frames whose points are scored together, an entry per level (static); of a
+            run's two, 1 takes the previous frame alone.
         islands: Independent populations, an entry per level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry per
             level.
@@ -53,7 +53,7 @@ class AlignmentOptions:
             and curvature are known of one direction alone.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
-            None, and on the levels that refine one motion: the paper's error.
+            Where it is None, and on levels that refine a single motion, such a point does not count: the paper's error.
         bounds: Half-widths of the search box about the guess, metres and radians, at the coarsest level.
         bounds_factor: Factor on the half-widths from a level to the next finer one.
         scouts: Motions drawn about the guess and scored before the coarsest level's search (static); its islands

@@ -28,9 +28,9 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
     name: getattr(optax, name)
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 }
-"""optax's optimisers that need nothing but a learning rate."""
+"""Optimisers of optax that need nothing but a learning rate, by name."""
 CONFIG_KEYS = ("options", "sequence", *ROOMS, "device", "versions")
-"""Of a run's config.json."""
+"""Keys of a run's config.json."""
 MAX_FILE_BYTES = 2**20
 
 
@@ -38,9 +38,9 @@ class NamedSettings(NamedTuple):
     """Settings with the names of what they started from."""
 
     method: str
-    """Of the solver."""
+    """Name of the method that the solver is of."""
     preset: str
-    """Of the settings."""
+    """Name of the preset."""
     settings: Settings
     """With what the file changes."""
 
@@ -79,8 +79,8 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     Args:
         path: The file, TOML.
         settings: With a solver, a loss and an optimiser of this package: others have no name to be read by.
-        method: What reading starts from; by default what the solver tells.
-        preset: Likewise.
+        method: The method that reading starts from; by default the one that the solver is of.
+        preset: The preset that reading starts from.
 
     Raises:
         GavoError: It cannot be written, or holds somebody else's code.

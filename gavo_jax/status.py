@@ -76,7 +76,7 @@ GRAVITY = (
     AlignmentStatus.NO_DEPTH,
     AlignmentStatus.NOT_RIGID,
 )
-"""What can be found of a motion, the gravest last: of several findings that one is the status."""
+"""What can be found of a motion, the gravest last: of several that a search finds, that one is the status."""
 
 
 def bit(status: AlignmentStatus) -> int:

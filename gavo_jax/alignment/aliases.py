@@ -17,7 +17,8 @@ SHIFT_POINTS = 480
 """Points that a shift's evidence is taken on."""
 LEAST_LIKENESS = 0.6
 """Evidence, over that of no shift, from which on a frame looks like itself when it is shifted."""
-LARGEST_ALIASES = 4
+MOST_ALIASES = 4
+"""Shifts after which a frame looks like itself that are kept, the likest ones."""
 PEAK = 5
 """Pixels across within which a shift must be the likeliest; nearer to no shift than half of that is none."""
 
@@ -41,5 +42,5 @@ def self_motions(objective: Objective, own: Target) -> Float[Array, "k 4 4"]:
     around = jax.lax.reduce_window(likeness, -jnp.inf, jax.lax.max, (PEAK, PEAK), (1, 1), "SAME")
     is_alias = (likeness == around) & (likeness > LEAST_LIKENESS * jnp.max(likeness))
     is_alias &= jnp.maximum(jnp.abs(across), jnp.abs(down)) > PEAK // 2
-    values, chosen = jax.lax.top_k(jnp.where(is_alias, likeness, -jnp.inf).ravel(), LARGEST_ALIASES)
+    values, chosen = jax.lax.top_k(jnp.where(is_alias, likeness, -jnp.inf).ravel(), MOST_ALIASES)
     return jnp.where(jnp.isfinite(values)[:, None, None], motions[chosen], jnp.nan)

@@ -15,15 +15,15 @@ from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.image.settling import filled_inverse_depth
 
 MOST = 500
-"""Corners, the strongest ones,"""
+"""Most corners of a frame; the strongest ones count."""
 QUALITY = 0.005
-"""down to this share of the strongest one's response,"""
+"""Smallest response of a corner, as a share of the strongest one's."""
 LEAST_SLOPE = 2.0
 """Grey levels a pixel that a corner must have in every direction; noise has about one."""
 RESPONSE = 64.0 * 9.0 / (12.0 * 255.0) ** 2
 """OpenCV's response to one grey level a pixel in every direction: sums of its Sobel filter over 3 x 3 pixels."""
 SPACING = 1 / 80
-"""no two nearer than this share of the image's width."""
+"""Smallest distance of two corners, as a share of the image's width."""
 WINDOW = 1 / 30
 """What is compared about a corner, as a share of the width."""
 RETURN = 0.5
@@ -36,9 +36,9 @@ class Matches(NamedTuple):
     """The same corners in two frames."""
 
     reference: Float64[np.ndarray, "n 2"]
-    """Column and row,"""
+    """Columns and rows of the corners in the reference."""
     target: Float64[np.ndarray, "n 2"]
-    """and where they are in the other frame."""
+    """Columns and rows of the same corners in the target."""
 
 
 def track_corners(

@@ -33,9 +33,9 @@ HIDDEN = 3.0
 
 
 STEP = (0.05, 0.05)
-"""Metres and radians: a motion this far off must explain the frames worse,"""
+"""Metres and radians: how far a motion is moved aside to ask whether the evidence holds it."""
 LEAST_FALL = 0.03
-"""by this share of the evidence."""
+"""Share of the evidence that has to be lost by a step of `STEP` for the evidence to hold the motion."""
 
 
 class Evidence(NamedTuple):
@@ -51,9 +51,9 @@ class Held(NamedTuple):
     """What the evidence says of six directions."""
 
     held: Bool[Array, " 6"]
-    """Whether it falls both ways"""
+    """Whether the evidence falls on both sides of the motion, by each direction."""
     steps: Float[Array, "6 6"]
-    """within these, as columns."""
+    """The steps that were asked about, as columns, metres and radians."""
 
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:

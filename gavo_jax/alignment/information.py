@@ -35,9 +35,9 @@ class Information(NamedTuple):
     """Six directions δ of a step on the reference's side, at right angles in the flow that they cause."""
 
     directions: Float[Array, "6 6"]
-    """As columns; metres and radians."""
+    """The directions as columns; metres and radians."""
     curvature: Float[Array, " 6"]
-    """Of E along them, as far as both frames confirm it."""
+    """Curvature of E along the directions, as far as both frames confirm it."""
     determined: Bool[Array, " 6"]
     """Whether that is more than noise and interpolation would give."""
 

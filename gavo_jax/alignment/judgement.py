@@ -32,10 +32,10 @@ MIN_EXPLAINED_GREY = 0.45
 """Share of the grey residuals that must not be large (`objective.estimates.explained_share`); below, a pair is
 `HIGH_ERROR`."""
 MIN_EXPLAINED_DEPTH = 0.9
-"""The same of the depth residuals, for a motion of which the images leave a standard deviation above"""
+"""Share of the depth residuals that must not be large, for a motion that is less certain than `DOUBTFUL_DEVIATION`."""
 DOUBTFUL_DEVIATION = 0.005
-"""metres or radians. A well-determined motion may move much of the depth (surfaces come into view, others are hidden);
-where it is not, depth that disagrees says that it is wrong."""
+"""Metres or radians: standard deviation of a motion above which depth that disagrees says that it is wrong. A
+well-determined motion may move much of the depth: surfaces come into view, others are hidden."""
 MIN_EVIDENCE, MIN_SEEN_EVIDENCE = 0.7, 1.8
 """Evidence, of all readings and of those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
 MAX_RIVAL = 1.1

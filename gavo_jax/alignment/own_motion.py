@@ -45,7 +45,7 @@ class OwnMotion(NamedTuple):
     target_T_reference: Float64[np.ndarray, "4 4"]
     """The motion between the two frames' moments, that of the middle row."""
     covariance: Float64[np.ndarray, "6 6"]
-    """Of δ in target_T_reference · exp(δ), metres and radians."""
+    """Covariance of δ in target_T_reference · exp(δ), metres and radians."""
     twists: Float64[np.ndarray, "2 6"]
     """Motion of the points in the reference camera and in the target camera, (v, w) in m/s and rad/s. What both have in
     common hardly shows."""

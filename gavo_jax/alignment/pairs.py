@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
+from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_pair
@@ -168,9 +168,9 @@ def with_repetitions(
     for k in np.flatnonzero((status == AlignmentStatus.OK) | (status == AlignmentStatus.LOW_TEXTURE)):
         motion, images = np.asarray(result.target_T_reference[k]), (greys[k], depths[k], camera)
         if guesses is None:
-            is_open = may_be_any_period(motion, result.error[k], np.inf, *images)
+            is_open = another_period_is_in_reach(motion, result.error[k], np.inf, *images)
         else:
-            is_open = may_be_another_period(motion, result.error[k], guesses[k], *images)
+            is_open = another_period_fits_expected(motion, result.error[k], guesses[k], *images)
         if is_open:
             status[k] = status[k] or AlignmentStatus.AMBIGUOUS
             findings[k] |= bit(AlignmentStatus.AMBIGUOUS)
@@ -188,10 +188,10 @@ def concluded(
     """A batch's results on the host, with all that is looked at there.
 
     Args:
-        result: Of `align_rows`.
+        result: The result of `align_rows`.
         frames: References and targets as they were given, whose stamps tell the delays of depth.
-        sides: The same, of `stacked_images`.
-        camera: Theirs.
+        sides: The same images as `stacked_images` gives them.
+        camera: Camera of both frames.
         settings: What searched.
         expected: Motions to start from, where any were given.
     """
@@ -202,8 +202,8 @@ def concluded(
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
-    """`align_batch` of images that are stacked already and guesses `with_features`, its results on the device; of the
-    first `count` rows alone, where that is given.
+    """`align_batch` of images that are stacked already, from the guesses of `starts_of`, its results on the device; of
+    the first `count` rows alone, where that is given.
     """
     rows = len(guesses)
     count = rows if count is None else count

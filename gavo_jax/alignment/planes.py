@@ -20,7 +20,7 @@ NEAR = (0.01, 0.02)
 MIDDLE = (2.0, 98.0)
 """Percentiles, along either side, of the part of a plane that a view from straight before it holds."""
 EVERY = 7
-"""Of so many pixels one is asked where the plane lies."""
+"""Pixels of which one is asked where the plane lies."""
 LEAST, NARROW = 16, 8
 """Pixels that are asked, and that the view has along either side, at least."""
 
@@ -29,9 +29,9 @@ class Plane(NamedTuple):
     """A plane before a camera: the points X with normal · X = distance."""
 
     normal: Float64[np.ndarray, " 3"]
-    """Of length 1, away from the camera."""
+    """Unit normal, away from the camera."""
     distance: float
-    """Metres, above 0."""
+    """Distance from the camera, metres, above 0."""
 
     @property
     def foot(self) -> Float64[np.ndarray, " 3"]:
@@ -46,7 +46,7 @@ class Small(NamedTuple):
     inverse_depth: Float[np.ndarray, "h w"]
     """1/m; 0 where nothing was read."""
     camera: Camera
-    """Of the smaller images."""
+    """Camera of the smaller images."""
 
     @property
     def slopes(self) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:

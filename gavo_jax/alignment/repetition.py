@@ -18,7 +18,7 @@ from gavo_jax.trajectory import inverse
 REPEATS = 0.6
 """Correlation of an image with itself, shifted, from which on it may repeat itself. Rooms reach 0.4."""
 APART = 0.3
-"""By how much less it has to be on the way there: a smooth image is like itself everywhere."""
+"""How much lower that correlation has to be on the way to the shift: a smooth image is like itself everywhere."""
 FARTHEST = 3
 """The largest shift that is looked at is the view's size over this."""
 OVERLAP = 0.3
@@ -161,7 +161,7 @@ MOST = 8
 """Repetitions of each plane that are compared, the nearest."""
 
 
-def may_be_another_period(
+def another_period_fits_expected(
     found: Float64[np.ndarray, "4 4"],
     error: Any,
     expected: Float64[np.ndarray, "4 4"],
@@ -175,9 +175,9 @@ def may_be_another_period(
         found: target_T_reference.
         error: Its E, squared grey levels.
         expected: The same motion, by what was known before.
-        grey: Of either frame, [H, W].
-        depth: Of the same, in units of the camera's.
-        camera: Of both.
+        grey: Grey of either frame, [H, W].
+        depth: Depth of the same frame, in units of the camera's.
+        camera: Camera of both frames.
     """
     apart = found @ inverse(expected)
     if _pixels(apart, depth, camera) < LEAST_SHIFT:
@@ -190,18 +190,19 @@ def may_be_another_period(
     return _is_any_as_good(near, error, grey, depth, camera)
 
 
-def may_be_any_period(
+def another_period_is_in_reach(
     found: Float64[np.ndarray, "4 4"], error: Any, seconds: float, grey: Any, depth: Any, camera: Camera
 ) -> bool:
-    """The same, where nothing was known before: whether another repetition is a motion that a hand makes in that time.
+    """Whether a motion of which nothing was known before may be off by a period of a pattern: another repetition is a
+    motion that a hand makes in that time.
 
     Args:
         found: target_T_reference.
-        error: As above.
-        seconds: That it took; infinite where that is not known.
-        grey: As above.
-        depth: As above.
-        camera: As above.
+        error: Its E, squared grey levels.
+        seconds: Time that the motion took; infinite where that is not known.
+        grey: Grey of either frame, [H, W].
+        depth: Depth of the same frame, in units of the camera's.
+        camera: Camera of both frames.
     """
     reach = seconds * (FAST[0] + FAST[1] * _distance(depth, camera))
     near = [
@@ -223,13 +224,13 @@ def _distance(depth: Any, camera: Camera) -> float:
 
 
 def _pixels(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camera) -> float:
-    """By how many a motion moves the middle of an image, about."""
+    """Pixels by which a motion moves the middle of an image, about."""
     ahead = _ahead(depth, camera)
     return float(np.linalg.norm(_step_of(motion, ahead))) * float(camera.fx) / ahead.distance
 
 
 def _step_of(motion: Float64[np.ndarray, "4 4"], plane: Plane) -> Float64[np.ndarray, " 3"]:
-    """By how many metres, along it, a motion moves the point of a plane that is straight ahead, or where none is its
+    """Metres along a plane by which a motion moves the point of it that is straight ahead, or where none is its
     foot.
     """
     cosine = plane.normal[2]

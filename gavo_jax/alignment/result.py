@@ -30,7 +30,8 @@ class Alignment(NamedTuple):
     """Covariance of δ in target_T_reference · exp(δ), δ = (v, w) in metres and radians; not-a-number where nothing is
     known."""
     status: Any
-    """`AlignmentStatus`: the gravest of what was found."""
+    """`AlignmentStatus`: the gravest of what the search found, plausibility among the run's pairs included. What is
+    found later, of the frame or of the run, is the status only where nothing was found before."""
     history: Float[Array, " iterations"]
     """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
     findings: Any = 0
@@ -45,7 +46,7 @@ class Alignment(NamedTuple):
 
     @property
     def statuses(self) -> tuple[AlignmentStatus, ...]:
-        """Every status that holds, the one that counts first; `OK` alone where nothing speaks against the motion."""
+        """Every status that holds, `status` first; `OK` alone where nothing speaks against the motion."""
         others = (other for other in AlignmentStatus if int(self.findings) & bit(other) and other != self.status)
         return (self.status, *others)
 

@@ -43,7 +43,7 @@ LARGEST_RISE = 0.003
 """Share by which E may rise; beyond, there is no sway and the motion stays."""
 
 
-class Unrest(NamedTuple):
+class VelocityChange(NamedTuple):
     """How a run's velocity changes from frame to frame."""
 
     summed: Float[Array, " 6"]
@@ -52,16 +52,16 @@ class Unrest(NamedTuple):
     """Mean square of the mean velocity's change from pair to pair, of one axis: (m/s)² and (rad/s)²."""
 
     @classmethod
-    def unknown(cls) -> "Unrest":
+    def unknown(cls) -> "VelocityChange":
         """Before the first pair."""
         still: Any = np.zeros(6, np.float32)
         changes: Any = np.square(np.asarray(FIRST_CHANGES, np.float32))
         return cls(still, changes)
 
-    def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "Unrest":
+    def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "VelocityChange":
         """With one more pair: its sway and its mean velocity's change, m/s and rad/s."""
         squares = jnp.mean(jnp.square(change.reshape(2, 3)), axis=1)
-        return Unrest(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
+        return VelocityChange(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
 
     @property
     def deviation(self) -> Float[Array, " 6"]:
@@ -75,7 +75,8 @@ class Swaying(NamedTuple):
 
     elapsed: Float[Array, ""]
     """Seconds since the last frame."""
-    unrest: Unrest
+    velocity_change: VelocityChange
+    """How the run's velocity has changed so far."""
 
 
 class Swayed(NamedTuple):
@@ -83,8 +84,8 @@ class Swayed(NamedTuple):
 
     motion: Float[Array, "4 4"]
     twist: Float[Array, " 6"]
-    """Of the points in the target camera at its moment, less the mean since the last frame; metres and radians over the
-    time between the two."""
+    """Velocity of the points in the target camera at its moment less the mean since the last frame, as a twist: metres
+    and radians over the time between the two."""
     covariance: Float[Array, "6 6"]
     """What not knowing the sway adds to that of δ in motion · exp(δ)."""
     residuals: Residuals
@@ -95,8 +96,8 @@ def unswayed(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
     return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
 
 
-class At(NamedTuple):
-    """How far the refinement has come."""
+class Iterate(NamedTuple):
+    """Where the refinement stands after some of its steps."""
 
     motion: Float[Array, "4 4"]
     x: Float[Array, " 12"]
@@ -114,25 +115,25 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying, poi
     """
     readout = problem.objective.readout
     assert readout is not None, "only a rolling shutter shows a sway"
-    known = (swaying.elapsed * swaying.unrest.deviation) ** -2.0
+    known = (swaying.elapsed * swaying.velocity_change.deviation) ** -2.0
     prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # of the sway, and of the sum
     share = problem.objective.readings() / points
     factor = share**2 / (problem.objective.scales.grey**2 * DEPENDENT)
 
-    def step_on(_: int, at: At) -> At:
-        objective = problem.with_sway(at.x[6:]).objective
-        late = (readout * row_time(at.residuals.warped.v, objective.plane)).reshape(-1)
-        gradient, hessian = prior * at.x, jnp.diag(prior)
-        gradient = gradient.at[6:].add(known * swaying.elapsed * swaying.unrest.summed)
-        for jacobian, residual, weight in weighted_terms(objective, objective.reference, at.residuals):
+    def step_on(_: int, now: Iterate) -> Iterate:
+        objective = problem.with_sway(now.x[6:]).objective
+        late = (readout * row_time(now.residuals.warped.v, objective.plane)).reshape(-1)
+        gradient, hessian = prior * now.x, jnp.diag(prior)
+        gradient = gradient.at[6:].add(known * swaying.elapsed * swaying.velocity_change.summed)
+        for jacobian, residual, weight in weighted_terms(objective, objective.reference, now.residuals):
             both = jnp.concatenate([jacobian, late * jacobian])
             gradient += factor * both @ (weight * residual)
             hessian += factor * (both * weight) @ both.T
         step = -jnp.linalg.solve(hessian, gradient)
-        motion, x = exp(step[:6]) @ at.motion, at.x + step
-        return At(motion, x, problem.with_sway(x[6:]).objective.residuals(motion), hessian)
+        motion, x = exp(step[:6]) @ now.motion, now.x + step
+        return Iterate(motion, x, problem.with_sway(x[6:]).objective.residuals(motion), hessian)
 
-    start = At(problem.origin, jnp.zeros(12), residuals, jnp.diag(prior))
+    start = Iterate(problem.origin, jnp.zeros(12), residuals, jnp.diag(prior))
     # a loop, as steps written out one by one take XLA a second longer
     motion, x, r, hessian = jax.lax.fori_loop(0, ROUNDS, step_on, start)
     objective = problem.with_sway(x[6:]).objective

@@ -54,7 +54,7 @@ class Level(NamedTuple):
     """What changes from level to level; with a leading axis L the input of the scan over the levels."""
 
     number: Integer[Array, ""]
-    """In the pyramid; 0 is the full image."""
+    """Number of the pyramid's level; 0 is the full image."""
     is_first: Bool[Array, ""]
     plane: ImagePlane
     reference: Reference
@@ -62,17 +62,17 @@ class Level(NamedTuple):
     points: Integer[Array, ""]
     """Points a view on this level; places from there on are empty."""
     columns: Integer[Array, ""]
-    """Points a row."""
+    """Points of a view in one row."""
     views: Integer[Array, ""]
     """Views that count; the points of the others have lost their readings."""
     islands: Integer[Array, ""]
-    """Independent populations."""
+    """Number of independent populations."""
     depth_weight: Float[Array, ""]
-    """Of the depth cost."""
+    """Weight of the depth cost."""
     exchanged: Reference | None = None
     """[1, N]: the target's points, where the error is symmetric."""
     readout: Float[Array, ""] | None = None
-    """Of a rolling shutter; see `Objective`."""
+    """Share of the motion that passes during a rolling shutter's readout; see `Objective`."""
 
     @property
     def is_undecided(self) -> Bool[Array, ""]:

@@ -18,15 +18,15 @@ from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.evidence import inverse_depth_of
-from gavo_jax.bodies.identity import LEAST, Roll, parts
+from gavo_jax.bodies.identity import LEAST, Roll, body_components
 from gavo_jax.bodies.motions import find_motions
-from gavo_jax.bodies.scene import AwareState, Look, Retina
+from gavo_jax.bodies.scene import AwareState, FrameView, Retina
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 
@@ -35,11 +35,11 @@ DOUBTFUL = 0.1
 MAJORITY = 0.5
 """Support from which on a motion is taken for the camera's although its points agree badly."""
 ROUNDS = 3
-"""Of searching without what moves by the last round's motion, at most."""
+"""Most rounds of searching without what moves by the last round's motion."""
 RELUCTANT = 2.0
-"""Ratio of dissents from which on the area asks for another motion,"""
+"""Dissent from a motion, over that from the one which the area asks for, from which on another one is searched for."""
 BETTER = 1.2
-"""and from which on one that was found is taken."""
+"""Dissent from a motion, over that from the one found instead, from which on the new one is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
 """Dissents from which on a motion may be a body's, without bodies in view and with some. Where only noise is left the
 middle block gains 5.3, the median of chi-squared with six degrees of freedom; real clips have about 9 in the middle
@@ -48,35 +48,35 @@ pair and 17 in the worst.
 GAIN = 0.01
 """Support that a round has to add for another one to follow."""
 LARGE = 0.25
-"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found,"""
+"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found."""
 MAX_CARRIED = 0.5
-"""for so many seconds."""
+"""Seconds for which the last motion may stand for one that cannot be found."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
 SUSPICIOUS = 0.02
 """Share of the image with bodies, away from where some were, from which on other motions are asked."""
 SUSPECTED = 0.3
-"""Suspicion from which on a pixel's points do not take part,"""
+"""Suspicion from which on a pixel's points take no part in the search."""
 MOST_ASIDE = 0.6
-"""unless so much of the image is suspected: then only what moves does not."""
+"""Share of the image that may be set aside on suspicion; where more is suspected, only what moves is set aside."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
 """Deviation, metres and radians, of a motion that goes on as before."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
-"""Of a motion that is worth asking about."""
+"""Statuses of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
-"""What a body may cause by hiding what the points saw;"""
+"""Findings that a body may cause by hiding what the points saw."""
 MOST = 0.9
-"""of depth so much of what it leaves in view has to agree."""
+"""Share of the depth left in view by bodies that has to agree with a motion for `DEPTH_MISMATCH` to be excused."""
 
 
-class Candidate(NamedTuple):
+class MotionCandidate(NamedTuple):
     """A motion that may be the camera's."""
 
     attempt: Attempt
     belief: Belief
-    """Of the last frame's pixels."""
+    """What the motion says of the last frame's pixels."""
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -138,8 +138,8 @@ class BodyAware:
         known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
-        explains = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
-        attempt, found, carried = seen, _bodies(look.belief, before, explains), 0.0
+        depth_disagrees = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
+        attempt, found, carried = seen, _bodies(look.belief, before, depth_disagrees), 0.0
         arisen = np.mean((found > 0) & ~_near(before))
         is_lost = not attempt.usable and (known or np.any(found))
         is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
@@ -148,14 +148,14 @@ class BodyAware:
             attempt = self._share_out(state, frame, clock, attempt)
             if not attempt.usable and scene.carried < MAX_CARRIED:
                 found_none = attempt
-                attempt = self._go_on(state, clock, found_none, covered)
+                attempt = self._helped_by_prediction(state, clock, found_none, covered)
                 carried = 0.0 if attempt is found_none else float(scene.carried + clock.elapsed)
         is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
         if is_vague and known and not self.is_eager:
-            attempt = self._completed(state, clock, attempt)
+            attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
             look = self._look(state, attempt)
-            found = _bodies(look.belief, before, explains)
+            found = _bodies(look.belief, before, depth_disagrees)
         return self._remember(state, frame, clock, attempt, look, found, carried)
 
     def _remember(
@@ -164,7 +164,7 @@ class BodyAware:
         frame: Frame,
         clock: Clock,
         attempt: Attempt,
-        look: Look,
+        look: FrameView,
         found: Integer[np.ndarray, "h w"],
         carried: float,
     ) -> Attempt:
@@ -196,7 +196,7 @@ class BodyAware:
             tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else bodies > 0)
         return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
-    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, Look]:
+    def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, FrameView]:
         """The attempt, or a search without what dissents where most of the image's area asks for another motion; and
         what is seen by its motion.
         """
@@ -214,7 +214,7 @@ class BodyAware:
             attempt, look = again, other
         return attempt, look
 
-    def _look(self, state: AwareState, attempt: Attempt) -> Look:
+    def _look(self, state: AwareState, attempt: Attempt) -> FrameView:
         return self.retina.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
@@ -233,13 +233,13 @@ class BodyAware:
         scene, tracker, retina = state.scene, state.tracker, self.retina
         known = bool(np.any(np.asarray(scene.roll.labels)))
 
-        def candidate(attempt: Attempt) -> Candidate:
-            return Candidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
+        def candidate(attempt: Attempt) -> MotionCandidate:
+            return MotionCandidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
 
-        def search_from(tracker: TrackerState) -> Candidate:
+        def search_from(tracker: TrackerState) -> MotionCandidate:
             return candidate(self.search.align(tracker, frame, clock))
 
-        def search_without(mask: Any) -> Candidate:
+        def search_without(mask: Any) -> MotionCandidate:
             return search_from(retina.without(tracker, mask))
 
         found = candidate(first)
@@ -261,16 +261,16 @@ class BodyAware:
                 break
         return _judged(best, tried, known)
 
-    def _go_on(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
+    def _helped_by_prediction(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion
         or, of an image that is covered for the most part, nothing; else the attempt as it is.
         """
         result = attempt.result
         if int(result.findings) == bit(AlignmentStatus.LOW_TEXTURE) and np.all(np.isfinite(result.covariance)):
-            return self._completed(state, clock, attempt)
-        return self._carry_on(state, clock, attempt) if covered > LARGE else attempt
+            return self._fused_with_prediction(state, clock, attempt)
+        return self._extrapolated(state, clock, attempt) if covered > LARGE else attempt
 
-    def _completed(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+    def _fused_with_prediction(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
         both, weighted by their covariances.
         """
@@ -281,7 +281,7 @@ class BodyAware:
         motion = found @ exp(share @ onward)
         return _moved(state, attempt, motion, share @ prior)
 
-    def _carry_on(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
+    def _extrapolated(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with the motion that the camera has if it goes on as before."""
         motion = self.predict(state, float(clock.elapsed))
         attempt = _moved(state, attempt, motion, UNKNOWN)
@@ -297,11 +297,13 @@ def _moved(
     xi: Any = log(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
-    tracker = tracker._replace(keyframe=tracker.previous, motion=xi, guess=xi, passing=xi, usual=state.tracker.usual)
+    tracker = tracker._replace(
+        keyframe=tracker.previous, motion=xi, guess=xi, instant_motion=xi, usual=state.tracker.usual
+    )
     return attempt._replace(state=tracker, result=result, usable=True)
 
 
-def _judged(best: Candidate, tried: list[Candidate], known: bool) -> Attempt:
+def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) -> Attempt:
     """The best candidate's attempt with what the image as a whole says of it.
 
     What all of the image at rest speaks for is not wrong because a body hides what its points saw; but the image has to
@@ -329,13 +331,13 @@ def mistrusted(attempt: Attempt) -> Attempt:
 
 
 def deviation(attempt: Attempt) -> float:
-    """Of an attempt's translation, metres."""
+    """Standard deviation of an attempt's translation, metres."""
     return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
-def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], explains: bool) -> Integer[np.ndarray, "h w"]:
+def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], depth_disagrees: bool) -> Integer[np.ndarray, "h w"]:
     moving, known = jax.device_get((belief.moving, belief.known))
-    return parts(moving, known, before, explains)
+    return body_components(moving, known, before, depth_disagrees)
 
 
 def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

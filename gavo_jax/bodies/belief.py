@@ -186,12 +186,12 @@ def _box(image: Float[Array, "h w"], radius: int = 2) -> Float[Array, "h w"]:
 
 
 ROUNDS = (8, 12, 50)
-"""Of smoothing at each resolution, finest first, each half the one before."""
+"""Rounds of smoothing at each resolution, finest first; each resolution is half the one before."""
 DATA_WEIGHT = 0.3
 DEPTH_EDGE = 0.015
-"""Relative step of inverse depth that hardly lets anything across,"""
+"""Relative step of inverse depth across which neighbours are hardly tied."""
 GREY_EDGE = 25.0
-"""and step of grey, in grey levels, where depth is missing."""
+"""Step of grey, grey levels, across which neighbours are hardly tied where depth is missing."""
 ALIKE, HALF_KNOWN = 0.3, 0.03
 """Tie of neighbours without depth, and of two of which one has some: a body ends where its depth does."""
 

@@ -20,9 +20,9 @@ from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp
 
 STRIDE = 2
-"""Every so many pixels along either side are asked;"""
+"""Pixels of the image from one that is asked to the next, along either side."""
 CELL = 4
-"""so many of these along either side are a block."""
+"""Asked pixels along either side of a block."""
 LEAST_GREY, LEAST_DEPTH = 1.0, 8e-4
 """Smallest deviations of a pixel's residuals: grey levels, 1/m."""
 BOUND = 6.0
@@ -30,9 +30,9 @@ BOUND = 6.0
 FARTHER = 2.0
 """A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
 ROUNDS = 4
-"""Of re-weighting the blocks, about their median."""
+"""Rounds of re-weighting the blocks, about their median."""
 DRAWS, DRAWN = 48, 6
-"""Of blocks to begin from: where a body is strong, the median's next minimum is not its least one."""
+"""Draws to begin from, and blocks of each: where a body is strong, the median's next minimum is not its least one."""
 HALVINGS = 16
 DISSENT = 6.0
 """Times the usual: from there on a block does not move as the others do."""
@@ -44,7 +44,7 @@ class Blocks(NamedTuple):
     hessian: Float[Array, "b 6 6"]
     gradient: Float[Array, "b 6"]
     inverse: Float[Array, "b 6 6"]
-    """Of the Hessians, damped."""
+    """Inverses of the Hessians, damped."""
     credit: Float[Array, " b"]
 
 
@@ -81,11 +81,11 @@ def ask_area(
     blocks = _equations(here, there, target_T_here, credit, camera)
 
     def middle_gain(delta: jax.Array) -> jax.Array:
-        return _middle(gain_of_its_own(blocks, delta), blocks.credit)
+        return weighted_median(gain_of_its_own(blocks, delta), blocks.credit)
 
     def settle(_: int, delta: jax.Array) -> jax.Array:
         gains = gain_of_its_own(blocks, delta)
-        weight = blocks.credit / (1.0 + gains / (2.0 * _middle(gains, blocks.credit))) ** 2
+        weight = blocks.credit / (1.0 + gains / (2.0 * weighted_median(gains, blocks.credit))) ** 2
         hessian = jnp.einsum("b,bij->ij", weight, blocks.hessian)
         return -jnp.linalg.solve(hessian + jnp.eye(6), weight @ blocks.gradient)
 
@@ -95,7 +95,7 @@ def ask_area(
     settled = jax.vmap(lambda start: jax.lax.fori_loop(0, ROUNDS, settle, start))(jnp.stack([nothing, best_of_few]))
     delta = settled[jnp.argmin(jax.vmap(middle_gain)(settled))]
     gains = gain_of_its_own(blocks, delta)
-    least = _middle(gains, blocks.credit)
+    least = weighted_median(gains, blocks.credit)
     return Opinion(
         middle_gain(nothing),
         least,
@@ -149,7 +149,7 @@ def _equations(
         (r.grey, r.inside, LEAST_GREY, along_grey),
         (r.depth, r.depth_valid, LEAST_DEPTH, along_depth),
     ):
-        scale = jnp.maximum(1.48 * middle_of_many(jnp.abs(residual), mask * counted > 0), least)
+        scale = jnp.maximum(1.48 * median_by_bisection(jnp.abs(residual), mask * counted > 0), least)
         weight = jnp.where(mask > 0, (1.0 + (residual / (BOUND * scale)) ** 2) ** -2 / scale**2, 0.0)
         rows = [*jnp.where(mask > 0, pixel_jacobian(slopes, r.warped, plane), 0.0), residual]
         own = [weight * rows[i] * rows[j] for i in range(6) for j in range(i, 7)]
@@ -167,7 +167,7 @@ def surface_area(inverse_depth: Float[Array, " n"]) -> Float[Array, " n"]:
     """How large a surface each pixel shows, in those of the usual depth; 0 where there is no reading."""
     has = inverse_depth > 0
     depth = jnp.where(has, 1.0 / jnp.maximum(inverse_depth, 1e-3), 0.0)
-    return jnp.minimum(depth / jnp.maximum(middle_of_many(depth, has), 1e-3), FARTHER) ** 2
+    return jnp.minimum(depth / jnp.maximum(median_by_bisection(depth, has), 1e-3), FARTHER) ** 2
 
 
 def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
@@ -188,7 +188,7 @@ def _inverses(matrices: Float[Array, "b 6 6"]) -> Float[Array, "b 6 6"]:
     return jnp.moveaxis(rows[:, 6:], -1, 0)
 
 
-def middle_of_many(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
+def median_by_bisection(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
     """Median of some of many values from 0 on, to a small part of their largest, by bisection: sorting takes longer
     than all else here.
     """
@@ -203,8 +203,8 @@ def middle_of_many(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Fl
     return jax.lax.fori_loop(0, HALVINGS, halve, (jnp.float32(0.0), jnp.max(jnp.where(counted, values, 0.0))))[1]
 
 
-def _middle(values: Float[Array, " b"], weights: Float[Array, " b"]) -> Float[Array, ""]:
-    """Median of weighted values."""
+def weighted_median(values: Float[Array, " b"], weights: Float[Array, " b"]) -> Float[Array, ""]:
+    """The value below which half of the weight lies."""
     order = jnp.argsort(values)
     total = jnp.cumsum(weights[order])
     return values[order][jnp.searchsorted(total, 0.5 * total[-1])]

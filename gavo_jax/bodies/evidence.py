@@ -28,7 +28,7 @@ class View(NamedTuple):
     """One level of a frame, packed as a `Target`, and how the camera moved while its rows were exposed."""
 
     image: Target
-    """[h, w]."""
+    """The level's grey and depth, [h, w]."""
     sweep: Float[Array, "*v 6"]
     """Twist of the points in the camera during one readout; 0 where all rows are exposed at once, not-a-number of a
     first frame, before which there is no other."""
@@ -71,7 +71,7 @@ class Evidence(NamedTuple):
     measured: Float[Array, "v h w"]
     """1 where the other view has depth there as well."""
     inverse_depth: Float[Array, "h w"]
-    """Of the pixels, 1/m; 0 where there is no reading."""
+    """Inverse depth of the pixels, 1/m; 0 where there is no reading."""
     place: Float[Array, "v 2 h w"]
     """Column and row where the pixel lies in the other view."""
 
@@ -129,12 +129,12 @@ class Compared(NamedTuple):
     residuals: Residuals
     """[V, N], grey made as bright as the others."""
     grey: GreySample
-    """Of the view itself."""
+    """Grey of the view itself, with its slopes."""
     seen_grey: Float[Array, "v n"]
     """The same, once for each of the others."""
     inverse_depth: Float[Array, " n"]
     place: tuple[Float[Array, " n"], Float[Array, " n"]]
-    """Column and row."""
+    """Column and row of each pixel in the view."""
 
 
 def compare(

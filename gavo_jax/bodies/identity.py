@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Integer
 LEAST = 0.008
 """Share of the image that a body covers at least."""
 SHOWS = 0.03
-"""Evidence, as a share of the image that is known to move, that shows a body,"""
+"""Evidence (belief that pixels move, summed, as a share of the image) from which on a component is a new body."""
 EXPLAINS = 0.015
-"""the largest part where depth disagrees with the motion found, which it explains,"""
+"""The same for the largest component where depth disagrees with the motion found: a body would explain that."""
 KEEPS = 0.006
-"""and that one needs that was known in the frame before."""
+"""The same for a body that was known in the frame before."""
 THICK = 6 / 160
 """Radius, over the image's width, of a disc that lies within a body."""
 MOST = 8
@@ -28,7 +28,7 @@ class Roll(NamedTuple):
     labels: Integer[np.ndarray, "h w"]
     """Number of the body that each pixel of the last frame shows, 0 for none."""
     numbers: Integer[np.ndarray, " n"]
-    """Of the bodies that are known; 0 where there is none."""
+    """Numbers of the bodies that are known; 0 where there is none."""
     ages: Integer[np.ndarray, " n"]
     """Frames since each was seen."""
     motions: Float[np.ndarray, "n 6"]
@@ -50,11 +50,11 @@ class Roll(NamedTuple):
         )
 
 
-def parts(
+def body_components(
     moving: Float[np.ndarray, "h w"],
     known: Float[np.ndarray, "h w"],
     before: Bool[np.ndarray, "h w"],
-    explains: bool = False,
+    depth_disagrees: bool = False,
 ) -> Integer[np.ndarray, "h w"]:
     """Parts of a mask that hang together and are bodies: 1, 2, … from the largest one; else 0.
 
@@ -65,7 +65,7 @@ def parts(
         moving: Positive where something moves; see `Belief`.
         known: See `Belief`.
         before: Where bodies were in the frame before.
-        explains: Whether depth disagrees with the motion found.
+        depth_disagrees: Whether depth disagrees with the motion found.
     """
     mask = moving > 0
     labels = np.zeros(mask.shape, np.int32)
@@ -81,18 +81,18 @@ def parts(
         part = split == k
         was_known = np.mean(before[part]) > 0.3
         evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
-        shows = EXPLAINS if explains and found == 0 else SHOWS
+        shows = EXPLAINS if depth_disagrees and found == 0 else SHOWS
         if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else shows):
             found += 1
             labels[part] = found
     return labels
 
 
-def identify(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
+def associate(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
     """Give each part of a mask the number of the known body that it overlaps most, or a new one.
 
     Args:
-        found: Of `parts`, in the new frame.
+        found: Of `body_components`, in the new frame.
         roll: Of the frame before, its labels moved to where they are expected in the new one.
     """
     overlaps = sorted(

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.alignment.sway import Unrest
+from gavo_jax.alignment.sway import VelocityChange
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.identity import Roll, identify
+from gavo_jax.bodies.identity import Roll, associate
 from gavo_jax.bodies.records import Seen
 from gavo_jax.bodies.scene import AwareState, Retina
 from gavo_jax.camera import to_ray
@@ -43,7 +43,7 @@ def find_motions(
         inverse_depth: Of them, 1/m; 0 where there is no reading.
     """
     before = Roll(*map(np.asarray, state.scene.roll))
-    roll = identify(found, before)
+    roll = associate(found, before)
     moving = np.asarray(belief.moving)
     seen = []
     for place, (number, age) in enumerate(zip(roll.numbers, roll.ages, strict=True)):
@@ -64,14 +64,16 @@ def find_motions(
 def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: Roll, number: int) -> Alignment:
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
-    whole = _unsettled(state.whole, state.tracker, aware.retina) if np.any(state.tracker.passing) else state.whole
+    whole = state.whole
+    if np.any(state.tracker.instant_motion):
+        whole = _unsettled(whole, state.tracker, aware.retina)
     motion: Any = np.float32(before.motions[place])
     tracker = state.tracker._replace(
         previous=whole,
         keyframe=whole,
         motion=motion,
         guess=motion,
-        unrest=Unrest.unknown(),
+        velocity_change=VelocityChange.unknown(),
         seconds=np.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )
@@ -80,7 +82,7 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
 
 def _unsettled(whole: Reference, tracker: TrackerState, retina: Retina) -> Reference:
     """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
-    twist = tracker.passing * (retina.full.readout / tracker.seconds)
+    twist = tracker.instant_motion * (retina.full.readout / tracker.seconds)
     return unsettle_reference(whole, twist, retina.planes)
 
 

@@ -20,11 +20,11 @@ class Seen(NamedTuple):
     number: int
     """The same from frame to frame, from 1."""
     field: Float[np.ndarray, "h w"]
-    """Of the level that bodies are seen on; positive where the body is."""
+    """Pixels of the level that bodies are seen on; positive where the body is."""
     share: float
-    """Of the image."""
+    """Share of the image that it covers."""
     centroid: Float64[np.ndarray, " 3"]
-    """Of the points of it that are seen, metres, in the camera."""
+    """Centroid of the points of it that are seen, metres, in the camera."""
     alignment: Alignment | None = None
     """Its motion in the camera, from the reference frame to this one; None where it was not asked for, or where the
     body was not seen before."""
@@ -37,9 +37,9 @@ class Body:
     number: int
     """The same from frame to frame, from 1."""
     share: float
-    """Of the image that it covers."""
+    """Share of the image that it covers."""
     centroid: Float64[np.ndarray, " 3"]
-    """Of the part of it that is seen, metres, in the world."""
+    """Centroid of the part of it that is seen, metres, in the world."""
     displacement: Float64[np.ndarray, " 3"]
     """Way of that centroid since the reference frame, metres, in the world; not-a-number where it is not known."""
     rotation: Float64[np.ndarray, " 3"]
@@ -69,7 +69,7 @@ class Body:
 
 
 BORDER = 1 / 80
-"""Of the image's width: what is left out round a body with it, a pixel of the level that bodies are seen on."""
+"""Share of the image's width that is left out round a body: a pixel of the level that bodies are seen on."""
 
 
 def covered(bodies: Iterable[Body]) -> Bool[np.ndarray, "height width"] | None:

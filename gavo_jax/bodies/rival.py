@@ -24,17 +24,17 @@ from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import carried, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.rigid_motions import length_and_angle, log, transport_covariance
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 TOGETHER = (0.008, np.radians(0.5))
-"""Metres and radians within which the two are the same motion,"""
+"""Metres and radians within which the two motions are the same."""
 APART = (0.025, np.radians(1.0))
-"""and from which on it matters which one is taken."""
+"""Metres and radians between the two motions from which on it matters which one is taken."""
 AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
 """Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
 away, however many frames are taken meanwhile."""
@@ -43,16 +43,16 @@ DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
 FORGOTTEN = 1.0
 """Seconds after which it counts as clear whose motion the first one's is."""
 LARGEST = 100.0
-"""Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ;"""
+"""Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ."""
 CONTRADICTED = 30.0
-"""and from which on the far part contradicts the first motion;"""
+"""The same distance from which on the far part contradicts the first motion."""
 CLEAR, DOUBTFUL = 0.75, 0.5
-"""as a share of the largest, together with the far part's margin: from the first on the rival is taken, from the second
-on the first one's motion may be a body's."""
+"""Certainty (that distance over `LARGEST`, at most 1, plus the far part's margin) above which the rival is taken, and
+above which the first search's motion may be a body's."""
 MAJORITY, FAR_MAJORITY, FRAMES = 0.2, 0.6, 2
-"""Margins in the whole image and in its far part that decide if they hold for so many frames,"""
+"""Margins in the whole image and in its far part that decide for the rival, and frames for which they have to hold."""
 LANDSLIDE = 0.6
-"""and one in the whole image that does at once."""
+"""Margin in the whole image that decides for the rival at once."""
 EXACT, EXACTER, VAGUE = 0.012, 0.008, 0.02
 """Metres: deviation of the rival's translation up to which votes can have it taken, up to which the contradiction can,
 and from which on it tells nothing."""
@@ -62,7 +62,7 @@ class Span(NamedTuple):
     """How long something has been so."""
 
     frames: Any
-    """-1 where it is not."""
+    """Number of frames; -1 where it is not so."""
     seconds: Any
 
     @property
@@ -82,20 +82,20 @@ class Rival(NamedTuple):
     """Another motion that may be the camera's, since some frame, its anchor."""
 
     state: AwareState
-    """Of its own search."""
+    """State of the rival's own search."""
     anchor: View
     near: Bool[np.ndarray, "h w"]
     """What the anchor shows of surfaces that are taken for bodies."""
     stands_before: Any
     """Whether these stand before the rest: only then it says something that both searches agree."""
     first_T_anchor: Float[np.ndarray, "4 4"]
-    """Motion since the anchor by the first search,"""
+    """Motion since the anchor by the first search."""
     rival_T_anchor: Float[np.ndarray, "4 4"]
-    """and by the rival's."""
+    """Motion since the anchor by the rival's search."""
     vaguest: Float[np.ndarray, "6 6"]
     """Covariance of the rival's motion where it was known least well since the anchor; see `_in_target`."""
     age: Span
-    """Since the anchor."""
+    """Time since the anchor."""
     ahead: Any
     """Frames for which the margins have held."""
 
@@ -226,8 +226,8 @@ class WithRival:
         Args:
             other: The rival's.
             rival: Before it, of the age it has then.
-            open_for: How long it was open whose motion the first one's is,
-            open_after: and how long it is from now on.
+            open_for: How long it was open whose motion the first one's is.
+            open_after: How long it is from now on.
         """
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
@@ -288,7 +288,9 @@ def _view(state: AwareState) -> View:
 
 def _in_target(result: Alignment) -> Float64[np.ndarray, "6 6"]:
     """Covariance of a motion by a step on the target's side: results have it by one on the reference's."""
-    return carried(np.asarray(result.target_T_reference, np.float64), np.asarray(result.covariance, np.float64))
+    return transport_covariance(
+        np.asarray(result.target_T_reference, np.float64), np.asarray(result.covariance, np.float64)
+    )
 
 
 def _distance(
@@ -300,7 +302,7 @@ def _distance(
 
 
 def _between(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
-    length, angle = size(inverse(first) @ second)
+    length, angle = length_and_angle(inverse(first) @ second)
     return float(length), float(angle)
 
 

@@ -25,23 +25,23 @@ from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
 OLD = 0.22
-"""Seconds after which an older view takes the place of the one before,"""
+"""Age in seconds at which the view between takes the place of the older one."""
 FAR_OFF = 0.7
-"""or part of what is at rest that it sees, below which it does at once: over a long way, errors of the poses and other
-light look like bodies."""
+"""Share of what is at rest that the older view sees, below which it is replaced at once: over a long way, errors of the
+poses and other light look like bodies."""
 
 
 class Scene(NamedTuple):
     """What is known of the last frame's image, and of older ones to compare the next one with."""
 
     known: Float[Array, "h w"]
-    """See `Belief`; of the last frame's pixels."""
+    """What is known of the last frame's pixels; see `Belief.known`."""
     suspected: Float[Array, "h w"]
-    """See `belief.suspect`; the same."""
+    """Which of these pixels are suspected; see `belief.suspect`."""
     roll: Roll
     """The bodies that it shows."""
     views: View
-    """Of the last frame, of an older one and of one between them, [3]: what moves slowly shows in the older one."""
+    """Views of the last frame, an older one and one between them, [3]: what moves slowly shows in the older one."""
     views_T_last: Float[Array, "3 4 4"]
     """Motions from the last frame's camera into these."""
     age: Float[np.ndarray, ""]
@@ -62,11 +62,11 @@ class AwareState(NamedTuple):
     """Whether the last motion may be a body's, by a stricter measure than the status's."""
 
 
-class Look(NamedTuple):
-    """A new frame, by some motion."""
+class FrameView(NamedTuple):
+    """A new frame as it looks if some motion is the camera's."""
 
     belief: Belief
-    """Of its pixels."""
+    """What the motion says of the new frame's pixels."""
     views: View
     """The scene's, should that be its motion, and `views_T_here` the motions into them."""
     views_T_here: Float[Array, "3 4 4"]
@@ -93,12 +93,12 @@ class Retina:
 
     @cached_property
     def camera(self) -> Camera:
-        """Of the level that bodies are seen on."""
+        """Camera of the level that bodies are seen on."""
         return self.full.level(self.levels.numbers[seen_level(self.levels)])
 
     @cached_property
     def planes(self) -> ImagePlane:
-        """Of the levels searched, on the host."""
+        """Image planes of the levels searched, on the host."""
         return jax.tree.map(np.asarray, self.levels.planes(self.full))
 
     @property
@@ -108,7 +108,7 @@ class Retina:
 
     def view(self, tracker: TrackerState) -> View:
         """Of a tracker's last frame, on the host: to slice a device's array takes a program."""
-        sweep = np.asarray(tracker.passing) * (self.full.readout / np.asarray(tracker.seconds))
+        sweep = np.asarray(tracker.instant_motion) * (self.full.readout / np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
     def blank(self) -> Scene:
@@ -131,12 +131,12 @@ class Retina:
         image = jax.tree.map(np.asarray, tracker.previous_image)
         return view_of(image, self.levels, sweep)
 
-    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Look:
+    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> FrameView:
         """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
         keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
-            (tracker.previous_image, tracker.passing, tracker.seconds),
+            (tracker.previous_image, tracker.instant_motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             np.array(keep, np.int32),
             self.full,
@@ -147,14 +147,14 @@ class Retina:
         """What a motion makes of the last frame's pixels, on the host."""
         belief = _look_back(
             (scene.known, scene.views),
-            (tracker.previous_image, tracker.passing, tracker.seconds),
+            (tracker.previous_image, tracker.instant_motion, tracker.seconds),
             np.asarray(target_T_reference, np.float32),
             self.full,
             levels=self.levels,
         )
         return jax.device_get(belief)
 
-    def renewed(self, scene: Scene, look: Look, elapsed: float) -> Scene:
+    def renewed(self, scene: Scene, look: FrameView, elapsed: float) -> Scene:
         """The scene with the new frame as its last one, so many seconds later."""
         is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
         age = OLD if is_far_off else _age_after(scene, elapsed)
@@ -176,7 +176,7 @@ def _age_after(scene: Scene, elapsed: float) -> float:
     return age if age < OLD else 0.0
 
 
-@partial(CachedProgram, static=("levels",), returns=(Look,))
+@partial(CachedProgram, static=("levels",), returns=(FrameView,))
 def _look(
     known: tuple[Float[Array, "h w"], Float[Array, "h w"], View, Float[Array, "3 4 4"]],
     new: tuple[Target, Float[Array, " 6"], Float[Array, ""]],
@@ -185,11 +185,11 @@ def _look(
     camera: Camera,
     *,
     levels: Levels,
-) -> Look:
+) -> FrameView:
     """One program for all that is asked about every frame: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
-    image, passing, seconds = new
-    here = view_of(image, levels, passing * (camera.readout / seconds))
+    image, instant_motion, seconds = new
+    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
     views = views.moving_as(here.sweep)
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
@@ -199,7 +199,7 @@ def _look(
     last = jax.tree.map(lambda leaf: leaf[0], views)
     opinion = ask_area(last, here, target_T_reference, credit, seen) if has_blocks(seen) else None
     views = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others[keep]]), here, views)
-    return Look(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
+    return FrameView(belief, views, jnp.concatenate([jnp.eye(4)[None], views_T_here[keep]]), opinion)
 
 
 @partial(CachedProgram, static=("levels",), returns=(Belief,))
@@ -213,8 +213,8 @@ def _look_back(
 ) -> Belief:
     """One program, so that it is kept between processes: it is asked for in the middle of a run."""
     before, views = known
-    image, passing, seconds = new
-    here = view_of(image, levels, passing * (camera.readout / seconds))
+    image, instant_motion, seconds = new
+    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
     last = jax.tree.map(lambda leaf: leaf[0], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
     here = jax.tree.map(lambda leaf: leaf[None], here)

@@ -11,17 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 FLAT, FLAT_NOISE = 0.02, 0.004
-"""Two neighbours lie on one surface where their inverse depths differ by less than this share and so much, 1/m;"""
+"""Share of the larger inverse depth, and 1/m added to it: two neighbours that differ by less lie on one surface."""
 STEP, STEP_NOISE = 0.04, 0.01
-"""one stands before the other where they differ by more than this."""
+"""The same: of two neighbours that differ by more, one stands before the other."""
 WIDEST_SHADOW = 6
 """Pixels without depth across which two surfaces still are neighbours."""
 BEFORE = 0.75
-"""Share of a surface's border along which it stands before its neighbours, of one that may move,"""
+"""Share of its border along which a surface has to stand before its neighbours to count as one that may move."""
 LEAST_BORDER = 8
-"""pixels of such a border at least,"""
+"""Fewest pixels of such a border."""
 LEAST_AREA = 0.015
-"""and share of the image."""
+"""Smallest share of the image that such a surface covers."""
 MOST_TOGETHER = 0.5
 """Share of the image up to which smaller surfaces than the largest one count, too."""
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, middle_of_many, surface_area
+from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, median_by_bisection, surface_area
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.program_cache import CachedProgram
@@ -28,9 +28,9 @@ class Margin(NamedTuple):
     """By how much the second motion is ahead of the first, from -1 to 1."""
 
     whole: Float[Array, ""]
-    """In the whole image,"""
+    """The margin in the whole image."""
     far: Float[Array, ""]
-    """and in its far part alone."""
+    """The margin in the far part of the image alone."""
 
 
 @partial(CachedProgram, returns=(Margin,))
@@ -38,11 +38,11 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     """Have the blocks of a view choose between two motions into another; a block counts by the area of its surface.
 
     Args:
-        here: The view.
-        there: The other.
-        motions: there_T_here, twice.
-        near: Which pixels are not of the far part.
-        camera: Of the views' level.
+        here: The view whose blocks are asked.
+        there: The other view.
+        motions: The two motions there_T_here.
+        near: Pixels of `here` that are not of its far part.
+        camera: Camera of the views' level.
     """
     others = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), there)
     compared = compare(here, others, motions, camera, STRIDE)
@@ -52,7 +52,7 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     for residual, mask, least in ((r.grey, r.inside, LEAST_GREY), (r.depth, r.depth_valid, LEAST_DEPTH)):
         both = jnp.all(mask > 0, axis=0) & has
         better = jnp.where(both, jnp.min(jnp.abs(residual), axis=0), 0.0)
-        scale = jnp.maximum(1.48 * middle_of_many(better, both), least)
+        scale = jnp.maximum(1.48 * median_by_bisection(better, both), least)
         t = jnp.log1p((residual / scale) ** 2 / FREEDOM)
         cost += jnp.where(both, 0.5 * (FREEDOM + 1.0) * t, 0.0)
     seen = jnp.all(r.inside > 0, axis=0) & has

@@ -44,7 +44,7 @@ EDGE = 2
 """Pairs at either end of a stretch that do not count: the motion before and after them is not known."""
 
 LONGEST_READOUT, LONGEST_DELAY = 0.05, 0.05
-"""Seconds."""
+"""Longest readout and longest delay of depth that are looked for, seconds."""
 READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP = 0.004, 0.005, 0.015, 4.0
 """Between the values of the last parabolas: seconds, seconds, share, pixels."""
 FOCAL_RANGE, CENTRE_RANGE = 0.25, 40.0
@@ -106,7 +106,7 @@ class _Trial:
     edge: int = EDGE
     """Pairs at either end of a stretch that do not count."""
     order: Integer[np.ndarray, " pairs"] | None = None
-    """Of those that count, in time, as `scan` draws neighbours together; None where they are in order."""
+    """Order in time of the pairs that count, as `scan` draws neighbours together; None where they are in order."""
 
     def match(self, unknowns: Unknowns) -> list[Matched]:
         size = replace(self.camera.rectified(), fx=1.0, fy=1.0, cx=0.0, cy=0.0, readout=0.0, depth_scale=1.0)

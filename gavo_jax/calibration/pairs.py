@@ -64,9 +64,9 @@ class Stretch(NamedTuple):
     grey: Float[Array, "f h w"]
     inverse_depth: Float[Array, "f h w"]
     stamps: Float[Array, " f"]
-    """Of colour, seconds after the first; of an even clock where they are such with jitter."""
+    """Stamps of colour, seconds after the first one; those of an even clock where they are such with jitter."""
     delays: Float[Array, " f"]
-    """Of depth after colour, by the stamps, seconds."""
+    """Delays of depth after colour by the stamps, seconds."""
 
     @classmethod
     def of(cls, frames: Iterable[Frame], camera: Camera) -> "Stretch":
@@ -87,7 +87,7 @@ class Stretch(NamedTuple):
 
 
 MOST_JITTER = 0.3
-"""Of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
+"""Share of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
 
 
 def evened(stamps: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:

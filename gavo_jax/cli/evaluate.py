@@ -69,7 +69,7 @@ def evaluate(options: Evaluate) -> int:
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")
-"""Of the errors, in the order in which they are told."""
+"""Names of the errors, in the order in which they are told."""
 
 
 def _errors(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> tuple[dict[str, ErrorSeries], list[str]]:

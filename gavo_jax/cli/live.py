@@ -89,13 +89,13 @@ class _End(NamedTuple):
     """How tracking came to its end."""
 
     seconds: float
-    """Since the first frame, without"""
+    """Seconds of tracking since the first frame, those spent waiting for programs left out."""
     waited: float
-    """those spent waiting for programs."""
+    """Seconds spent waiting for programs."""
     interrupted: bool
-    """By Ctrl-C."""
+    """Whether Ctrl-C ended it."""
     fault: GavoError | None
-    """Of the device."""
+    """What went wrong with the device, if anything."""
 
 
 def _track(

@@ -14,7 +14,7 @@ from gavo_jax.errors import GavoError
 
 _STREAM = 3
 BOX_PLACES = ((0.0, 1.0), (0.75, 1.0), (-0.75, 1.0), (0.4, 1.6), (-0.4, 1.6), (1.1, 1.6))
-"""Of the boxes, to the right of the first view's axis and along it, metres."""
+"""Places of the boxes, to the right of the first view's axis and along it, metres."""
 MOST_BODIES = len(BOX_PLACES) + 1
 _LOOKS = (
     ("picture", (1.2, 0.95, 0.8)),

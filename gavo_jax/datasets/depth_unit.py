@@ -19,13 +19,13 @@ COMMON = (5000.0, 1000.0, 1.0)
 """Units per metre of files: of the TUM benchmark, millimetres, metres."""
 
 SHIFTED, TENTHS = 8000.0, 10000.0
-"""Of SUN3D, millimetres moved up by three bits; tenths of a millimetre. Only steps speak for these."""
+"""Units per metre: SUN3D's millimetres moved up by three bits; tenths of a millimetre. Only steps speak for these."""
 
 CENTIMETRES = 100.0
 """Units per metre that nothing but a much too small median speaks for."""
 
 LOOKED_AT = 3
-"""Frames."""
+"""Number of frames that are looked at."""
 
 KINECTS = ("fr1", "fr2", "fr3", "bonn")
 """Presets of such cameras."""
@@ -35,7 +35,7 @@ KINECT_STEP = 2.85e-3
 of 75 mm and a focal length of 585 pixels."""
 
 KINECT_NEAREST = 0.35
-"""Metres."""
+"""Metres: a Kinect reads nothing nearer."""
 
 KINECT_VIEW = (0.76, 0.93)
 """Focal length over the image's width of such cameras."""
@@ -63,10 +63,10 @@ class DepthSample(NamedTuple):
     """What the raw depth of a few frames says, in its own units."""
 
     near: float
-    """First percentile."""
+    """First percentile of the raw depth."""
     median: float
     far: float
-    """99th percentile."""
+    """99th percentile of the raw depth."""
     kinect_scale: float | None
     """Units per metre by the steps, if the sensor were such a camera; None where the steps follow no law."""
 

@@ -99,7 +99,7 @@ class Entry(NamedTuple):
     """A frame's files."""
 
     stamp: float
-    """Of the colour image, seconds."""
+    """Stamp of the colour image, seconds."""
     color: Path
     depth: Path | None
     depth_stamp: float | None = None

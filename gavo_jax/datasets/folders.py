@@ -38,7 +38,7 @@ RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
 NUMBERS = "names are numbers"
-"""Of which frames per second are a guess."""
+"""What is said of stamps that are counted, of which frames per second are a guess."""
 
 
 class NumberedFolder(FileSequence):

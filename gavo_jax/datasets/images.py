@@ -20,11 +20,11 @@ from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
-"""Of what is looked for in a folder; a file that is named may have any."""
+"""Endings of colour images that are looked for in a folder; a file that is named may have any."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm")
 
 MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
-"""Of a file: the largest image with sixteen bytes to a pixel, and some room."""
+"""Largest file, bytes: the largest image with sixteen bytes to a pixel, and some room."""
 
 PNG_SIGNATURE, EXR_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
 NPY_SIGNATURE, NPZ_SIGNATURE = b"\x93NUMPY", b"PK\x03\x04"

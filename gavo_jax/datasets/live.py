@@ -24,9 +24,9 @@ class LiveImages(NamedTuple):
     """Registered to colour: uint16 [H, W] in units of the camera's `depth_scale`, or floats in metres; 0 or not finite
     = no reading."""
     timestamp: float
-    """Of the colour image, seconds, by any clock that only goes forward."""
+    """Stamp of the colour image, seconds, by any clock that only goes forward."""
     depth_timestamp: float | None = None
-    """Of the depth image, by the same clock."""
+    """Stamp of the depth image, by the same clock; None where it is the colour image's."""
 
 
 class LiveDevice(Protocol):

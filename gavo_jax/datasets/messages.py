@@ -48,13 +48,13 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "32FC1": ("f4", 1, None),
     "64FC1": ("f8", 1, None),
 }
-"""Of an encoding: the number type, channels, and what makes BGR of it (None: it is, or it is depth)."""
+"""Number type and channels of an encoding, and what makes BGR of it (None: it is, or it is depth)."""
 
 HALVED = ("nv12", "nv21")
 """Below the rows of brightness half as many of colour, at half the width."""
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16", "Z16")
-"""Of raw images; Z16 is what librealsense calls 16UC1."""
+"""Encodings of raw depth images; Z16 is what librealsense calls 16UC1."""
 
 FILM = re.compile(r"(?i)\b(?:[hx]\.?26[45]|hevc|avc|vp[89]|av1|theora)\b")
 """In the format of compressed images that are no images of their own."""

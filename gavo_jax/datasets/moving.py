@@ -21,7 +21,7 @@ Path = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]
 MOST_PARTS = 254
 """Labels are bytes, and 0 is the room."""
 LARGEST_EDGE = 10.0
-"""Of a body's box, metres."""
+"""Largest edge of a body's box, metres."""
 _TEXTURE_STREAM = 1 << 40
 
 

@@ -18,7 +18,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From our camera's axes to NeRF's: its y points up, and it looks along -z."""
 
 WITHOUT_SCALE = ("colmap_im_id", "sharpness", "colmap_pose")
-"""Of frames whose poses structure from motion made: how long its unit is, is open."""
+"""Keys of frames whose poses structure from motion made: how long its unit is, is open."""
 
 
 def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory | None, list[str]]:

@@ -26,7 +26,7 @@ class Paired(NamedTuple):
     entries: list[Entry]
     left_out: list[str]
     times: dict[int, float]
-    """Of each depth image, by the number in its name, else by its place, from 1."""
+    """Stamp of each depth image, by the number in its name, else by its place, from 1."""
     seconds: Seconds | None
     """Times by numbers, where the names are those."""
     guessed: str = ""
@@ -39,7 +39,7 @@ class _Timed(NamedTuple):
     files: list[Path]
     seconds: list[float]
     unit: float | None
-    """Of whole numbers, see `names.Stamps`."""
+    """Unit of stamps that are whole numbers; see `names.Stamps`."""
     others: tuple[Path, ...] = ()
     """Whose names have another form."""
 

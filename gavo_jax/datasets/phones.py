@@ -26,7 +26,7 @@ from gavo_jax.errors import GavoError, data_rows, number, read_text
 from gavo_jax.trajectory import SHORTEST_QUATERNION, Trajectory, inverse, rotation_from_quaternion
 
 LARGEST = 1e10
-"""Of a file of poses, seconds since 1970 included."""
+"""Largest number in a file of poses, seconds since 1970 included."""
 
 SLOWEST, FASTEST = 0.1, 1000.0
 """Frames per second that may be a rate."""

@@ -20,7 +20,7 @@ PATIENCE = 5000
 """Milliseconds without a frame after which the camera counts as gone."""
 
 METRES_PER_UNIT = 1e-3
-"""Of depth, where the camera does not say."""
+"""Metres per unit of depth, where the camera does not say."""
 
 
 class RealSense:

@@ -23,7 +23,7 @@ NEVER = np.uint16(65535)
 
 
 TO_THE_END = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
-"""Of the inversion of a lens: by its usual five iterations rays of a wide view are off by pixels."""
+"""When the inversion of a lens ends: after its usual five iterations rays of a wide view are off by pixels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ class Images(NamedTuple):
 
     is_depth: bool
     encoding: str
-    """Of raw images; of compressed ones their format."""
+    """Encoding of raw images; the format of compressed ones."""
     frame: str
     """In which their camera looks."""
 

@@ -10,14 +10,14 @@ from gavo_jax.trajectory import inverse, rotation_from_quaternion
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIXED_TOPIC, ANY_TOPIC = "/tf_static", "/tf"
-"""Of transforms that are published once, and of those that are published over and over, whether they change or not."""
+"""Topics of transforms that are published once, and of those that are published over and over, changed or not."""
 
 LONGEST_OFF = 0.01
 """How far a quaternion's length may be off 1, as ROS's own library has it: zeros and what was never filled in are no
 rotation."""
 
 STILL = 1e-6
-"""Of the numbers of a transform, metres among them: what differs by more has changed."""
+"""Difference of a transform's numbers, metres among them, above which it has changed."""
 
 
 def fixed_transforms(messages: Iterable[Any]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:

@@ -38,7 +38,7 @@ MILLISECOND = 1e-3
 """Seconds."""
 
 MAX_NUMBER = 10**18
-"""Of a frame."""
+"""Largest number of a frame."""
 
 Seconds = Callable[[np.ndarray], np.ndarray]
 """Times of frames by their numbers."""

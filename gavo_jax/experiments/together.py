@@ -145,11 +145,11 @@ class _Made(NamedTuple):
     """One run's attempt at a frame, made with the others'."""
 
     state: TrackerState
-    """Before it,"""
+    """The run's state before the frame."""
     frame: Frame
-    """the new frame,"""
+    """The new frame."""
     clock: Clock
-    """and when that was taken."""
+    """When the new frame was taken."""
     result: Alignment
     after: Callable[[], TrackerState]
     """Gives the state after it: a row of the new stack."""

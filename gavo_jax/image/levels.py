@@ -42,9 +42,9 @@ class ImagePlane(NamedTuple):
     width: Integer[Array, "*l"]
     height: Integer[Array, "*l"]
     offset: Integer[Array, "*l"]
-    """Of the level's first pixel in the packed target."""
+    """Offset of the level's first pixel in the packed target."""
     stride: Integer[Array, "*l"]
-    """From a pixel in the packed target to the one below it."""
+    """Pixels from one in the packed target to the one below it."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Levels:
     """Some pyramid levels of a camera, in the order in which they are searched.
 
     Attributes:
-        width: Of level 0, pixels.
-        height: Likewise.
+        width: Width of level 0, pixels.
+        height: Height of level 0, pixels.
         numbers: Which levels, coarsest first; 0 is the full image.
         points: Largest number of reference points of a level.
     """

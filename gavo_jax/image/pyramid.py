@@ -99,9 +99,9 @@ class Atlas(NamedTuple):
     """
 
     grey: Float[Array, "h+3 w+3"]
-    """`NO_PIXEL` in the margin and between the levels."""
+    """Grey levels; `NO_PIXEL` in the margin and between the levels."""
     inverse_depth: Float[Array, "h+3 w+3"]
-    """0 there."""
+    """Inverse depth, 1/m; 0 in the margin and between the levels."""
 
 
 NO_PIXEL = -1.0

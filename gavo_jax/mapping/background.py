@@ -27,7 +27,7 @@ class BackgroundMapper:
     What goes wrong there is raised by a later call.
 
     Args:
-        mapper: It; nobody else may use it meanwhile.
+        mapper: The mapper that works there; nobody else may use it meanwhile.
     """
 
     def __init__(self, mapper: Mapper):

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.mapping.keyframes import NEAREST, Keyframe
-from gavo_jax.mapping.motions import size
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MOST = 4
@@ -15,52 +15,52 @@ MOST = 4
 LOOKED_AT = 48
 """Earlier keyframes, those that see most of what the new one sees, that are compared with it: this bounds the work."""
 FEW_POINTS = 60
-"""Points that tell which these are."""
+"""Points of the new keyframe by which these are chosen."""
 MIN_SECONDS = 0.2
-"""Between the two: within that, the odometry's own keyframe saw both, and nothing is learnt."""
+"""Least time between the two keyframes: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
-"""Predicted share of either one's points that the other sees,"""
+"""Smallest predicted share of either keyframe's points that the other one sees."""
 MIN_LIKENESS = 0.88
-"""and correlation of what both see."""
+"""Smallest correlation of the grey of what both keyframes see."""
 APART = 2
 """Keyframes between two candidates: neighbours would say the same twice."""
 ANOTHER_GUESS = (0.02, 0.02)
 """Metres and radians by which a guess has to differ from one that led to nothing."""
 
 
-class Candidate(NamedTuple):
+class LoopCandidate(NamedTuple):
     """A pair of keyframes that may overlap."""
 
     earlier: Keyframe
     later: Keyframe
     later_T_earlier: Float64[np.ndarray, "4 4"]
-    """As it is known now: the guess."""
+    """The motion between the two as it is known now: the guess."""
     overlap: float
-    """Predicted, the smaller one of the two directions,"""
+    """Predicted share of the points of either keyframe that the other one sees, the smaller one of the two."""
     likeness: float
-    """and the correlation."""
+    """Correlation of the grey of what both see, the smaller one of the two directions."""
 
 
-def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Candidate]:
+def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[LoopCandidate]:
     """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
 
     Args:
-        new: The later one.
-        others: The earlier ones.
-        camera: Of their images.
+        new: The later keyframe.
+        others: The earlier keyframes.
+        camera: Camera of the keyframes' images.
     """
     possible = []
     for other in _most_overlapping(new, others, camera):
         later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
-        back = new.look.agreement(other.look, inverse(later_T_earlier), camera)
+        back = new.thumbnail.agreement(other.thumbnail, inverse(later_T_earlier), camera)
         if back[0] < MIN_OVERLAP or back[1] < MIN_LIKENESS:
             continue
-        there = other.look.agreement(new.look, later_T_earlier, camera)
+        there = other.thumbnail.agreement(new.thumbnail, later_T_earlier, camera)
         overlap, likeness = min(there[0], back[0]), min(there[1], back[1])
         if overlap >= MIN_OVERLAP and likeness >= MIN_LIKENESS:
-            possible.append(Candidate(other, new, later_T_earlier, overlap, likeness))
+            possible.append(LoopCandidate(other, new, later_T_earlier, overlap, likeness))
     possible.sort(key=lambda candidate: -candidate.likeness)
-    found: list[Candidate] = []
+    found: list[LoopCandidate] = []
     for candidate in possible:
         if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
             found.append(candidate)
@@ -70,7 +70,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
 def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
     """Those of some earlier keyframes that were not tried yet and see most of what a new one sees."""
     old = [o for o in others if new.timestamp - o.timestamp >= MIN_SECONDS and not _was_tried(new, o)]
-    points = new.look.points[:, :: max(1, new.look.points.shape[1] // FEW_POINTS)]
+    points = new.thumbnail.points[:, :: max(1, new.thumbnail.points.shape[1] // FEW_POINTS)]
     if not old or not points.size:
         return []
     old_T_new = inverse(np.stack([other.world_T_camera for other in old])) @ new.world_T_camera
@@ -89,5 +89,5 @@ def _was_tried(new: Keyframe, other: Keyframe) -> bool:
     if guess is None:
         return False
     later_T_earlier = inverse(new.world_T_camera) @ other.world_T_camera
-    changes = size(inverse(guess) @ later_T_earlier)
+    changes = length_and_angle(inverse(guess) @ later_T_earlier)
     return all(change < least for change, least in zip(changes, ANOTHER_GUESS, strict=True))

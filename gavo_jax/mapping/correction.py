@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float64, Int
 
 from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.mapper import Loops
-from gavo_jax.mapping.motions import between
 from gavo_jax.mapping.pose_graph import COUNTED
+from gavo_jax.rigid_motions import interpolate
 from gavo_jax.trajectory import Trajectory, inverse
 
 IN_DOUBT = 100.0
@@ -19,17 +19,17 @@ class Doubts(NamedTuple):
     """Which poses of a trajectory are no more than guesses."""
 
     guessed: Bool[np.ndarray, " n"]
-    """Of the motion to them: lost, or gone on with behind a body."""
+    """Poses whose motion from the one before is a guess: lost, or taken to have gone on behind a body."""
     lost: Bool[np.ndarray, " n"]
-    """Those of these that nothing was seen of."""
+    """Guessed poses of frames that were lost."""
 
 
 def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) -> Trajectory:
     """A trajectory of the odometry corrected as its keyframes were.
 
     Args:
-        odometry: It.
-        loops: The map.
+        odometry: The trajectory, as the odometry has it.
+        loops: The map, with its keyframes as they were corrected.
         doubts: Which poses are guesses; those that are lost are put between those around, if these belong together.
 
     Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
@@ -49,7 +49,7 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
         before = max(after - 1, 0)
         if 0 < after < len(stamps) and keyframes[before].segment == keyframes[after].segment:
             share = (passed[i] - at_keyframes[before]) / (at_keyframes[after] - at_keyframes[before])
-            poses[i] = between(corrections[before] @ pose, corrections[after] @ pose, float(share))
+            poses[i] = interpolate(corrections[before] @ pose, corrections[after] @ pose, float(share))
         else:
             nearest = after if _begins(keyframes, after, odometry.segments[i]) else before
             poses[i] = corrections[nearest] @ pose
@@ -71,7 +71,7 @@ def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
         for i in range(start + 1, end):
             if segments[start] == segments[i] == segments[end]:
                 share = (stamps[i] - stamps[start]) / (stamps[end] - stamps[start])
-                poses[i] = between(poses[start], poses[end], float(share))
+                poses[i] = interpolate(poses[start], poses[end], float(share))
     return Trajectory(stamps, poses, segments)
 
 

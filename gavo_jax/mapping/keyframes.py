@@ -11,7 +11,7 @@ from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
 from gavo_jax.image.settling import Still, still
-from gavo_jax.mapping.motions import size
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MAX_IMAGES = 300
@@ -23,23 +23,23 @@ SMALLER = 3
 """Pyramid level, from the keyframe's images, of the small blurred image that tells whether two keyframes look alike
 (Klein and Murray, ECCV 2008); 40 x 30 pixels of a frame of 640 x 480."""
 BLUR = 1.0
-"""Its pixels."""
+"""Standard deviation of that image's blur, in its pixels."""
 NEAREST = 0.05
-"""Metres in front of a camera from which on a point counts as seen,"""
+"""Metres in front of a camera from which on a point counts as seen."""
 FEWEST = 30
-"""and how many such points there have to be for two looks to be compared."""
+"""Fewest points that have to be seen for two thumbnails to be compared."""
 USUAL_DISTANCE = 2.0
-"""Metres, where depth says nothing."""
+"""Median depth, metres, that is taken where depth says nothing."""
 
 
-class Look(NamedTuple):
+class Thumbnail(NamedTuple):
     """A small blurred image, and where the things are that it shows."""
 
     small: Float32[np.ndarray, "h w"]
     points: Float64[np.ndarray, "3 n"]
-    """Of its pixels that have a reading, metres in the camera."""
+    """Points that its pixels with a reading show, metres in the camera."""
     grey: Float32[np.ndarray, " n"]
-    """Of these pixels."""
+    """Grey of these pixels."""
 
     @classmethod
     def of(cls, images: Still, camera: Camera) -> Self:
@@ -58,13 +58,15 @@ class Look(NamedTuple):
         """Median depth, metres."""
         return float(np.median(self.points[2])) if self.points.size else USUAL_DISTANCE
 
-    def agreement(self, other: "Look", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera) -> tuple[float, float]:
+    def agreement(
+        self, other: "Thumbnail", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera
+    ) -> tuple[float, float]:
         """How well another one shows the same from another pose.
 
         Args:
-            other: The other one.
-            other_T_self: The motion between them.
-            camera: Of the keyframes' images.
+            other: The other keyframe's thumbnail.
+            other_T_self: Maps points of this keyframe's camera into the other one's.
+            camera: Camera of the keyframes' images, half the size of the frames.
 
         Returns:
             Share of the points that it sees, and the correlation of their grey in the two; 0 where too few are seen.
@@ -80,8 +82,8 @@ class Look(NamedTuple):
         return float(inside.mean()), correlation(self.grey[inside], there)
 
 
-NOTHING_SEEN = Look(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
-"""Of a keyframe without images."""
+NOTHING_SEEN = Thumbnail(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))
+"""Thumbnail of a keyframe without images."""
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -97,15 +99,15 @@ class Keyframe:
 
     Attributes:
         number: Its place among the keyframes.
-        index: In the sequence.
-        timestamp: Seconds.
-        segment: Of the odometry's trajectory.
+        index: Index of the frame in the sequence.
+        timestamp: Colour stamp, seconds.
+        segment: Segment of the odometry's trajectory that it belongs to.
         world_T_odometry: Its pose by the odometry alone.
         world_T_camera: Its pose as it is known now.
         step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
             unknown.
-        images: Of half the size; None once they were given up.
-        look: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
+        images: Grey and depth at half the size; None once they were given up.
+        thumbnail: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
         features: Its keypoints, once they were needed.
     """
 
@@ -117,24 +119,24 @@ class Keyframe:
     world_T_camera: Float64[np.ndarray, "4 4"]
     step: Float64[np.ndarray, "6 6"] | None
     images: Still | None
-    look: Look
+    thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Earlier keyframes that it was aligned with, and the guess of that,"""
+    """Earlier keyframes that it was aligned with, by number, with the guess of that."""
     linked: set[int] = field(default_factory=set)
-    """and those to which that led to an edge."""
+    """Numbers of the earlier keyframes that it has an edge to."""
     features: Features | None = None
     in_doubt: bool = False
     """Whether something speaks against the odometry's motion from the keyframe before."""
 
     def give_up_images(self) -> None:
         """Forget all that is heavy; the pose stays."""
-        self.images, self.look, self.features = None, NOTHING_SEEN, None
+        self.images, self.thumbnail, self.features = None, NOTHING_SEEN, None
         self.tried.clear()
 
 
 def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.ndarray, "*n"]:
     """How far motions shift the image of things at a distance (m), about, in radians."""
-    length, angle = size(a_T_b)
+    length, angle = length_and_angle(a_T_b)
     return angle + length / max(distance, 0.1)
 
 
@@ -150,8 +152,8 @@ class Keyframes:
     """The keyframes of a run, in their order.
 
     Args:
-        camera: Of the frames as they come, without distortion.
-        most: Keyframes that keep their images, at least 2.
+        camera: Camera of the frames as they come, without distortion.
+        most: Largest number of keyframes that keep their images; at least 2.
     """
 
     def __init__(self, camera: Camera, most: int = MAX_IMAGES):
@@ -163,7 +165,7 @@ class Keyframes:
         if not self.all or self.all[-1].segment != segment:
             return True
         last = self.all[-1]
-        return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.look.distance) > SPACING)
+        return bool(shift(inverse(last.world_T_odometry) @ world_T_camera, last.thumbnail.distance) > SPACING)
 
     def make(
         self,
@@ -178,9 +180,9 @@ class Keyframes:
 
         Args:
             frame: The images.
-            index: In the sequence.
-            segment: Of the odometry's trajectory.
-            world_T_odometry: Its pose.
+            index: Index of the frame in the sequence.
+            segment: Segment of the odometry's trajectory that it belongs to.
+            world_T_odometry: Pose of the frame by the odometry alone.
             twist: Motion of the points in the camera at its moment, m/s and rad/s.
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """
@@ -195,7 +197,7 @@ class Keyframes:
             world_T_camera=np.array(world_T_odometry),
             step=step,
             images=images,
-            look=Look.of(images, self.camera),
+            thumbnail=Thumbnail.of(images, self.camera),
         )
 
     def add(self, keyframe: Keyframe) -> None:

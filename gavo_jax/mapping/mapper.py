@@ -11,22 +11,22 @@ from jaxtyping import Float64
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.mapping.candidates import Candidate, find_candidates
+from gavo_jax.mapping.candidates import LoopCandidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
-from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
+from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.status import GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 STEP_FLOOR = 5e-4
 """Metres and radians that a step of the odometry is off by beside what its covariance says."""
 DOUBTED = 0.1
-"""Metres and radians that stand for a motion which something speaks against,"""
+"""Metres and radians: standard deviation given to a motion that something speaks against."""
 UNTIED = 1.0
-"""and for one of which nothing is known."""
+"""Metres and radians: standard deviation given to a motion of which nothing is known."""
 GROWTH = 1.25
 """Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
 FIRST = 20
@@ -93,8 +93,8 @@ class Mapper:
         What moves on its own is no part of a map: two frames that show the same body would be tied by it.
 
         Args:
-            frame: It.
-            step: It.
+            frame: The frame.
+            step: What the driver says of it.
             moving: Where bodies are in the frame of a step.
         """
         if step is None:
@@ -149,8 +149,8 @@ class Mapper:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded.
 
         Args:
-            sequence: The run's.
-            steps: It had made.
+            sequence: The frames that the run is over.
+            steps: The steps that it had made.
             moving: Where bodies are in the frame of a step.
         """
         self.watch(_decoded(sequence, 0), None)
@@ -166,7 +166,7 @@ class Mapper:
         """Make the last frame a keyframe, look for loops once more with what is known now, and optimise.
 
         Args:
-            steps: Of the run, as later ones have shown them to be: more of them may be in doubt.
+            steps: The run's steps, as later ones have shown them to be: more of them may be in doubt.
         """
         if self._newest is not None:
             frame, step, twist = self._newest
@@ -223,8 +223,8 @@ class Mapper:
         before = self._known.get(_key(step.reference_timestamp))
         covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
         if before is not None and np.isfinite(covariance).all():
-            in_doubt = before.in_doubt or is_in_doubt(step)
-            self._known[_key(step.timestamp)] = _Way(carried(motion, before.covariance + covariance), in_doubt)
+            covariance = transport_covariance(motion, before.covariance + covariance)
+            self._known[_key(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
 
@@ -249,12 +249,12 @@ class Mapper:
             keyframe.linked.add(edge.earlier)
             self.edges.append(edge._replace(alignment=None))
 
-    def _candidates(self, keyframe: Keyframe) -> list[Candidate]:
+    def _candidates(self, keyframe: Keyframe) -> list[LoopCandidate]:
         """The loops that a keyframe may close."""
         earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
         return find_candidates(keyframe, earlier, self.keyframes.camera)
 
-    def _close(self, candidates: list[Candidate]) -> None:
+    def _close(self, candidates: list[LoopCandidate]) -> None:
         """Keep those loops that stand."""
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
             candidate.later.tried[candidate.earlier.number] = candidate.later_T_earlier

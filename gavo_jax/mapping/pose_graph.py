@@ -14,26 +14,26 @@ from scipy.sparse.linalg import splu
 from scipy.special import chdtri
 
 from gavo_jax.errors import GavoError
-from gavo_jax.mapping.motions import carried, log
 from gavo_jax.mapping.verification import Edge
+from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.trajectory import inverse
 
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
-"""GTSAM's order of a twist."""
+"""Places in a twist of ours in GTSAM's order: rotation first."""
 PROBABILITY = 0.99
-"""That the residual of a right loop stays below what makes a loop count as wrong."""
+"""Probability that the residual of a right loop stays below what makes a loop count as wrong."""
 REWEIGHTED = 2
 """Times that the odometry's weight is told anew and the graph optimised with it."""
 SECOND_CHANCES = 4
 """Times that the loops which fit are told anew."""
 IMPOSSIBLE = 1.0 - 1e-6
-"""That the residual of a right loop against the odometry alone stays below what makes a loop look wrong beforehand."""
+"""Probability that the residual of a right loop against the odometry alone stays below what makes it look wrong."""
 MISTRUST = 4.0
-"""On the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
+"""Factor on the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
 SCALES = (0.1, MISTRUST)
-"""Smallest and largest factor on the odometry's covariances that the loops may tell,"""
+"""Smallest and largest factor on the odometry's covariances that the loops may ask for."""
 BELIEF = 20.0
-"""and how many residuals' worth its covariances are believed beforehand."""
+"""Weight of the odometry's own covariances against what the loops say of them, as a number of residuals."""
 COUNTED = 0.5
 """Weight from which on a loop counts as right."""
 MOST_ROWS, PROBES = 512, 128
@@ -47,11 +47,11 @@ class Solution(NamedTuple):
 
     world_T_camera: Float64[np.ndarray, "n 4 4"]
     weights: Float64[np.ndarray, " loops"]
-    """Of each loop, 1 counted, 0 refused."""
+    """Weight of each loop, from 1 (counted) to 0 (refused)."""
     residuals: Float64[np.ndarray, "loops 6"]
     """δ of each loop in earlier_T_later · exp(δ) = what the poses say, metres and radians."""
     scale: float
-    """Of the odometry's covariances, as the loops tell."""
+    """Factor on the odometry's covariances, as the loops ask for."""
 
 
 def require_gtsam() -> Any:
@@ -146,12 +146,12 @@ def _plausible(
     chain, spread = [poses[0]], [np.zeros((6, 6))]
     for edge in odometry:
         chain.append(chain[-1] @ edge.earlier_T_later)
-        spread.append(spread[-1] + carried(chain[-1], edge.covariance))
+        spread.append(spread[-1] + transport_covariance(chain[-1], edge.covariance))
     result = []
     for edge in loops:
         said = inverse(chain[edge.earlier]) @ chain[edge.later]
         residual = log(inverse(edge.earlier_T_later) @ said)
-        drifted = carried(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
+        drifted = transport_covariance(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
         result.append(squared < chdtri(6, 1.0 - IMPOSSIBLE))
     return np.array(result)

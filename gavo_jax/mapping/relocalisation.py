@@ -13,14 +13,14 @@ from jaxtyping import Float32
 from gavo_jax.camera import Camera
 from gavo_jax.features import Features, detect, solve_motion
 from gavo_jax.image.settling import Still
-from gavo_jax.mapping.candidates import Candidate
-from gavo_jax.mapping.keyframes import Keyframe, Look
+from gavo_jax.mapping.candidates import LoopCandidate
+from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.verification import Edge, Verifier
 
 LOOKED_AT = 8
-"""Keyframes, those most like the frame, whose features are matched,"""
+"""Keyframes whose features are matched, those most like the frame."""
 ALIGNED = 4
-"""and of these those that are aligned, the best by matches."""
+"""Of these, the keyframes that are aligned, the best ones by matches."""
 MARGIN = 0.2
 """Share of a small image's width and height by which two may be shifted against each other and still look alike."""
 MIN_MATCHES = 15
@@ -55,16 +55,16 @@ class Recogniser:
             frame: Its poses say nothing.
             keyframes: The others, with their images.
         """
-        alike = sorted(keyframes, key=lambda other: -likeness(frame.look, other.look))[:LOOKED_AT]
+        alike = sorted(keyframes, key=lambda other: -likeness(frame.thumbnail, other.thumbnail))[:LOOKED_AT]
         seen = self._detect(frame)
-        guesses: list[tuple[int, Candidate]] = []
+        guesses: list[tuple[int, LoopCandidate]] = []
         for other in alike:
             motion = solve_motion(self._known(other), seen, self.camera)
             if motion is None or motion.inliers < MIN_MATCHES:
                 continue
-            _, agreement = other.look.agreement(frame.look, motion.target_T_reference, self.camera)
+            _, agreement = other.thumbnail.agreement(frame.thumbnail, motion.target_T_reference, self.camera)
             if agreement >= MIN_LIKENESS:
-                candidate = Candidate(other, frame, motion.target_T_reference, 1.0, agreement)
+                candidate = LoopCandidate(other, frame, motion.target_T_reference, 1.0, agreement)
                 guesses.append((motion.inliers, candidate))
         guesses.sort(key=lambda guess: -guess[0])
         candidates = [candidate for _, candidate in guesses[:ALIGNED]]
@@ -89,7 +89,7 @@ class Recogniser:
         return detect(images.grey, images.depth, self.camera)
 
 
-def likeness(a: Look, b: Look) -> float:
+def likeness(a: Thumbnail, b: Thumbnail) -> float:
     """Correlation of two small images at the shift that suits them best."""
     height, width = a.small.shape
     rows, columns = int(MARGIN * height), int(MARGIN * width)

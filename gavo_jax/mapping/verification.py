@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.pairs import Images, align_rows
-from gavo_jax.alignment.repetition import may_be_any_period
+from gavo_jax.alignment.repetition import another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
-from gavo_jax.mapping.candidates import MOST, Candidate
-from gavo_jax.mapping.motions import between, carried, size
+from gavo_jax.mapping.candidates import MOST, LoopCandidate
 from gavo_jax.precision import in_32_bits
+from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -36,16 +36,16 @@ SETTINGS = Settings(
 """Gauss-Newton from the guess, both ways. The images have half the size, so that a level here is the next coarser one
 of the frame's."""
 MIN_OVERLAP = 0.5
-"""Of the alignment, either way."""
+"""Smallest overlap of the alignment, there and back."""
 MAX_DISAGREEMENT = (0.02, 0.02)
 """Metres and radians between the motions found there and back."""
 FLOOR = 1e-3
 """Metres and radians that a pair of keyframes is off by beside what its covariance says: each keyframe's velocity,
 hence its rolling shutter, is known to a few per cent."""
 SIDE_BY_SIDE = min(os.cpu_count() or 1, 8)
-"""Lots of candidates."""
+"""Lots of candidates that are aligned at once."""
 SHARED = 4.0
-"""On the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
+"""Factor on the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
 
 
 class Edge(NamedTuple):
@@ -55,7 +55,7 @@ class Edge(NamedTuple):
     later: int
     earlier_T_later: Float64[np.ndarray, "4 4"]
     covariance: Float64[np.ndarray, "6 6"]
-    """Of δ in earlier_T_later · exp(δ), metres and radians."""
+    """Covariance of δ in earlier_T_later · exp(δ), metres and radians."""
     overlap: float = 1.0
     disagreement: tuple[float, float] = (0.0, 0.0)
     """Metres and radians between there and back."""
@@ -81,7 +81,7 @@ class Verifier:
         nothing = Images(np.zeros(size, np.uint8), np.zeros(size, np.uint16))
         self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
 
-    def verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+    def verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
         """Edges of the candidates that stand; None for the others. More than one keyframe's are asked about in the end,
         when nothing else is computed: several lots of them are aligned side by side.
         """
@@ -91,7 +91,7 @@ class Verifier:
         with ThreadPoolExecutor(min(SIDE_BY_SIDE, len(lots))) as workers:
             return [edge for edges in workers.map(in_32_bits(self._verify), lots) for edge in edges]
 
-    def _verify(self, candidates: list[Candidate]) -> list[Edge | None]:
+    def _verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
         """Align there, and back only what stands; each from the guess, so that they are two opinions."""
         guesses = [candidate.later_T_earlier for candidate in candidates]
         sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
@@ -105,14 +105,14 @@ class Verifier:
                 edges[k] = _edge(candidates[k], there[k], result)
         return edges
 
-    def _is_unique(self, candidate: Candidate, there: Alignment) -> bool:
+    def _is_unique(self, candidate: LoopCandidate, there: Alignment) -> bool:
         """Whether no other motion explains the images as well, as one does before a pattern that repeats itself. Which
         one it was, the map's guess does not tell: it drifts, and who knows by how much.
         """
         images = candidate.earlier.images
         assert images is not None
         motion = np.asarray(there.target_T_reference)
-        return not may_be_any_period(motion, there.error, np.inf, images.grey, images.depth, self.camera)
+        return not another_period_is_in_reach(motion, there.error, np.inf, images.grey, images.depth, self.camera)
 
     def _one_way(
         self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]
@@ -142,18 +142,18 @@ def _stands(result: Alignment) -> bool:
     return result.status == AlignmentStatus.OK and float(result.overlap) >= MIN_OVERLAP
 
 
-def _edge(candidate: Candidate, there: Alignment, back: Alignment) -> Edge | None:
+def _edge(candidate: LoopCandidate, there: Alignment, back: Alignment) -> Edge | None:
     """The edge of a candidate that was aligned there and back, if these agree."""
     by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
-    metres, radians = (float(part) for part in size(inverse(by_way_there) @ by_way_back))
+    metres, radians = (float(part) for part in length_and_angle(inverse(by_way_there) @ by_way_back))
     if metres > MAX_DISAGREEMENT[0] or radians > MAX_DISAGREEMENT[1]:
         return None
-    covariance = carried(inverse(by_way_there), np.asarray(there.covariance, np.float64))
+    covariance = transport_covariance(inverse(by_way_there), np.asarray(there.covariance, np.float64))
     covariance = 0.5 * (covariance + np.asarray(back.covariance, np.float64))
     return Edge(
         candidate.earlier.number,
         candidate.later.number,
-        between(by_way_there, by_way_back, 0.5),
+        interpolate(by_way_there, by_way_back, 0.5),
         SHARED * (covariance + FLOOR**2 * np.eye(6)),
         float(min(there.overlap, back.overlap)),
         (metres, radians),

@@ -59,9 +59,9 @@ def _independent_share(
 
 
 FULL_DEPTH_RATIO = 0.3
-"""Independent share of the depth residuals, over that of the grey ones, from which on depth has its whole weight;"""
+"""Independent share of the depth residuals, over that of the grey ones, from which on depth has its whole weight."""
 LEAST_DEPTH_TRUST = 1 / 3
-"""of which this part always stays."""
+"""Part of its weight that depth always keeps."""
 
 
 def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], scales: Scales) -> Float[Array, ""]:

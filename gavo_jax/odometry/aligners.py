@@ -17,16 +17,16 @@ import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from gavo_jax.alignment.judgement import is_unknown
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period
+from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
-from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.precision import in_32_bits
+from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -38,13 +38,13 @@ class Attempt(NamedTuple):
     state: Any
     """What it knows then, should the frame become the reference."""
     result: Alignment
-    """On the host."""
+    """The motion and what is known of it, on the host."""
     usable: bool
-    """Whether the motion can be used,"""
+    """Whether the motion can be used."""
     fit: bool = True
-    """and whether the frame may then become the reference."""
+    """Whether the frame may become the reference, should its motion be usable."""
     candidates: tuple[Population, ...] = ()
-    """Of the search, one entry per level, coarsest first; empty unless they are recorded."""
+    """Candidates of the search, one entry per level, coarsest first; empty unless they are recorded."""
     bodies: tuple[Seen, ...] = ()
     """What moves on its own, as far as that was asked."""
     unknown: int = 0
@@ -79,7 +79,7 @@ class Aligner(Protocol):
 
 
 BEGINNING = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
-"""Of a first frame."""
+"""Clock of a first frame."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +147,10 @@ class Search:
         and the next frame has no motion to expect: it would only repeat the error.
 
         Args:
-            state: Before the frame,
-            after: and with it.
-            result: On the host.
-            frame: The new one.
+            state: State before the frame.
+            after: State with the frame as the reference.
+            result: The search's result, on the host.
+            frame: The new frame.
             clock: When it was taken.
         """
         attempt = Attempt(after, result, result.status == AlignmentStatus.OK)
@@ -160,9 +160,9 @@ class Search:
         images = frame.grey, frame.depth, self.camera
         is_known = bool(np.any(np.asarray(state.motion)))
         if is_known:
-            is_open = may_be_another_period(motion, result.error, self.predict(state, seconds), *images)
+            is_open = another_period_fits_expected(motion, result.error, self.predict(state, seconds), *images)
         else:
-            is_open = may_be_any_period(motion, result.error, seconds, *images)
+            is_open = another_period_is_in_reach(motion, result.error, seconds, *images)
         if not is_open:
             return attempt
         attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
@@ -189,7 +189,7 @@ def expecting(state: Any, xi: Float64[np.ndarray, " 6"], seconds: float) -> Any:
 def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)
-    return state._replace(motion=still, guess=still, passing=still, seconds=jnp.float32(1.0))
+    return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(1.0))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:

@@ -12,25 +12,25 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera, inverse_depth, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import exp, log
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
 """Points across an image, on a regular grid: points of much contrast would lie at the edges of things."""
 SMALLEST_CHANGE = 0.01
-"""1/m, three times the noise of a structured-light sensor: points at which the motion and rest differ by less say
-nothing;"""
+"""1/m by which the motion and rest have to differ at a point for it to tell anything: three times the noise of a
+structured-light sensor."""
 CHANGED = 0.25
-"""nor do those that are not among this share of all, at which they differ most;"""
+"""Share of all points that are asked: those at which the motion and rest differ most."""
 LEAST_POINTS = 50
-"""nor so few."""
+"""Fewest points that tell anything."""
 EDGE = 0.05
 """1/m between neighbouring pixels, from which on two things lie beside each other."""
 REMEMBERED, MIN_REMEMBERED = 15, 8
 """Pairs of which the median tells, and the fewest that do."""
 MOST_LEFT = 0.7
-"""Of how depth changed, the part that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and 0.42
-with a body over 40 % of the image."""
+"""Largest part of the change of depth that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and
+0.42 with a body over 40 % of the image."""
 FLAT = 1e-4
 """Share of the nearest reading, in 1/m, by which readings differ at most that are one number."""
 LEAST_EXPLAINED = 0.95
@@ -46,9 +46,9 @@ class DepthChange(NamedTuple):
     delay: float
     """From its image to its depth, seconds."""
     velocity: tuple[float, ...] = ()
-    """Of the last motion that was found, a twist a second; empty before the first."""
+    """Velocity of the last motion that was found, a twist per second; empty before the first."""
     left: tuple[float, ...] = ()
-    """Of the last pairs, how much of what rest would leave unexplained the motion leaves."""
+    """Part of what rest would leave unexplained that the motion leaves, of each of the last pairs."""
 
     @property
     def usually_left(self) -> float:

@@ -40,9 +40,9 @@ class Step:
     """What the driver says of one new frame."""
 
     index: int
-    """Of the frame in the sequence; the first frame, 0, makes no step."""
+    """Index of the frame in the sequence; the first frame, 0, makes no step."""
     reference_timestamp: float
-    """Colour stamp of the reference, the last frame that was not lost, seconds."""
+    """Colour stamp of the frame that this one was aligned with, seconds."""
     timestamp: float
     alignment: Alignment
     """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded. Its status may be
@@ -58,7 +58,7 @@ class Step:
     segment: int = 0
     """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
     origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
-    """Of the pose: from the reference, from a keyframe of the map (then that is the pair's reference), or from nothing
+    """Where the pose comes from: the reference, a keyframe of the map (then that is the pair's reference), or nothing
     (a lost pair, or a motion that is taken to have gone on behind a body)."""
     bodies: tuple[Body, ...] = ()
     """What moves on its own, where the settings ask for that; see docs/bodies.md."""
@@ -83,9 +83,9 @@ class Found(NamedTuple):
     alignment: Alignment
     """With a keyframe as the reference."""
     timestamp: float
-    """Of the keyframe, seconds."""
+    """Colour stamp of the keyframe, seconds."""
     world_T_camera: Float64[np.ndarray, "4 4"]
-    """Of the frame, in the world of the odometry's segment that the keyframe belongs to."""
+    """Pose of the frame, in the world of the odometry's segment that the keyframe belongs to."""
     segment: int
 
 
@@ -102,17 +102,17 @@ MAX_HELD = 3
 MAX_DOUBTED = 15
 """The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
 POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
-"""Of frames that have a motion, but become the reference only where the old one is out of reach,"""
+"""Statuses of frames that have a motion, but become the reference only where the old one is out of reach."""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
-"""and of those that never do."""
+"""Statuses of frames that have a motion, but never become the reference."""
 DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
-"""Of frames that have a motion, but no depth of their own that could be trusted."""
+"""Statuses of frames that have a motion, but no depth of their own that could be trusted."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 
 
 Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
-"""Tells what moves in the frame of a step: `Step.moving`, or where the steps were read from files these."""
+"""Says which pixels move in a step's frame: `Step.moving`, or the masks of the run's folder."""
 
 
 def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:
@@ -120,7 +120,7 @@ def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:
     return step.moving
 
 
-class Outcome(NamedTuple):
+class FrameOutcome(NamedTuple):
     """What became of a frame, before a map is asked."""
 
     after: Progress
@@ -268,19 +268,19 @@ class Odometry:
             raise frame or FrameError("the first frame could not be read")
         return frame
 
-    def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> Outcome:
+    def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
         """Of a frame of which nothing can be used."""
         revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         after = self._lose(before, None, timestamp)
-        return Outcome(after, no_alignment(finding.status), lost=True, revises=revises)
+        return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
-    def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> Outcome:
+    def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
         """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
-            return Outcome(before, no_alignment(finding.status), lost=True)
-        return Outcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
+            return FrameOutcome(before, no_alignment(finding.status), lost=True)
+        return FrameOutcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
-    def _align(self, before: Progress, frame: Frame, finding: Finding) -> Outcome:
+    def _align(self, before: Progress, frame: Frame, finding: Finding) -> FrameOutcome:
         """Of a frame that is aligned."""
         clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
@@ -303,7 +303,7 @@ class Odometry:
             after = after._replace(depth=watch)
             if watch.told and not before.depth.told:
                 revises = max(revises, watch.spoken_of(before.last_index))
-        return Outcome(after, result, lost, attempt.candidates, bodies, revises)
+        return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
         """Look for a frame in the map, where it is the reference of a segment that is adrift."""

@@ -11,9 +11,9 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.judgement import UNKNOWN, is_unknown
 from gavo_jax.alignment.result import with_finding
-from gavo_jax.mapping.motions import between, log
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.plausibility import image_shift
+from gavo_jax.rigid_motions import interpolate, log
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -121,7 +121,7 @@ def _misplaced(poses: Sequence[np.ndarray], stamps: Float64[np.ndarray, " n"]) -
     """Which of some poses, the third among them, are of other moments than their stamps say, if any."""
     here, later = BEFORE, BEFORE + 1
     share = float((stamps[here] - stamps[here - 1]) / (stamps[later] - stamps[here - 1]))
-    changed = [{here: between(poses[here - 1], poses[later], share)}]
+    changed = [{here: interpolate(poses[here - 1], poses[later], share)}]
     changed += [{here: poses[k], k: poses[here]} for k in range(later, len(poses) - 1)]
     found, most = {}, MUCH_SMOOTHER
     for other in changed:

@@ -14,10 +14,10 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.datasets.base import Frame
-from gavo_jax.mapping.motions import size
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.plausibility import SMALLEST_SHIFT, TOLERANCE, image_shift, possible_change
 from gavo_jax.odometry.tracking import Clock
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -30,9 +30,9 @@ class Leap(NamedTuple):
 
     target_T_reference: Float64[np.ndarray, "4 4"]
     seconds: float
-    """In which a camera would have made it."""
+    """Seconds in which a camera would have made it."""
     timestamp: float
-    """Of the frame it leads to."""
+    """Stamp of the frame that it leads to, seconds."""
 
 
 def align_leaping(
@@ -42,7 +42,7 @@ def align_leaping(
 
     Args:
         aligner: Who aligns.
-        state: Its own.
+        state: The aligner's state before the frame.
         frame: The new frame.
         clock: When it was taken.
         leap: What the frame before may have been.
@@ -69,16 +69,16 @@ def align_leaping(
 def _goes_on(aligner: Aligner, state: object, clock: Clock, leap: Leap, since: float, attempt: Attempt) -> bool:
     """Whether a motion is one step further than a leap, rather than where the camera was expected without it."""
     motion = np.asarray(attempt.result.target_T_reference, np.float64)
-    onward = size(motion @ inverse(leap.target_T_reference) @ inverse(aligner.predict(state, since)))
+    onward = length_and_angle(motion @ inverse(leap.target_T_reference) @ inverse(aligner.predict(state, since)))
     if np.any(np.array(onward) > possible_change(since, leap.seconds) + np.array(TOLERANCE)):
         return False
-    stayed = size(motion @ inverse(aligner.predict(state, float(clock.elapsed))))
+    stayed = length_and_angle(motion @ inverse(aligner.predict(state, float(clock.elapsed))))
     return bool(image_shift(*onward) < image_shift(*stayed))
 
 
 def _seconds(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) -> float:
     """The time in which the camera, as fast as it was, makes a motion."""
     elapsed = float(clock.elapsed)
-    found = image_shift(*size(np.asarray(attempt.result.target_T_reference, np.float64)))
-    expected = image_shift(*size(aligner.predict(state, elapsed)))
+    found = image_shift(*length_and_angle(np.asarray(attempt.result.target_T_reference, np.float64)))
+    expected = image_shift(*length_and_angle(aligner.predict(state, elapsed)))
     return max(elapsed, min(elapsed * float(found) / max(float(expected), SMALLEST_SHIFT), LONGEST))

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.result import with_finding
-from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.plausibility import TOLERANCE, image_shift, possible_change
 from gavo_jax.odometry.tracking import Clock
+from gavo_jax.rigid_motions import exp, length_and_angle, log
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -39,7 +39,7 @@ def arrival_of(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) 
         aligner: Who aligned.
         state: What it knew before.
         clock: When the frame was taken.
-        attempt: Its own.
+        attempt: What it made of the frame.
     """
     seconds = float(clock.elapsed)
     expected = aligner.predict(state, seconds)
@@ -80,10 +80,10 @@ def is_misplaced(came: Arrival, onward: Float64[np.ndarray, "4 4"], seconds: flo
 
 def _is_possible(motion: np.ndarray, expected: np.ndarray, seconds: float) -> bool:
     """Whether a camera can have left its way that far by then."""
-    off = np.array(size(motion @ inverse(expected)))
+    off = np.array(length_and_angle(motion @ inverse(expected)))
     return bool(np.all(off <= possible_change(seconds, seconds) + np.array(TOLERANCE)))
 
 
 def _off(motion: np.ndarray, expected: np.ndarray) -> float:
     """By how much a motion moves the image otherwise than expected, about, in radians."""
-    return float(image_shift(*size(motion @ inverse(expected))))
+    return float(image_shift(*length_and_angle(motion @ inverse(expected))))

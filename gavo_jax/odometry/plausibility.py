@@ -38,11 +38,10 @@ SCENE_DISTANCE = 1.5
 SMALLEST_SHIFT = 0.005
 """Radians that the image moves by at least: the error of a camera at rest is the sensor's noise alone."""
 MIN_DEPTH_RATIO = 0.65
-"""Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`; a motion that is larger by a
-factor of this, or by more,"""
+"""Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`."""
 MOST_HIDDEN = 1.5
-"""may explain as much less: where up to twelve frames are dropped from the TUM clips the share stays at 0.54 of the
-usual one and more, while of a depth of other units it is 0.1 and less.
+"""Largest factor by which a motion above the usual lets less depth agree. Where up to twelve frames are dropped from
+the TUM clips, the share stays at 0.54 of the usual one and more; of a depth of other units it is 0.1 and less.
 """
 MAX_DEPTH_SCALE_RATIO = 6.0
 """Scale of the depth residuals over its usual value, above which a pair is `DEPTH_MISMATCH`: in a scene of about one
@@ -69,7 +68,7 @@ class Usual(NamedTuple):
     """How far the image moved, radians."""
     explained_depths: Float[Array, " n"]
     depth_scales: Float[Array, " n"]
-    """1/m."""
+    """Scales of the depth residuals, 1/m."""
 
     @classmethod
     def unknown(cls) -> "Usual":

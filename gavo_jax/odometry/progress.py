@@ -22,20 +22,20 @@ class Progress(NamedTuple):
     tracker: Any = None
     """The aligner's state; None while no usable frame was seen."""
     last_index: int = -1
-    """Of the last frame."""
+    """Index of the last frame in the sequence."""
     reference_timestamp: float = 0.0
     world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
     world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
-    """As recorded last."""
+    """Pose of the last frame, as it was recorded."""
     held: int = 0
-    """Frames since the reference was renewed,"""
+    """Frames since the reference was renewed."""
     way: Way = Way()
-    """and where the camera was found meanwhile."""
+    """Where the camera was found since then."""
     history: History = History()
     segment: int = 0
-    """Of the reference;"""
+    """Number of the segment that the reference belongs to."""
     last_segment: int = 0
-    """and the largest number that one was given."""
+    """Largest number given to a segment so far."""
     adrift: int = 0
     """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
     doubted: bool = False
@@ -47,9 +47,9 @@ class Progress(NamedTuple):
     arrival: Arrival | None = None
     """How the reference was reached, where its image may be of another moment."""
     beginning: Beginning | None = None
-    """Of the track, as long as it may have followed a body."""
+    """How the track began, as long as it may have followed a body."""
     depth: DepthWatch | None = None
-    """Of the reference, and how depth has changed; None before the first reference."""
+    """What is known of the reference's depth, and how depth has changed; None before the first reference."""
 
     def tracker_at(self, timestamp: float) -> Any:
         """The aligner's state for a frame of that stamp, with the motion that the way since the reference foretells."""

@@ -39,11 +39,11 @@ class OdometryRun:
     steps: list[Step]
     metrics: RunMetrics
     sequence: Sequence | None = field(default=None, repr=False)
-    """What was run over."""
+    """The frames that were run over; None where they are not kept."""
     odometry: Trajectory | None = None
-    """With loops: the trajectory before they corrected it,"""
+    """With loops, the trajectory before they corrected it."""
     loops: Loops | None = None
-    """and the map of keyframes."""
+    """With loops, the map of keyframes."""
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -126,7 +126,7 @@ def run_odometry(
     return OdometryRun(outcome.trajectory, outcome.steps, metrics, sequence, outcome.odometry, outcome.loops)
 
 
-class Outcome(NamedTuple):
+class RunOutcome(NamedTuple):
     """What a run comes to."""
 
     trajectory: Trajectory
@@ -135,7 +135,7 @@ class Outcome(NamedTuple):
     figures: dict[str, Any]
     """As metrics.json names them: `Metrics`, and with loops the errors before them and what the map holds."""
     odometry: Trajectory | None = None
-    """With loops: the trajectory before they corrected it."""
+    """With loops, the trajectory before they corrected it; else None."""
     loops: Loops | None = None
 
 
@@ -147,7 +147,7 @@ def conclude(
     seconds: float,
     compile_seconds: float,
     frames: int | None = None,
-) -> Outcome:
+) -> RunOutcome:
     """Look back on a run whose last frame was tracked: hindsight, then loops, then figures.
 
     Args:
@@ -173,9 +173,9 @@ def conclude(
         return {**compute_metrics(of, ground_truth, steps, seconds, compile_seconds)}
 
     if loops is None:
-        return Outcome(trajectory, steps, figures(trajectory))
+        return RunOutcome(trajectory, steps, figures(trajectory))
     of_loops = {**errors_before(figures(causal)), **loop_figures(loops)}
-    return Outcome(trajectory, steps, figures(trajectory) | of_loops, causal, loops)
+    return RunOutcome(trajectory, steps, figures(trajectory) | of_loops, causal, loops)
 
 
 def doubts_of(steps: list[Step]) -> Doubts:

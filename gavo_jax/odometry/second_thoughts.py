@@ -54,8 +54,9 @@ class Recovering(SecondThought):
     Attributes:
         first: What is asked first.
         second: What is asked where that is unusable; made when it is needed.
-        wide: What the second one searches with; its program is made when it is needed,
-        is_loaded: or by `warm_up`, where it was compiled before.
+        wide: What the second one searches with.
+        is_loaded: Whether `warm_up` loads the wide search's program, where it was compiled before; else it is made when
+            it is needed.
     """
 
     second: Callable[[], Aligner]

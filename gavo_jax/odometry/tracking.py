@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.search import Population, align_views
-from gavo_jax.alignment.sway import Swaying, Unrest
+from gavo_jax.alignment.sway import Swaying, VelocityChange
 from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
@@ -65,17 +65,17 @@ class TrackerState(NamedTuple):
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
     guess: Float[Array, " 6"]
-    """Of the next motion, if it took as long: the last one again, unless somebody knows better."""
-    passing: Float[Array, " 6"]
-    """What that twist would be, had the camera moved as it did at the previous frame's own moment."""
-    unrest: Unrest
+    """Twist expected of the next motion, if it took as long: the last one again, unless somebody knows better."""
+    instant_motion: Float[Array, " 6"]
+    """The same twist, had the camera moved all the time as it did at the previous frame's own moment."""
+    velocity_change: VelocityChange
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
-    """Time that motion took."""
+    """Time that the last motion took, seconds."""
     share: Float[Array, ""]
-    """Of the image, whose points take part in the next search: less where those of bodies are left out."""
+    """Share of the image whose points take part in the next search: less where those of bodies are left out."""
     exposure: Exposure
-    """Of the previous frame; the keyframe's points are as if taken with it."""
+    """Exposure of the previous frame; the keyframe's points are as if taken with it."""
     usual: Usual
 
 
@@ -83,10 +83,10 @@ class Clock(NamedTuple):
     """When a new frame was taken, as numbers of the program."""
 
     elapsed: Any
-    """Since the reference's colour image, seconds."""
+    """Time since the reference's colour image, seconds."""
     depth_delay: Any
-    """From the new colour image to the new depth image, seconds."""
-    frame: Any
+    """Time from the new colour image to the new depth image, seconds."""
+    index: Any
     """Index in the sequence; with the run's key it makes the frame's random numbers."""
 
 
@@ -103,9 +103,9 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
 
 
 KEYFRAME_SHARES = 16
-"""Shares of a keyframe's points that are renewed independently,"""
+"""Number of shares that a keyframe's points are dealt into, each renewed on its own."""
 KEYFRAME_SPREAD = 0.2
-"""each at its own overlap, evenly spread over a range of this width."""
+"""Width of the range over which the overlaps at which they are renewed are evenly spread."""
 
 
 def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overlap: Any) -> Reference:
@@ -174,8 +174,8 @@ def track_frame(
     exchanged = None
     if alignment.symmetric:
         exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
-    key = jax.random.fold_in(key, clock.frame)
-    swaying = Swaying(clock.elapsed, state.unrest) if options.sway else None
+    key = jax.random.fold_in(key, clock.index)
+    swaying = Swaying(clock.elapsed, state.velocity_change) if options.sway else None
     result, populations = align_views(
         views,
         packed,
@@ -194,13 +194,14 @@ def track_frame(
     result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
     motion = jnp.where(is_first, 0.0, result.xi)
     sway = jnp.where(is_first, 0.0, result.sway)
-    passing = motion + sway
+    instant_motion = motion + sway
     if options.synchronise:
-        target = _synchronised(raw, camera, delay * passing, finest)
+        target = _synchronised(raw, camera, delay * instant_motion, finest)
     newest = make_references(target, camera, levels)
     if readout is not None:
         unsettled = newest.row_time
-        newest, keyframe = settle_reference(newest, passing * readout), settle_reference(keyframe, motion * readout)
+        newest = settle_reference(newest, instant_motion * readout)
+        keyframe = settle_reference(keyframe, motion * readout)
         newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
     keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
     keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
@@ -209,16 +210,17 @@ def track_frame(
     )
     change = motion / clock.elapsed - state.motion / state.seconds
     was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
-    unrest = state.unrest.after(sway / clock.elapsed, change)
-    unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
+    velocity_change = state.velocity_change.after(sway / clock.elapsed, change)
+    changes = jnp.where(was_second, state.velocity_change.changes, velocity_change.changes)
+    velocity_change = velocity_change._replace(changes=changes)
     after_it = TrackerState(
         newest,
         keyframe,
         packed,
         motion,
         motion,
-        passing,
-        unrest,
+        instant_motion,
+        velocity_change,
         clock.elapsed,
         jnp.float32(1.0),
         exposure,
@@ -239,8 +241,8 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         previous_image=packed,
         motion=jnp.zeros(6),
         guess=jnp.zeros(6),
-        passing=jnp.zeros(6),
-        unrest=Unrest.unknown(),
+        instant_motion=jnp.zeros(6),
+        velocity_change=VelocityChange.unknown(),
         seconds=jnp.float32(1.0),
         share=jnp.float32(1.0),
         exposure=Exposure.of(pyramid),
@@ -262,8 +264,8 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         previous_image=Target(words, words),
         motion=still,
         guess=still,
-        passing=still,
-        unrest=Unrest.unknown(),
+        instant_motion=still,
+        velocity_change=VelocityChange.unknown(),
         seconds=np.float32(1.0),  # pyright: ignore[reportArgumentType]
         share=np.float32(1.0),  # pyright: ignore[reportArgumentType]
         exposure=Exposure(zero, zero),

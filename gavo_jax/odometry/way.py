@@ -17,7 +17,7 @@ class Fix(NamedTuple):
     """Where the camera was found."""
 
     seconds: float
-    """Since the reference."""
+    """Seconds since the reference."""
     xi: tuple[float, ...]
     """Twist of target_T_reference, metres and radians."""
 

@@ -32,18 +32,18 @@ class Mark(NamedTuple):
     """How far a growing file was."""
 
     size: int
-    """Bytes."""
+    """Length of the file, bytes."""
     sha256: str
-    """Of these bytes."""
+    """SHA-256 of these bytes."""
 
 
 class Checkpoint(NamedTuple):
     """Where a run stood."""
 
     progress: Progress
-    """After a usable frame, so that it has a tracker."""
+    """All that the driver knows; without a tracker where no usable frame was seen yet."""
     files: dict[str, Mark]
-    """By name, the files that grow with the run."""
+    """The files that grow with the run, by name."""
     images: str = ""
     """Digest of the images that were seen; see `SeenImages`."""
 

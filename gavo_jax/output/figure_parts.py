@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#8C7A1F")
-"""Of Okabe and Ito; the last two, of Tol's scheme, take the place of their yellow and black."""
+"""Colours of Okabe and Ito; the last two, of Tol's scheme, take the place of their yellow and black."""
 GREYS = (0.3, 0.6)
-"""Of other libraries' curves, the darkest and the lightest."""
+"""Greys of other libraries' curves, the darkest and the lightest."""
 LINES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 CAPTION_WIDTH, CAPTION_SIZE = 15, 8.5
@@ -67,7 +67,7 @@ def number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
 
 
 LABEL_HEIGHT = 0.05
-"""Of the panel's height, between the labels of two curves at least."""
+"""Share of the panel's height between the labels of two curves at least."""
 
 
 def label_ends(axes: Any) -> None:

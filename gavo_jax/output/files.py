@@ -30,7 +30,7 @@ BODIES = "bodies.csv"
 MOTIONS = "motions.csv"
 CHECKPOINT = "checkpoint.npz"
 COMPARISON = "comparison.json"
-"""Of `gavo compare`."""
+"""File that `gavo compare` writes."""
 RECORDING = "run.rrd"
 """What `--viewer save` writes."""
 VIEW = "view.rrd"
@@ -138,8 +138,8 @@ def refuse_foreign(folder: Path, file: str, what: str) -> None:
 
     Args:
         folder: The folder.
-        file: That tells.
-        what: It is of.
+        file: The file that tells of other results.
+        what: What that file is of, for the message.
 
     Raises:
         GavoError: The file is there.

@@ -22,12 +22,13 @@ FRAME_COLUMNS = (
     + DEVIATIONS
     + ("milliseconds", "segment", "statuses", "origin", "revises")
 )
-"""Of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the direction
-that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`), deviations
-of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's segment from
-0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the reference is
-then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body). The last one is how many
-of the pairs before are wrong, as is seen then: their status says so once the run has come to its end."""
+"""Columns of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the
+direction that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`),
+deviations of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's
+segment from 0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the
+reference is then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body). The last
+one is how many of the pairs before are wrong, as is seen then: their status says so once the run has come to its
+end."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
@@ -172,7 +173,7 @@ class RecordedRun(NamedTuple):
     config: dict[str, Any]
     trajectory: Trajectory
     steps: list[Step]
-    """Of each frame after the first; see `read_steps`."""
+    """The step of each frame after the first; see `read_steps`."""
 
 
 def read_run(folder: str | Path) -> RecordedRun:

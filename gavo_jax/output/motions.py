@@ -17,8 +17,8 @@ MOTION_COLUMNS = (
     + tuple(f"{name}_{row}{column}" for name in MATRICES for row in range(3) for column in range(4))
     + tuple(f"covariance_{row}{column}" for row, column in zip(*UPPER, strict=True))
 )
-"""Of motions.csv, one row per pair: the frame's index, stamps in seconds, the upper three rows of the pose and of the
-pair's motion, metres, and the upper triangle of its covariance, of (v, w), metres and radians."""
+"""Columns of motions.csv, one row per pair: the frame's index, stamps in seconds, the upper three rows of the pose and
+of the pair's motion, metres, and the upper triangle of its covariance, of (v, w), metres and radians."""
 
 
 def motion_row(step: Step) -> list[Any]:

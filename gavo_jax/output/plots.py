@@ -69,18 +69,18 @@ CAPTIONS = {
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
-"""By the name of the figure's files."""
+"""Caption of each figure, by the name of its files."""
 WITH_TRUTH = (
     " Ground truth: interpolated at the frames' stamps, laid on the first estimate at its first pose that the "
     "ground truth covers."
 )
-"""Of the trajectories' caption."""
+"""What the trajectories' caption ends with where there is a ground truth."""
 GAPS = " Gaps: too little of the view is left."
-"""Of the landscape's caption, where there are any."""
+"""What the landscape's caption ends with where there are gaps."""
 SEVERAL_RUNS = " Bars: median over the runs; whiskers: smallest and largest."
-"""Of the drift's caption."""
+"""What the drift's caption ends with where there are several runs."""
 MORE_THAN_THE_PAIR = " The motion was found with {}, too: the minimum of this pair alone may lie millimetres away."
-"""Of the landscape's caption."""
+"""What the landscape's caption ends with where more than the pair was searched."""
 
 
 def plot_distance_error(errors: Mapping[str, ErrorSeries], ours: Collection[str] = ()) -> Figure:
@@ -165,7 +165,7 @@ AXES = ("x, right", "−y, up", "z, forward")
 SIDES = np.array([-1.0, 1.0])
 HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 MARGIN = 1.3
-"""Of a panel's sides over those of what it holds: the start at an edge leaves room for its name."""
+"""Sides of a panel over those of what it holds: the start at an edge leaves room for its name."""
 
 
 def _half_widths(extent: Float[np.ndarray, " 3"], views: Sequence[tuple[int, int]]) -> Float[np.ndarray, " 2"]:

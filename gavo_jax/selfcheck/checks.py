@@ -358,7 +358,7 @@ def breed(solver: GeneticAlgorithm, seed: int, states: GeneticState, newcomers: 
 
 
 HALF_WIDTH = 4.0
-"""Of the box that generations are bred in, search units; a few offspring meet it."""
+"""Half-width of the box that generations are bred in, search units; a few offspring meet it."""
 
 
 def generation_deviation(islands: int, population: int) -> float:

@@ -51,7 +51,7 @@ class Scene(NamedTuple):
     target_grey: np.ndarray
     """[h, w], whole grey levels."""
     plane: tuple[float, float, float]
-    """a, b, c of the target's inverse depth a + b u + c v, 1/m and 1/m a pixel."""
+    """Coefficients a, b, c of the target's inverse depth a + b u + c v, 1/m and 1/m per pixel."""
     x: np.ndarray
     """[n] of the points' rays (x, y, 1), float32 like all that the kernels are given."""
     y: np.ndarray
@@ -64,7 +64,7 @@ class Scene(NamedTuple):
 
 
 PLANE = (0.5, 1 / 4096, -1 / 4096)
-"""Of a target; packed without loss, so that its inverse depth is continuous from block to block."""
+"""Plane of a target; packed without loss, so that its inverse depth is continuous from block to block."""
 
 
 def texture(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -140,7 +140,7 @@ class Residuals(NamedTuple):
     """Slope of the target along u, grey levels a pixel; `grey_v` along v."""
     grey_v: np.ndarray
     warped: Warped
-    """Of all points."""
+    """All points, warped."""
 
 
 def residuals(scene: Scene, target_T_reference: np.ndarray) -> Residuals:
@@ -242,7 +242,7 @@ class Breeding(NamedTuple):
     crossover_range: float
     mutation_step: float
     half_width: float
-    """Of the search box, search units."""
+    """Half-width of the search box, search units."""
 
 
 EDGE, TAIL = 1e-5, 1e-3

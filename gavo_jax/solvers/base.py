@@ -51,7 +51,7 @@ class Best(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """The candidates that a state holds, for what wants to look at them (covariance, modes, viewer)."""
+    """The candidates that a state holds, kept for the viewer and the figures of a search."""
 
     x: Float[Array, "p 6"]
     error: Float[Array, " p"]

@@ -75,7 +75,7 @@ class Scene:
         self._frame, self._generation = 0, 0
         self._segment = 0
         self._world_T_camera: Float64[np.ndarray, "4 4"] | None = None
-        """Of the last frame, where the motion from there is known."""
+        """Pose of the last frame, where the motion from there is known."""
         self._seen = SeenCubes()
         self._bodies: dict[int, Float64[np.ndarray, " 3"]] = {}
         """Where the bodies of the last frame are, by number."""

@@ -13,7 +13,7 @@ from gavo_jax.viewer.colors import PARTICLE_COLORS
 MAX_PARTICLES = 256
 """Particles shown of a generation; of a larger one every k-th by rank, the best included."""
 MILLIMETRES = 1e3
-"""Of the search space: its particles lie millimetres apart."""
+"""Millimetres per metre: the search space is drawn in them, as its particles lie millimetres apart."""
 KEY = (
     "RMSE of the best particle, in grey levels. Particles: blue is best. White: the last camera. Green star: the true "
     "next one, where the arrow leads. The time line `generation` steps through."
@@ -30,11 +30,11 @@ class Level(NamedTuple):
     centre: Float[np.ndarray, " 3"]
     half_sizes: Float[np.ndarray, " 3"]
     number: int
-    """Of the pyramid's level."""
+    """Number of the pyramid's level."""
     particles: int
-    """Of a generation, shown or not."""
+    """Particles of a generation, shown or not."""
     rmse: Float[np.ndarray, " g"]
-    """Of each generation's best particle, grey levels."""
+    """Root mean square residual of each generation's best particle, grey levels."""
 
     def states(self, errors: Float[np.ndarray, " g"] | None = None) -> list[str]:
         """Return each generation's state, as Markdown; `errors` are those of the best particles, mm, where known."""

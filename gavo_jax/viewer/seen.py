@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 CUBE = 0.03
-"""Metres."""
+"""Side of the cubes, metres."""
 FARTHEST = 4.0
 """Metres; the depth of what is beyond is too uncertain."""
 MOST_POINTS = 300_000

@@ -13,9 +13,9 @@ from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
 
 DISTANCE = 1.5
-"""Metres to the wall,"""
+"""Metres to the wall."""
 SLIDE = np.array([0.01, 0.004])
-"""and how far the camera slides along it, right and down."""
+"""Metres that the camera slides along the wall, right and down."""
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

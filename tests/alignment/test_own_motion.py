@@ -9,7 +9,7 @@ from gavo_jax.alignment.result import no_alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.mapping.motions import exp, size
+from gavo_jax.rigid_motions import exp, length_and_angle
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -40,7 +40,7 @@ def test_a_rolling_shutter_is_told_from_the_motion() -> None:
         for readout, found in errors.items():
             result = refine_moving(*pair, replace(CAMERA, readout=readout), truth @ ASIDE)
             assert result is not None
-            found.append(float(size(inverse(truth) @ result.target_T_reference)[0]))
+            found.append(float(length_and_angle(inverse(truth) @ result.target_T_reference)[0]))
             if readout:
                 deviation = float(np.sqrt(np.diag(result.covariance)[:3].max()))
                 assert found[-1] < 2.0 * deviation

@@ -9,7 +9,7 @@ from small import ALONE, CAMERA
 
 import gavo_jax as gavo
 from gavo_jax import se3
-from gavo_jax.alignment.repetition import may_be_another_period, may_be_any_period, repetitions
+from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach, repetitions
 from gavo_jax.datasets.synthetic import SyntheticSequence
 
 SETTINGS = replace(gavo.preset("gauss-newton"), odometry=ALONE)
@@ -116,24 +116,24 @@ def test_a_motion_whose_error_is_far_below_what_a_period_changes_is_not_off_by_i
     """On a wall that grows brighter to the right."""
     grey = np.round(wall(24.0) * 0.8 + 0.3 * np.arange(CAMERA.width)).astype(np.uint8)
     assert (24, 0) in pixels(grey)
-    assert may_be_another_period(moved_by(9.0), 200.0, np.eye(4), grey, DEPTH, CAMERA)
-    assert not may_be_another_period(moved_by(9.0), 5.0, np.eye(4), grey, DEPTH, CAMERA)
+    assert another_period_fits_expected(moved_by(9.0), 200.0, np.eye(4), grey, DEPTH, CAMERA)
+    assert not another_period_fits_expected(moved_by(9.0), 5.0, np.eye(4), grey, DEPTH, CAMERA)
 
 
 def test_a_motion_is_doubted_from_a_third_of_a_period_on() -> None:
     grey = wall(24.0)
     still = np.eye(4)
-    assert not may_be_another_period(moved_by(6.0), 4.0, still, grey, DEPTH, CAMERA)
-    assert may_be_another_period(moved_by(9.0), 4.0, still, grey, DEPTH, CAMERA)
-    assert not may_be_another_period(moved_by(9.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "as was expected"
-    assert may_be_another_period(moved_by(-14.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "a period off"
+    assert not another_period_fits_expected(moved_by(6.0), 4.0, still, grey, DEPTH, CAMERA)
+    assert another_period_fits_expected(moved_by(9.0), 4.0, still, grey, DEPTH, CAMERA)
+    assert not another_period_fits_expected(moved_by(9.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "as was expected"
+    assert another_period_fits_expected(moved_by(-14.0), 4.0, moved_by(10.0), grey, DEPTH, CAMERA), "a period off"
 
 
 def test_where_nothing_was_known_any_period_counts_that_a_hand_reaches() -> None:
     grey = wall(24.0)
-    assert may_be_any_period(moved_by(3.0), 4.0, np.inf, grey, DEPTH, CAMERA)
-    assert may_be_any_period(moved_by(3.0), 4.0, 0.1, grey, DEPTH, CAMERA)
-    assert not may_be_any_period(moved_by(3.0), 4.0, 0.005, grey, DEPTH, CAMERA)
+    assert another_period_is_in_reach(moved_by(3.0), 4.0, np.inf, grey, DEPTH, CAMERA)
+    assert another_period_is_in_reach(moved_by(3.0), 4.0, 0.1, grey, DEPTH, CAMERA)
+    assert not another_period_is_in_reach(moved_by(3.0), 4.0, 0.005, grey, DEPTH, CAMERA)
 
 
 def test_align_says_so_of_a_slanted_wall_too() -> None:

@@ -17,10 +17,10 @@ from gavo_jax import program_cache
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies import motions
-from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, Candidate, _judged
+from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
 from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
-from gavo_jax.bodies.identity import Roll, identify, parts
+from gavo_jax.bodies.identity import Roll, associate, body_components
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
 from gavo_jax.datasets.base import Frame
@@ -124,8 +124,8 @@ def test_a_body_is_found_where_it_is() -> None:
     roll = Roll.empty(Retina(CAMERA, TRACKED).size)
     for index, belief in enumerate(beliefs(sequence)[1:], start=2):
         moving = np.asarray(belief.moving)
-        labels = parts(moving, np.asarray(belief.known), roll.labels > 0)
-        roll = identify(labels, roll)
+        labels = body_components(moving, np.asarray(belief.known), roll.labels > 0)
+        roll = associate(labels, roll)
         field = np.where(labels == 1, moving, -1.0).astype(np.float32)
         mask = in_world(Seen(1, field, 0.0, np.zeros(3)), np.eye(4), np.eye(4), (CAMERA.height, CAMERA.width)).mask
         true = sequence.mask(index)
@@ -358,7 +358,7 @@ def judged(finding: AlignmentStatus, *, grey: float, depth: float, support: floa
     belief = Belief(2 * covered - 1, 2 * covered - 1, *shares, image, image, jnp.ones(2))
     result = no_alignment(finding)
     result = result._replace(explained=result.explained._replace(grey=np.float32(grey), depth=np.float32(depth)))
-    best = Candidate(Attempt(None, result, usable=False), belief)
+    best = MotionCandidate(Attempt(None, result, usable=False), belief)
     return _judged(best, [best], known=True).result
 
 
@@ -391,23 +391,23 @@ def test_a_motion_that_more_of_the_image_contradicts_may_be_a_bodys(
 
 def test_what_is_thin_is_no_body() -> None:
     nowhere = np.zeros((60, 80), bool)
-    assert set(np.unique(parts(field(BOX, THIN), field(BOX, THIN), nowhere))) == {0, 1}
-    assert not np.any(parts(field(THIN), field(THIN), nowhere))
+    assert set(np.unique(body_components(field(BOX, THIN), field(BOX, THIN), nowhere))) == {0, 1}
+    assert not np.any(body_components(field(THIN), field(THIN), nowhere))
 
 
 def test_a_body_that_was_known_needs_less() -> None:
     nowhere, there = np.zeros((60, 80), bool), field(BOX) > 0
     little = 0.2 * field(BOX)
-    assert not np.any(parts(field(BOX), little, nowhere))
-    assert np.any(parts(field(BOX), little, there))
+    assert not np.any(body_components(field(BOX), little, nowhere))
+    assert np.any(body_components(field(BOX), little, there))
 
 
 def test_the_largest_part_needs_less_where_depth_disagrees() -> None:
     nowhere, both = np.zeros((60, 80), bool), field(BOX, OTHER)
     little = 0.25 * both
-    assert not np.any(parts(both, little, nowhere))
-    assert set(np.unique(parts(both, little, nowhere, explains=True))) == {0, 1}
-    assert not np.any(parts(both, 0.05 * both, nowhere, explains=True))
+    assert not np.any(body_components(both, little, nowhere))
+    assert set(np.unique(body_components(both, little, nowhere, depth_disagrees=True))) == {0, 1}
+    assert not np.any(body_components(both, 0.05 * both, nowhere, depth_disagrees=True))
 
 
 def test_points_that_are_left_out_are_not_asked_for() -> None:
@@ -432,7 +432,7 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     blank = aware.blank_state()
     part = np.zeros(aware.retina.size, bool)
     part[10:30, 10:30] = True
-    before = identify(part.astype(np.int32), Roll.empty(part.shape))
+    before = associate(part.astype(np.int32), Roll.empty(part.shape))
     state = blank._replace(scene=blank.scene._replace(roll=before))
     belief: Any = SimpleNamespace(moving=part.astype(np.float32))
     frame: Any = None
@@ -446,11 +446,11 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
 
 def test_bodies_keep_their_numbers() -> None:
     nowhere = np.zeros((60, 80), bool)
-    both = parts(field(BOX, OTHER), field(BOX, OTHER), nowhere)
-    roll = identify(both, Roll.empty((60, 80)))
+    both = body_components(field(BOX, OTHER), field(BOX, OTHER), nowhere)
+    roll = associate(both, Roll.empty((60, 80)))
     number = roll.labels[20, 20]
     moved = np.s_[12:32, 14:34]
-    alone = identify(parts(field(moved), field(moved), nowhere), roll)
+    alone = associate(body_components(field(moved), field(moved), nowhere), roll)
     assert alone.labels[20, 20] == number
-    again = identify(both, alone)
+    again = associate(both, alone)
     assert set(again.numbers[again.numbers > 0]) == {1, 2} and again.labels[20, 20] == number

@@ -19,13 +19,13 @@ from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
-from gavo_jax.mapping.motions import exp, log
 from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.presets import preset
+from gavo_jax.rigid_motions import exp, log
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus, bit
@@ -323,15 +323,15 @@ def test_what_the_images_do_not_tell_goes_on_as_before() -> None:
     sharp = np.diag([1e-8, 0.25, 1e-8, 1e-8, 1e-8, 1e-8])
     attempt = Attempt(blank.tracker, result_of(sharp), usable=False)
     clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
-    completed = aware._go_on(state, clock, attempt, covered=0.1)
+    completed = aware._helped_by_prediction(state, clock, attempt, covered=0.1)
     assert completed.usable and completed.unknown == 0
     assert completed.result.target_T_reference[:3, 3] == pytest.approx([0.02, 0.03, 0.0], abs=1e-3)
     assert completed.result.status is AlignmentStatus.LOW_TEXTURE
     variances = np.diag(completed.result.covariance)
     assert variances[0] == pytest.approx(1e-8, rel=0.1) and variances[1] == pytest.approx(1e-4, rel=0.1)
     blind = attempt._replace(result=result_of(np.full((6, 6), np.nan)))
-    assert aware._go_on(state, clock, blind, covered=0.1) is blind
-    guessed = aware._go_on(state, clock, blind, covered=0.9)
+    assert aware._helped_by_prediction(state, clock, blind, covered=0.1) is blind
+    guessed = aware._helped_by_prediction(state, clock, blind, covered=0.9)
     assert guessed.usable and guessed.unknown == 1
 
 
@@ -348,7 +348,7 @@ def test_what_goes_on_beside_what_is_known_leaves_that_alone_while_the_camera_tu
     found = exp(truth) @ exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
     attempt = Attempt(blank.tracker, vague._replace(target_T_reference=found), usable=False)
     clock = Clock(elapsed, np.float32(0), np.uint32(1))
-    result = aware._go_on(state, clock, attempt, covered=0.1).result
+    result = aware._helped_by_prediction(state, clock, attempt, covered=0.1).result
     off = log(inverse(exp(truth)) @ result.target_T_reference)
     assert np.all(np.abs(off) < 1e-4 + np.sqrt(np.diag(result.covariance)))
 

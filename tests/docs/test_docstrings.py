@@ -1,10 +1,11 @@
-"""Names of this package that its docstrings mention are there."""
+"""Docstrings stand alone, and the names of this package that they mention are there."""
 
 import ast
 import importlib
 import re
 from pathlib import Path
 
+import pytest
 from pages import ROOT
 
 from gavo_jax.camera import Camera
@@ -13,6 +14,11 @@ from gavo_jax.settings import AlignmentOptions, OdometryOptions
 PACKAGE = ROOT / "gavo_jax"
 PATHS = sorted(PACKAGE.rglob("*.py"))
 DOTTED = re.compile(r"`([a-z_]\w*(?:\.\w+)+)`")
+WRITTEN = [
+    path for folder in ("gavo_jax", "benchmarks", "examples", "tests") for path in sorted((ROOT / folder).rglob("*.py"))
+]
+SMALL_WORD = re.compile(r"[a-z]+[,.:;]?(\s|$)")
+"""A word that goes on a sentence; symbols, units, files' and other names have more than small letters."""
 FILES = (".json", ".csv", ".toml")
 """Endings of what is a file's name."""
 VALUES = {"camera": Camera, "alignment": AlignmentOptions, "odometry": OdometryOptions}
@@ -35,12 +41,22 @@ def modules() -> dict[str, list[str]]:
 MODULES = modules()
 
 
+def docstrings(source: str) -> list[tuple[int, str]]:
+    """Line and text of all docstrings of a file, those of constants and fields included."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
+    texts = [(node.lineno, node.value.value) for node in nodes if isinstance(node.value, ast.Constant)]
+    return [(line, text.strip()) for line, text in texts if isinstance(text, str)]
+
+
+def stands_alone(docstring: str) -> bool:
+    """Whether a docstring neither goes on what stands before it nor is gone on with after it."""
+    return not SMALL_WORD.match(docstring) and not docstring.endswith((",", ";"))
+
+
 def mentioned(path: Path) -> set[str]:
     """Dotted names in a file's docstrings that begin with a module of ours, from the package's own on."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Expr))
-    docstrings = (text.value for text in texts if isinstance(text, ast.Constant) and isinstance(text.value, str))
-    names = {name.removeprefix("gavo_jax.") for text in docstrings for name in DOTTED.findall(text)}
+    texts = [text for _, text in docstrings(path.read_text(encoding="utf-8"))]
+    names = {name.removeprefix("gavo_jax.") for text in texts for name in DOTTED.findall(text)}
     return {name for name in names if name.partition(".")[0] in MODULES and not name.endswith(FILES)}
 
 
@@ -72,6 +88,36 @@ def test_names_in_docstrings_are_there() -> None:
     assert not wrong
 
 
+def test_names_on_the_page_of_the_method_are_there_and_whole() -> None:
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    names = {name.removeprefix("gavo_jax.") for name in DOTTED.findall(text) if not name.endswith(".py")}
+    ours = sorted(name for name in names if name.partition(".")[0] in MODULES)
+    tops = {path.stem for path in PACKAGE.iterdir()}
+    assert ours and not [name for name in ours if name.partition(".")[0] not in tops or not is_there(name)]
+
+
 def test_what_is_not_there_is_told() -> None:
     assert is_there("objective.losses.LOSSES") and is_there("alignment.points") and is_there("pyramid.halve_grey")
     assert not is_there("objective.LOSSES") and not is_there("camera.focal") and not is_there("solvers.base.Nobody")
+
+
+def test_docstrings_stand_alone() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {text}"
+        for path in WRITTEN
+        for line, text in docstrings(path.read_text(encoding="utf-8"))
+        if not stands_alone(text)
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("text", ["and the largest one.", "Metres to the wall,", "metres", "radians: of it.", "One;"])
+def test_a_docstring_that_goes_on_is_told(text: str) -> None:
+    assert not stands_alone(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["m/s and rad/s.", "c² log(1 + s/c²).", "target_T_reference of it.", "frames.csv: rows."]
+)
+def test_a_docstring_may_begin_with_a_symbol_or_a_name(text: str) -> None:
+    assert stands_alone(text)

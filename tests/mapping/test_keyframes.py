@@ -14,16 +14,16 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.sensor_noise import NONE
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.image.settling import still
-from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, Candidate, find_candidates
+from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper
-from gavo_jax.mapping.motions import exp, log, size
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import doubts_of, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
+from gavo_jax.rigid_motions import exp, length_and_angle, log
 from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
@@ -179,7 +179,7 @@ def test_loops_bring_the_end_back_to_where_it_was():
     trajectory = correct(causal, loops)
     truth = WALK.ground_truth.world_T_camera
     end = inverse(truth[0]) @ truth[-1]
-    before, after = (size(inverse(end) @ of.world_T_camera[-1]) for of in (causal, trajectory))
+    before, after = (length_and_angle(inverse(end) @ of.world_T_camera[-1]) for of in (causal, trajectory))
     assert loop_figures(loops)["loops"] > 0 == loop_figures(loops)["loops_refused"]
     assert before[0] > 0.03 and after[0] < 0.15 * before[0] and after[1] < 0.2 * before[1]
     again = Mapper(CAMERA)
@@ -304,7 +304,7 @@ def test_a_frame_is_found_in_the_map_and_another_room_is_not():
         mapper.keyframes.add(keyframe)
     found = mapper.find(WALK[5], segment=1)
     assert found is not None and found.segment == 0
-    metres, radians = size(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
+    metres, radians = length_and_angle(inverse(inverse(truth[0]) @ truth[5]) @ found.world_T_camera)
     assert metres < 0.03 and radians < 0.03
     assert mapper.find(SyntheticSequence(1, seed=7, camera=CAMERA)[0], segment=1) is None
     assert mapper.find(WALK[5], segment=0) is None  # to its own segment nothing has to tie it
@@ -364,7 +364,7 @@ def test_before_tiles_that_repeat_nothing_ties_two_keyframes():
     earlier, later = (mapper.keyframes.make(tiled(s), 0, 0, np.eye(4), np.zeros(6)) for s in (0.0, 96.0))
     mapper.keyframes.add(earlier)
     near_the_last_tile = exp(np.array([-24.0 * 1.5 / 525, 0, 0, 0, 0, 0]))
-    assert mapper.verifier.verify([Candidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
+    assert mapper.verifier.verify([LoopCandidate(earlier, later, near_the_last_tile, 1.0, 1.0)]) == [None]
     assert mapper.find(tiled(96.0), segment=1) is None
 
 
@@ -376,7 +376,7 @@ def test_many_candidates_are_verified_side_by_side_to_the_same_edges():
         mapper.keyframes.add(keyframe)
     poses = sequence.ground_truth.world_T_camera
     guesses = [inverse(pose) @ poses[0] for pose in poses[1:]]
-    many = [Candidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
+    many = [LoopCandidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
     alone = [edge for candidate in many for edge in mapper.verifier.verify([candidate])]
     together = mapper.verifier.verify(many)
     assert len(many) > MOST and [edge is None for edge in together] == [edge is None for edge in alone]

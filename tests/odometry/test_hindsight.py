@@ -10,11 +10,11 @@ import pytest
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import no_alignment, with_finding
-from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.frames import read_run
 from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.mapping.motions import exp
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.misplaced import Arrival, is_misplaced
+from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus as Status
 from tests.odometry.test_leaps import real
 

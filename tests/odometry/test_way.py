@@ -7,9 +7,9 @@ import pytest
 from small import ALONE, CAMERA
 
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.mapping.motions import exp, size
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.way import Way
+from gavo_jax.rigid_motions import exp, length_and_angle
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
@@ -54,5 +54,5 @@ def test_a_camera_that_turns_is_followed_while_depth_is_missing() -> None:
     assert {step.alignment.status for step in steps[2:14]} == {AlignmentStatus.NO_DEPTH}
     truth = sequence.ground_truth.world_T_camera
     for step in steps:
-        metres, radians = size(inverse(inverse(truth[0]) @ truth[step.index]) @ step.world_T_camera)
+        metres, radians = length_and_angle(inverse(inverse(truth[0]) @ truth[step.index]) @ step.world_T_camera)
         assert metres < 0.02 and radians < 0.01

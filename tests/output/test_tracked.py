@@ -37,7 +37,7 @@ class CompilesLate(StandIn):
         self.program: Any = CachedProgram(slowly_traced)
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        if clock.frame == 2:
+        if clock.index == 2:
             self.program(np.zeros(3, np.float32))
         return Attempt(frame.timestamp, no_alignment(AlignmentStatus.OK)._replace(target_T_reference=np.eye(4)), True)
 

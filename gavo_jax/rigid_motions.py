@@ -1,4 +1,4 @@
-"""Rigid motions in double precision on the host: what chains of many need, and graphs of them."""
+"""Rigid motions in double precision on the host, as chains and graphs of many need them; `se3` is for the device."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -8,7 +8,7 @@ from gavo_jax.trajectory import inverse, quaternion_from_rotation
 
 
 def log(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 6"]:
-    """ξ = (v, w) of a rigid motion, metres and radians."""
+    """Twist ξ = (v, w) of a rigid motion, metres and radians."""
     *axis, cosine = quaternion_from_rotation(a_T_b[:3, :3])
     sine = float(np.linalg.norm(axis))
     w = np.array(axis) * (2.0 * np.arctan2(sine, cosine) / sine if sine > 0 else 2.0)
@@ -24,7 +24,7 @@ def exp(xi: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
     return result
 
 
-def between(
+def interpolate(
     start: Float64[np.ndarray, "4 4"], end: Float64[np.ndarray, "4 4"], share: float
 ) -> Float64[np.ndarray, "4 4"]:
     """The pose at a share of the way from one pose to another, along the screw that joins them."""
@@ -32,7 +32,7 @@ def between(
 
 
 def adjoint(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
-    """A with a_T_b · exp(δ) = exp(A δ) · a_T_b."""
+    """The adjoint A of a rigid motion: a_T_b · exp(δ) = exp(A δ) · a_T_b."""
     result = np.zeros((6, 6))
     rotation = a_T_b[:3, :3]
     result[:3, :3] = result[3:, 3:] = rotation
@@ -40,8 +40,10 @@ def adjoint(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
     return result
 
 
-def carried(a_T_b: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
-    """The covariance of Aδ, for a step δ in b seen as one in a."""
+def transport_covariance(
+    a_T_b: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
+) -> Float64[np.ndarray, "6 6"]:
+    """The covariance A Σ Aᵀ in a of a step δ in b whose covariance is Σ; A is the adjoint of a_T_b."""
     step = adjoint(a_T_b)
     return step @ covariance @ step.T
 
@@ -51,13 +53,15 @@ def cross(a: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
-def size(a_T_b: Float64[np.ndarray, "*n 4 4"]) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
-    """Length (m) and angle (rad) of rigid motions."""
+def length_and_angle(
+    a_T_b: Float64[np.ndarray, "*n 4 4"],
+) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
+    """Length of the translation (m) and angle of the rotation (rad) of rigid motions."""
     return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), rotation_angle(a_T_b[..., :3, :3])
 
 
 def _left_jacobian(w: np.ndarray) -> np.ndarray:
-    """V with exp(v, w) moved by V v."""
+    """Left Jacobian V of SO(3): the translation of exp(v, w) is V v."""
     angle, hat = float(np.linalg.norm(w)), cross(w)
     if angle < 1e-4:
         return np.eye(3) + 0.5 * hat + hat @ hat / 6.0

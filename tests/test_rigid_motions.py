@@ -1,0 +1,27 @@
+"""Rigid motions on the host: exponential and logarithm, the way between two poses, adjoint and covariance."""
+
+import numpy as np
+
+from gavo_jax.rigid_motions import adjoint, exp, interpolate, length_and_angle, log, transport_covariance
+from gavo_jax.trajectory import inverse
+
+RNG = np.random.default_rng(3)
+
+
+def test_exponential_and_logarithm_undo_each_other() -> None:
+    for xi in (np.zeros(6), 1e-6 * np.arange(6.0), np.array([0.3, -0.2, 0.5, 0.4, -1.0, 0.8])):
+        np.testing.assert_allclose(log(exp(xi)), xi, atol=1e-9)
+
+
+def test_half_the_way_is_as_far_from_either_end() -> None:
+    a, b = exp(RNG.normal(size=6)), exp(RNG.normal(size=6))
+    np.testing.assert_allclose(interpolate(a, b, 1.0), b, atol=1e-9)
+    middle = interpolate(a, b, 0.5)
+    np.testing.assert_allclose(length_and_angle(inverse(a) @ middle), length_and_angle(inverse(middle) @ b), atol=1e-9)
+
+
+def test_the_adjoint_takes_a_step_and_its_covariance_to_the_other_side() -> None:
+    a, step = exp(RNG.normal(size=6)), 1e-4 * RNG.normal(size=6)
+    np.testing.assert_allclose(a @ exp(step), exp(adjoint(a) @ step) @ a, atol=1e-7)
+    moved = adjoint(a) @ step
+    np.testing.assert_allclose(transport_covariance(a, np.outer(step, step)), np.outer(moved, moved), atol=1e-20)
