@@ -152,6 +152,86 @@ def associations(folder: Path) -> None:
     (folder / "calibration.txt").write_text("131 131 79.5 59.5\n")
 
 
+LORIS_STAMPS = [f"{1560004885.446172 + i / 30:.6f}" for i in range(4)]
+BASE_T_LASER, LASER_T_COLOR = np.eye(4), np.eye(4)
+BASE_T_LASER[:3, 3] = 0.1, 0.0, 0.9
+LASER_T_COLOR[:3] = [[0, 0, 1, 0.3], [-1, 0, 0, 0.05], [0, -1, 0, 0.4]]
+
+
+def storage(folder: Path, name: str, **values: object) -> None:
+    """A file of OpenCV's FileStorage, of matrices and what else it writes, with the head of its older versions."""
+    file = cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_WRITE)
+    for key, value in values.items():
+        _store(file, key, value)
+    file.release()
+    (folder / name).write_text((folder / name).read_text().replace("%YAML 1.2", "%YAML:1.0"))
+
+
+def _store(file: cv2.FileStorage, name: str, value: object) -> None:
+    if isinstance(value, dict | list):
+        file.startWriteStruct(name, cv2.FileNode_MAP if isinstance(value, dict) else cv2.FileNode_SEQ)
+        for key, part in value.items() if isinstance(value, dict) else (("", part) for part in value):
+            _store(file, key, part)
+        file.endWriteStruct()
+    else:
+        file.write(name, value)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def loris_sensors(folder: Path, order: str = "fx cx fy cy", **changed: object) -> None:
+    color: dict[str, float] = {"fx": 131.0, "fy": 131.0, "cx": 79.5, "cy": 59.5}
+    depth: dict[str, float] = {"fx": 90.0, "fy": 90.0, "cx": 80.5, "cy": 58.5}
+    sensors = {
+        name: {
+            "sensor_type": "camera",
+            "sensor_name": name,
+            "fps": 30,
+            "width": 160,
+            "height": 120,
+            "model": "pinhole",
+            "intrinsics": np.array([[numbers[key] for key in order.split()]]),
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": np.zeros((1, 5)),
+        }
+        for name, numbers in (("d400_color_optical_frame", color), ("d400_depth_optical_frame", depth))
+    }
+    sensors["d400_color_optical_frame"] |= changed
+    imu = {"sensor_type": "imu", "sensor_name": "d400_gyroscope", "imu_intrinsic": np.eye(3, 4).reshape(1, 12)}
+    storage(folder, "sensors.yaml", **sensors, d400_gyroscope=imu)
+
+
+def loris_transforms(folder: Path, moves: list[tuple[str, str, np.ndarray]] | None = None) -> None:
+    moves = moves or [
+        ("base_link", "laser", BASE_T_LASER),
+        ("laser", "d400_color_optical_frame", LASER_T_COLOR),
+        ("d400_color_optical_frame", "d400_depth_optical_frame", np.eye(4)),
+    ]
+    rows = [{"parent_frame": parent, "child_frame": child, "matrix": matrix} for parent, child, matrix in moves]
+    storage(folder, "trans_matrix.yaml", trans_matrix=rows)
+
+
+def open_loris(folder: Path) -> None:
+    """Depth of its own camera lies beside that which is registered; the true poses are of the robot's body."""
+    color_T_base = np.linalg.inv(BASE_T_LASER @ LASER_T_COLOR)
+    rows: dict[str, list[str]] = {"color": [], "aligned_depth": [], "depth": [], "groundtruth": []}
+    rows["groundtruth"].append("#Time px py pz qx qy qz qw")
+    for stamp, grey, metres, pose in zip(LORIS_STAMPS, GREYS, METRES, POSES, strict=True):
+        later = f"{float(stamp) + 0.004:.6f}"
+        for kind, name, pixels in (
+            ("color", stamp, grey),
+            ("aligned_depth", later, raw(metres, 1000)),
+            ("depth", later, np.full((120, 160), 500, np.uint16)),
+        ):
+            image(folder / f"{kind}/{name}.png", pixels)
+            rows[kind].append(f"{name} {kind}/{name}.png")
+        base = pose @ color_T_base
+        numbers = [*base[:3, 3], *quaternion_from_rotation(base[:3, :3])]
+        rows["groundtruth"].append(f"{stamp} {' '.join(map(str, numbers))}")
+    for name, lines in rows.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    loris_sensors(folder)
+    loris_transforms(folder)
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tum": ("TUM RGB-D folder", tum),
     "associations": ("TUM RGB-D folder", associations),
@@ -164,6 +244,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "one_folder": ("folder of colour and depth images", one_folder),
     "stray": ("scan of Stray Scanner", stray),
     "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
+    "open_loris": ("OpenLORIS-Scene sequence", open_loris),
     "nerf": ("folder of colour and depth images", nerf),
 }
 """By name: what the layout is recognised as, and who writes it."""

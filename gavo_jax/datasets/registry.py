@@ -11,6 +11,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images, missing_word
+from gavo_jax.datasets.openloris import OpenLoris
 from gavo_jax.datasets.phones import ArkitScenes, Record3D, StrayScan
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
@@ -73,6 +74,7 @@ class Dataset(Protocol):
 
 BUILT_IN: tuple[Dataset, ...] = (
     *(
+        OpenLoris,
         TumSequence,
         SevenScenes,
         ScanNet,

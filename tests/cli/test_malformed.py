@@ -191,13 +191,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["lowres_wide.traj:1: expected 7"],
     ),
     "nerf: poses of prose": ("nerf", edit("transforms.json", "0.0, 1.0", "0.0, 2.0"), ["transforms.json: frames[0]"]),
-    "openloris: lists of other names": (
-        "tum",
-        lambda clip: [
-            (clip / "rgb.txt").rename(clip / "color.txt"),
-            write("aligned_depth.txt", (clip / "depth.txt").read_text())(clip),
-        ],
-        ["rgb.txt: no such file", "color.txt and aligned_depth.txt", "copy them to rgb.txt and depth.txt"],
+    "openloris: no sensors": ("open_loris", remove("sensors.yaml"), ["sensors.yaml: no such file", "--camera"]),
+    "openloris: sensors of prose": (
+        "open_loris",
+        write("sensors.yaml", "%YAML:1.0\nwheels: 4\n"),
+        ["sensors.yaml: camera_matrix: missing"],
+    ),
+    "openloris: no registered depth": (
+        "open_loris",
+        remove("aligned_depth.txt"),
+        ["aligned_depth.txt: no such file", "unpack it"],
     ),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
