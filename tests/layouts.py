@@ -232,6 +232,39 @@ def open_loris(folder: Path) -> None:
     loris_transforms(folder)
 
 
+NED_T_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""A camera's axes (right, down, forward) in those of a body that counts forward, right and down."""
+
+
+def packed(metres: np.ndarray) -> np.ndarray:
+    """Floats as the four channels of an image of 8 bits, as OpenCV has them in memory: blue first."""
+    return metres.astype("<f4")[..., None].view(np.uint8)
+
+
+def tartan_poses(folder: Path, camera: str) -> None:
+    bodies = [pose @ np.linalg.inv(NED_T_CAMERA) for pose in POSES]
+    rows = [[*body[:3, 3], *quaternion_from_rotation(body[:3, :3])] for body in bodies]
+    np.savetxt(folder / f"pose_{camera}.txt", rows)
+
+
+def tartan_air(folder: Path) -> None:
+    """Of its first version, but for the size of the images."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"image_left/{i:06}_left.png", grey)
+        image(folder / f"depth_left/{i:06}_left_depth.npy", metres.astype(np.float32))
+    tartan_poses(folder, "left")
+    (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
+
+
+def tartan_air_2(folder: Path) -> None:
+    """Of its second version, at 10 Hz."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"image_lcam_front/{i:06}_lcam_front.png", grey)
+        image(folder / f"depth_lcam_front/{i:06}_lcam_front_depth.png", packed(metres))
+    tartan_poses(folder, "lcam_front")
+    (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tum": ("TUM RGB-D folder", tum),
     "associations": ("TUM RGB-D folder", associations),
@@ -245,6 +278,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "stray": ("scan of Stray Scanner", stray),
     "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
     "open_loris": ("OpenLORIS-Scene sequence", open_loris),
+    "tartan_air": ("TartanAir trajectory", tartan_air),
+    "tartan_air_2": ("TartanAir trajectory", tartan_air_2),
     "nerf": ("folder of colour and depth images", nerf),
 }
 """By name: what the layout is recognised as, and who writes it."""

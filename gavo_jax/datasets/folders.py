@@ -30,8 +30,8 @@ from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.pairing import Paired, paired_by_number, paired_by_stamp
-from gavo_jax.datasets.truth import TRUTH, Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
-from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
+from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
@@ -245,18 +245,9 @@ class Replica(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame: by its number, or in order where there are as many as images."""
-        if not (path / "traj.txt").exists():
-            return {}
-        rows = data_rows(path / "traj.txt")
-        if not rows:
-            raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
-        numbers = sorted(cls.find(path).color)
-        named = numbers if len(numbers) == len(rows) else range(len(rows))
-        return {
-            number: pose
-            for number, (place, row) in zip(named, rows, strict=True)
-            if (pose := pose_of(place, row)) is not None
-        }
+        file = path / "traj.txt"
+        rows = in_order(file, cls.find(path).color) if file.exists() else ()
+        return {number: pose for number, place, row in rows if (pose := pose_of(place, row)) is not None}
 
 
 class PlainFolder(FileSequence):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
 from gavo_jax.datasets.names import FEWEST
 from gavo_jax.errors import GavoError, data_rows, number
-from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
+from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
 
 TRUTH = "groundtruth.txt"
 """In TUM's form."""
@@ -39,6 +39,9 @@ MILLISECOND = 1e-3
 
 MAX_NUMBER = 10**18
 """Of a frame."""
+
+LARGEST = 1e10
+"""Of a file of poses, seconds since 1970 included."""
 
 Seconds = Callable[[np.ndarray], np.ndarray]
 """Times of frames by their numbers."""
@@ -252,3 +255,46 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
             matrix[:3, :3], matrix[3] = rotation, (0, 0, 0, 1)
             return matrix
     raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")
+
+
+def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | None:
+    """The numbers of a row; None where they are not all finite.
+
+    Raises:
+        GavoError: there are not so many, or it is text.
+    """
+    try:
+        values = [number(field) for field in fields]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise GavoError(f"{place}: expected {count} numbers, found {' '.join(fields)[:60]!r}")
+    if not np.isfinite(values).all():
+        return None
+    if np.abs(values).max() > LARGEST:
+        raise GavoError(f"{place}: holds an absurdly large value")
+    return values
+
+
+def posed(values: Sequence[float]) -> Float[np.ndarray, "4 4"] | None:
+    """The pose of tx ty tz qx qy qz qw; None where the quaternion is zero."""
+    if np.linalg.norm(values[3:]) < SHORTEST_QUATERNION:
+        return None
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(np.array(values[3:])), values[:3]
+    return pose
+
+
+def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list[str]]]:
+    """Rows of a file of poses, with their places, by the numbers of their images.
+
+    They are those of the images in their order, where there are as many, else all numbers from 0.
+
+    Raises:
+        GavoError: there is no row.
+    """
+    rows, numbers = data_rows(path), sorted(images)
+    if not rows:
+        raise GavoError(f"{path}: holds no trajectory (no rows)")
+    named = numbers if len(numbers) == len(rows) else range(len(rows))
+    return [(number, *row) for number, row in zip(named, rows, strict=True)]

@@ -202,6 +202,17 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         remove("aligned_depth.txt"),
         ["aligned_depth.txt: no such file", "unpack it"],
     ),
+    "tartanair: depth that was not downloaded": (
+        "tartan_air_2",
+        remove("depth_lcam_front"),
+        ["depth_lcam_front: no such folder beside image_lcam_front", "download it"],
+    ),
+    "tartanair: images that were scaled": (
+        "tartan_air",
+        remove("camera.yaml"),
+        ["clip: images of 160x120", "rendered at 640x480 or 640x640", "--camera"],
+    ),
+    "tartanair: poses of prose": ("tartan_air", write("pose_left.txt", "up\n"), ["pose_left.txt:1: expected 7"]),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
     "replica: a list for a camera": (

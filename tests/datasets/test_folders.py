@@ -62,7 +62,7 @@ def test_every_layout_gives_the_same_frames(folder, name):
     stamps = {"stray": STRAY_STAMPS, "arkit_scenes": ARKIT_STAMPS, "open_loris": LORIS_STAMPS, "nerf": [1 / 30]}
     first = float(stamps.get(name, [0.0])[0])
     first = 1 / 30 if "open3d" in name else first
-    expected = np.arange(4) / (60 if name == "stray" else 30)
+    expected = np.arange(4) / {"stray": 60, "tartan_air_2": 10}.get(name, 30)
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
     for i, frame in enumerate(sequence):
@@ -196,7 +196,10 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
         load_calibration(tmp_path / "k.txt", (640, 480))
 
 
-@pytest.mark.parametrize("name", ["seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris"])
+@pytest.mark.parametrize(
+    "name",
+    ["seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris", "tartan_air", "tartan_air_2"],
+)
 def test_poses_are_the_truth(folder, name):
     sequence = open_source(wrote(folder, name))
     truth = sequence.ground_truth
@@ -206,7 +209,7 @@ def test_poses_are_the_truth(folder, name):
     np.testing.assert_allclose(truth.world_T_camera, POSES[kept], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["seven_scenes", "plain", "associations"])
+@pytest.mark.parametrize("name", ["seven_scenes", "plain", "associations", "tartan_air_2"])
 def test_the_rate_can_be_said(folder, name):
     sequence = open_source(wrote(folder, name), Reading(rate=10.0))
     np.testing.assert_allclose(sequence.timestamps, np.arange(4) / 10)
