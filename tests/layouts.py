@@ -265,6 +265,51 @@ def tartan_air_2(folder: Path) -> None:
     (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
 
 
+RTABMAP_STAMPS = [f"{1786504901.920936 + i / 30:.6f}" for i in range(4)]
+OPTICAL = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0.9]])
+"""A camera's axes in those of a robot's body, and where it lies on it."""
+
+
+def rtabmap_camera(folder: Path, name: str, fx: float = 131.0, **more: object) -> None:
+    """As RTAB-Map writes a camera, with a lens that its images do not have."""
+    folder.mkdir(exist_ok=True)
+
+    def matrix(values: np.ndarray) -> dict[str, object]:
+        return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+    camera = np.array([[fx, 0, 79.5, 0], [0, 131.0, 59.5, 0], [0, 0, 1, 0]])
+    values: dict[str, object] = {
+        "camera_name": name,
+        "image_width": 160,
+        "image_height": 120,
+        "camera_matrix": matrix(camera[:, :3] + np.diag([9.0, 9.0, 0.0])),
+        "distortion_coefficients": matrix(np.array([[0.1, -0.2, 0.0, 0.0, 0.0]])),
+        "distortion_model": "plumb_bob",
+        "rectification_matrix": matrix(np.eye(3)),
+        "projection_matrix": matrix(camera),
+        "local_transform": matrix(OPTICAL),
+    }
+    storage(folder, f"{name}.yaml", **{**values, **more})
+
+
+def rtabmap(folder: Path, prefix: str = "", poses: str = "poses.txt", ids: bool = False) -> None:
+    """As its database viewer exports it; its estimate lies there, too."""
+    rows = ["#timestamp x y z qx qy qz qw id"]
+    for i, (stamp, grey, metres, pose) in enumerate(zip(RTABMAP_STAMPS, GREYS, METRES, POSES, strict=True)):
+        name = str(i + 1) if ids else stamp
+        image(folder / f"{prefix}rgb/{name}.jpg", grey)
+        image(folder / f"{prefix}depth/{name}.png", raw(metres, 1000))
+        rtabmap_camera(folder / f"{prefix}calib", name)
+        numbers = [*(pose[:3, 3] + 0.01 * i), *quaternion_from_rotation(pose[:3, :3])]
+        rows.append(f"{stamp} {' '.join(map(str, numbers))} {i + 1}")
+    (folder / poses).write_text("\n".join(rows) + "\n")
+
+
+def rtabmap_export(folder: Path) -> None:
+    """As the command exports it with the ids of nodes for names."""
+    rtabmap(folder, "map_", "map_camera_poses.txt", ids=True)
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tum": ("TUM RGB-D folder", tum),
     "associations": ("TUM RGB-D folder", associations),
@@ -280,6 +325,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "open_loris": ("OpenLORIS-Scene sequence", open_loris),
     "tartan_air": ("TartanAir trajectory", tartan_air),
     "tartan_air_2": ("TartanAir trajectory", tartan_air_2),
+    "rtabmap": ("export of RTAB-Map", rtabmap),
+    "rtabmap_export": ("export of RTAB-Map", rtabmap_export),
     "nerf": ("folder of colour and depth images", nerf),
 }
 """By name: what the layout is recognised as, and who writes it."""

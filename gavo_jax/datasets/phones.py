@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,12 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_exports import common_camera
 from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
-from gavo_jax.camera_words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.folders import NumberedFolder, PlainFolder
+from gavo_jax.datasets.folders import NumberedFolder, PlainFolder, of_each_frame
 from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.names import Found, by_number
@@ -110,10 +109,7 @@ class ArkitScenes(PlainFolder):
         files = sorted((path / cls.CAMERAS).glob("*.pincam"))
         if own_camera_file(path) is not None or not files:
             return super().calibrate(path, entries, reading)
-        cameras = [load_calibration(file).color for file in files]
-        found = common_camera(str(path / cls.CAMERAS), [_numbers(camera) for camera in cameras])
-        camera = replace(cameras[0], **found, depth_scale=MILLIMETRES)
-        return Calibration(camera, origin=f"{path / cls.CAMERAS}, the median of {len(files)}", states_depth_scale=False)
+        return of_each_frame(path / cls.CAMERAS, files, partial(load_calibration, depth_scale=MILLIMETRES))
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
@@ -183,10 +179,6 @@ def _at_width(camera: Camera, width: int) -> Camera:
     cx, cy = (share * (middle + 0.5) - 0.5 for middle in (camera.cx, camera.cy))
     size = {"width": width, "height": round(share * camera.height)}
     return replace(camera, fx=share * camera.fx, fy=share * camera.fy, cx=cx, cy=cy, **size)
-
-
-def _numbers(camera: Camera) -> dict[str, float]:
-    return {key: getattr(camera, key) for key in REQUIRED}
 
 
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:

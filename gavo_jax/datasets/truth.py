@@ -1,5 +1,6 @@
 """The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
 
+import fnmatch
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +19,8 @@ TRUTH = "groundtruth.txt"
 
 OTHER_NAMES = re.compile(r"(gt|ground[-_]?truth|poses?|traj|trajectory)(_left)?\.(txt|csv|tum)", re.IGNORECASE)
 """Files that look like one, and are not looked for: their form is open."""
+
+NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
 
 LOG = "trajectory.log"
 """In Redwood's form, which Open3D writes, too."""
@@ -125,10 +128,20 @@ def _is_without_gap(numbers: np.ndarray) -> bool:
     return len(numbers) > 1 and bool((np.diff(np.sort(numbers)) == 1).all())
 
 
-def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:
-    """A line for a file that may be the true trajectory and is not read, where there is no other."""
-    names = sorted(file.name for file in folder.glob("*") if OTHER_NAMES.fullmatch(file.name)) if truth is None else []
-    return [f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in names]
+def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") -> list[str]:
+    """A line for a file of poses that is not read, where there is no other: it may be the true trajectory, or is none.
+
+    Args:
+        folder: of the frames.
+        truth: that which was read.
+        estimates: the names, as of `glob`, of what the program has found that wrote the folder.
+    """
+    files = [] if truth is not None else sorted(file.name for file in folder.glob("*") if file.is_file())
+    found = set(fnmatch.filter(files, estimates))
+    others = [name for name in files if name not in found and OTHER_NAMES.fullmatch(name)]
+    return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [
+        f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in others
+    ]
 
 
 def counted_in(trajectory: Trajectory) -> float:

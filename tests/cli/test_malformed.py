@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command import runner
-from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, image, raw
+from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, RTABMAP_STAMPS, image, raw
 from recordings import COLOR, DEPTH, Recorder, Shot, record
 
 SHOTS = [
@@ -213,6 +213,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["clip: images of 160x120", "rendered at 640x480 or 640x640", "--camera"],
     ),
     "tartanair: poses of prose": ("tartan_air", write("pose_left.txt", "up\n"), ["pose_left.txt:1: expected 7"]),
+    "rtabmap: a camera of prose": (
+        "rtabmap",
+        write(f"calib/{RTABMAP_STAMPS[1]}.yaml", "wide"),
+        [f"{RTABMAP_STAMPS[1]}.yaml", "not a camera file"],
+    ),
+    "rtabmap: depth of a smaller size": (
+        "rtabmap",
+        pixels(f"depth/{RTABMAP_STAMPS[0]}.png", SMALL.astype(np.uint16) + 1000),
+        [f"{RTABMAP_STAMPS[0]}.png", "80x60", "160x120", "[depth]"],
+    ),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),
     "replica: a list for a camera": (

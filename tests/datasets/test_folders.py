@@ -19,6 +19,7 @@ from layouts import (
     MATRIX,
     METRES,
     POSES,
+    RTABMAP_STAMPS,
     STRAY_STAMPS,
     image,
     kinect,
@@ -59,15 +60,20 @@ def test_every_layout_gives_the_same_frames(folder, name):
     assert sequence.name == "clip" and len(sequence) == 4
     camera = sequence.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (131, 131, 79.5, 59.5, 160, 120)
-    stamps = {"stray": STRAY_STAMPS, "arkit_scenes": ARKIT_STAMPS, "open_loris": LORIS_STAMPS, "nerf": [1 / 30]}
-    first = float(stamps.get(name, [0.0])[0])
-    first = 1 / 30 if "open3d" in name else first
+    stamps = {
+        "stray": STRAY_STAMPS,
+        "arkit_scenes": ARKIT_STAMPS,
+        "open_loris": LORIS_STAMPS,
+        "rtabmap": RTABMAP_STAMPS,
+    }
+    from_one = ("nerf", "open3d", "open3d_image", "rtabmap_export")
+    first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
     expected = np.arange(4) / {"stray": 60, "tartan_air_2": 10}.get(name, 30)
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
     for i, frame in enumerate(sequence):
         assert isinstance(frame, Frame)
-        lossy = name in ("scannet", "replica", "open3d", "open3d_image")
+        lossy = name in ("scannet", "replica", "open3d", "open3d_image", "rtabmap", "rtabmap_export")
         assert np.abs(frame.grey.astype(int) - GREYS[i]).mean() < (1.5 if lossy else 0.1)
         off = frame.depth / camera.depth_scale - METRES[i]
         assert np.abs(off).max() < 0.51 / min(camera.depth_scale, 1000 if "float" not in name else 5000) + 1e-6
