@@ -1,4 +1,4 @@
-"""Cameras as programs that record and export write them: RealSense's SDK, whose lens models are its own, nerfstudio."""
+"""Cameras as programs and datasets write them: RealSense's SDK with lens models of its own, nerfstudio, OpenLORIS."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -157,6 +157,29 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
         raise GavoError(f"{path}: camera_model {shown(model)}, or its k4: OPENCV, OPENCV_FISHEYE and PINHOLE are read")
     lens = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return {**table, **size, **({"distortion": lens} if any(lens) else {})}
+
+
+OPENLORIS_COLOR = "d400_color_optical_frame"
+"""The colour camera among the sensors of OpenLORIS-Scene's robots, to which `aligned_depth` is registered."""
+
+SQUARE = 0.05
+"""By which share the two focal lengths of that camera may differ; of numbers in another order they do by more."""
+
+
+def is_openloris(values: Table) -> bool:
+    """Whether a file has the names of OpenLORIS-Scene's sensors."""
+    return OPENLORIS_COLOR in values
+
+
+def read_openloris(path: Path, values: Table) -> Table:
+    """Looks like the sensors of OpenLORIS-Scene."""
+    camera = values[OPENLORIS_COLOR]
+    if camera.get("model") != "pinhole":
+        raise GavoError(f"{path}: {OPENLORIS_COLOR}: model {shown(camera.get('model'))}: pinhole is the only one")
+    ((fx, cx, fy, cy),) = camera["intrinsics"]
+    if abs(fx - fy) > SQUARE * fx:
+        raise GavoError(f"{path}: {OPENLORIS_COLOR}: {fx:g} {cx:g} {fy:g} {cy:g}: hardly fx cx fy cy, in that order")
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **beside(str(path), camera)}
 
 
 def _whole(value: Any) -> Any:

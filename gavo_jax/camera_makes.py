@@ -10,10 +10,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from gavo_jax.camera_exports import Table, is_nerfstudio, is_realsense, read_nerfstudio, read_realsense
+from gavo_jax.camera_exports import (
+    Table,
+    is_nerfstudio,
+    is_openloris,
+    is_realsense,
+    read_nerfstudio,
+    read_openloris,
+    read_realsense,
+)
+from gavo_jax.camera_storage import line_of, read_storage, real_of, values_of
 from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
@@ -42,7 +50,7 @@ def _parse_yaml(path: Path, text: str) -> Table:
     try:
         values = next(yaml.load_all(text, _yaml_loader()), None)  # printed messages end with the start of another
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, AttributeError, OverflowError) as error:
-        raise GavoError(f"{path}: not YAML: {_line(error)}") from None
+        raise GavoError(f"{path}: not YAML: {line_of(error)}") from None
     return _of_known_make(path, values)
 
 
@@ -71,7 +79,7 @@ def _parse_json(path: Path, text: str) -> Table:
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: not JSON: {_line(error)}") from None
+        raise GavoError(f"{path}: not JSON: {line_of(error)}") from None
     return _of_known_make(path, values)
 
 
@@ -216,6 +224,7 @@ MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...
     (_is_kalibr, _read_kalibr),
     (_is_one_of_kalibr, _kalibr_camera),
     (_is_vins, _read_vins),
+    (is_openloris, read_openloris),
     (is_realsense, read_realsense),
     (is_nerfstudio, read_nerfstudio),
     (_is_flat, _read_flat),
@@ -225,53 +234,15 @@ MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...
 
 def _parse_storage(path: Path, text: str) -> Table:
     """OpenCV's FileStorage: matrices by the names that OpenCV's own examples use, or ORB-SLAM's keys."""
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError) as error:
-        raise GavoError(f"{path}: not readable by OpenCV's FileStorage: {_line(error)}") from None
-    try:
-        return _storage_orb(storage) or _storage_table(path, storage)
-    except GavoError:
-        raise
-    except (cv2.error, SystemError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise GavoError(f"{path}: not a camera of OpenCV's FileStorage: {_line(error)}") from None
-    finally:
-        storage.release()
+    return read_storage(path, text, lambda storage: _storage_orb(storage) or _storage_table(path, storage))
 
 
 def _storage_table(path: Path, storage: Any) -> Table:
     """What a FileStorage holds, read as YAML or JSON of the same names would be."""
-    root = storage.root()
-    values = {name: _plain_value(root.getNode(name)) for name in root.keys()}
-    if not _is_ros(values) and not _is_vins(values):
+    values = values_of(storage)
+    if not (_is_ros(values) or _is_vins(values) or is_openloris(values)):
         raise GavoError(f"{path}: camera_matrix: missing, or not 3x3")
     return _of_known_make(path, values)
-
-
-def _plain_value(node: Any) -> Any:
-    """A node of a FileStorage as numbers, text, lists and tables; a matrix as rows, None where it is nothing."""
-    if node.isMap():
-        names = node.keys()
-        if {"rows", "cols", "data"} <= set(names):
-            return _matrix_of(node).tolist()
-        return {name: _plain_value(node.getNode(name)) for name in names}
-    if node.isSeq():
-        return [_plain_value(node.at(i)) for i in range(node.size())]
-    if node.isString():
-        return node.string()
-    if node.isInt():
-        return int(node.real())
-    return node.real() if node.isReal() else None
-
-
-def _matrix_of(node: Any) -> np.ndarray:
-    """A matrix of a FileStorage. Not by its own `mat()`, which writes beyond its memory where sizes do not agree."""
-    data = node.getNode("data")
-    numbers = [_real(data.at(i)) for i in range(data.size())] if data.isSeq() else []
-    rows, columns = (node.getNode(name) for name in ("rows", "cols"))
-    if not (rows.isInt() and columns.isInt()) or int(rows.real()) * int(columns.real()) != len(numbers):
-        raise TypeError("a matrix whose rows and columns are not those of its data")
-    return np.array(numbers).reshape(int(rows.real()), int(columns.real()))
 
 
 def _storage_orb(storage: Any) -> Table | None:
@@ -282,7 +253,7 @@ def _storage_orb(storage: Any) -> Table | None:
 
     def real(name: str) -> float | None:
         node = storage.getNode(name)
-        return None if node.empty() else _real(node, name)
+        return None if node.empty() else real_of(node, name)
 
     table: Table = {key: real(f"{prefix}.{key}") for key in FOCAL}
     for key in ("width", "height"):
@@ -299,13 +270,6 @@ def _storage_orb(storage: Any) -> Table | None:
 def _orb_model(kind: str) -> str:
     """Our name of ORB-SLAM's camera type; one that is not known stays as it is, and is refused."""
     return {"PinHole": "pinhole", "Rectified": "pinhole", "KannalaBrandt8": "fisheye"}.get(kind, kind)
-
-
-def _real(node: Any, name: str = "a list") -> float:
-    """The number that a node of a FileStorage is, which itself takes text for 0."""
-    if not (node.isReal() or node.isInt()):
-        raise TypeError(f"{name}: not a number")
-    return node.real()
 
 
 def _parse_xml(path: Path, text: str) -> Table:
@@ -333,7 +297,7 @@ def _parse_sens(path: Path, text: str) -> Table:
     except GavoError:
         raise
     except (KeyError, ValueError, IndexError) as error:
-        raise GavoError(f"{path}: looks like the info.txt of a scan, but is none: {_line(error)}") from None
+        raise GavoError(f"{path}: looks like the info.txt of a scan, but is none: {line_of(error)}") from None
     same = all(abs(color[key] - depth[key]) < SAME_CAMERA for key in color)
     return {**color, **scale} if same else {**color, **scale, "depth": depth}
 
@@ -372,10 +336,6 @@ def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None
     is_wide = cx > fx * WIDEST_HALF or cy > abs(fy) * WIDEST_HALF
     if is_wide or not SQUARE[0] * abs(fy) < fx < SQUARE[1] * abs(fy):
         raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 PARSERS: dict[str, Callable[[Path, str], Table]] = {

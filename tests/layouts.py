@@ -152,6 +152,164 @@ def associations(folder: Path) -> None:
     (folder / "calibration.txt").write_text("131 131 79.5 59.5\n")
 
 
+LORIS_STAMPS = [f"{1560004885.446172 + i / 30:.6f}" for i in range(4)]
+BASE_T_LASER, LASER_T_COLOR = np.eye(4), np.eye(4)
+BASE_T_LASER[:3, 3] = 0.1, 0.0, 0.9
+LASER_T_COLOR[:3] = [[0, 0, 1, 0.3], [-1, 0, 0, 0.05], [0, -1, 0, 0.4]]
+
+
+def storage(folder: Path, name: str, **values: object) -> None:
+    """A file of OpenCV's FileStorage, of matrices and what else it writes, with the head of its older versions."""
+    file = cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_WRITE)
+    for key, value in values.items():
+        _store(file, key, value)
+    file.release()
+    (folder / name).write_text((folder / name).read_text().replace("%YAML 1.2", "%YAML:1.0"))
+
+
+def _store(file: cv2.FileStorage, name: str, value: object) -> None:
+    if isinstance(value, dict | list):
+        file.startWriteStruct(name, cv2.FileNode_MAP if isinstance(value, dict) else cv2.FileNode_SEQ)
+        for key, part in value.items() if isinstance(value, dict) else (("", part) for part in value):
+            _store(file, key, part)
+        file.endWriteStruct()
+    else:
+        file.write(name, value)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def loris_sensors(folder: Path, order: str = "fx cx fy cy", **changed: object) -> None:
+    color: dict[str, float] = {"fx": 131.0, "fy": 131.0, "cx": 79.5, "cy": 59.5}
+    depth: dict[str, float] = {"fx": 90.0, "fy": 90.0, "cx": 80.5, "cy": 58.5}
+    sensors = {
+        name: {
+            "sensor_type": "camera",
+            "sensor_name": name,
+            "fps": 30,
+            "width": 160,
+            "height": 120,
+            "model": "pinhole",
+            "intrinsics": np.array([[numbers[key] for key in order.split()]]),
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": np.zeros((1, 5)),
+        }
+        for name, numbers in (("d400_color_optical_frame", color), ("d400_depth_optical_frame", depth))
+    }
+    sensors["d400_color_optical_frame"] |= changed
+    imu = {"sensor_type": "imu", "sensor_name": "d400_gyroscope", "imu_intrinsic": np.eye(3, 4).reshape(1, 12)}
+    storage(folder, "sensors.yaml", **sensors, d400_gyroscope=imu)
+
+
+def loris_transforms(folder: Path, moves: list[tuple[str, str, np.ndarray]] | None = None) -> None:
+    moves = moves or [
+        ("base_link", "laser", BASE_T_LASER),
+        ("laser", "d400_color_optical_frame", LASER_T_COLOR),
+        ("d400_color_optical_frame", "d400_depth_optical_frame", np.eye(4)),
+    ]
+    rows = [{"parent_frame": parent, "child_frame": child, "matrix": matrix} for parent, child, matrix in moves]
+    storage(folder, "trans_matrix.yaml", trans_matrix=rows)
+
+
+def open_loris(folder: Path) -> None:
+    """Depth of its own camera lies beside that which is registered; the true poses are of the robot's body."""
+    color_T_base = np.linalg.inv(BASE_T_LASER @ LASER_T_COLOR)
+    rows: dict[str, list[str]] = {"color": [], "aligned_depth": [], "depth": [], "groundtruth": []}
+    rows["groundtruth"].append("#Time px py pz qx qy qz qw")
+    for stamp, grey, metres, pose in zip(LORIS_STAMPS, GREYS, METRES, POSES, strict=True):
+        later = f"{float(stamp) + 0.004:.6f}"
+        for kind, name, pixels in (
+            ("color", stamp, grey),
+            ("aligned_depth", later, raw(metres, 1000)),
+            ("depth", later, np.full((120, 160), 500, np.uint16)),
+        ):
+            image(folder / f"{kind}/{name}.png", pixels)
+            rows[kind].append(f"{name} {kind}/{name}.png")
+        base = pose @ color_T_base
+        numbers = [*base[:3, 3], *quaternion_from_rotation(base[:3, :3])]
+        rows["groundtruth"].append(f"{stamp} {' '.join(map(str, numbers))}")
+    for name, lines in rows.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    loris_sensors(folder)
+    loris_transforms(folder)
+
+
+NED_T_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""A camera's axes (right, down, forward) in those of a body that counts forward, right and down."""
+
+
+def packed(metres: np.ndarray) -> np.ndarray:
+    """Floats as the four channels of an image of 8 bits, as OpenCV has them in memory: blue first."""
+    return metres.astype("<f4")[..., None].view(np.uint8)
+
+
+def tartan_poses(folder: Path, camera: str) -> None:
+    bodies = [pose @ np.linalg.inv(NED_T_CAMERA) for pose in POSES]
+    rows = [[*body[:3, 3], *quaternion_from_rotation(body[:3, :3])] for body in bodies]
+    np.savetxt(folder / f"pose_{camera}.txt", rows)
+
+
+def tartan_air(folder: Path) -> None:
+    """Of its first version, but for the size of the images."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"image_left/{i:06}_left.png", grey)
+        image(folder / f"depth_left/{i:06}_left_depth.npy", metres.astype(np.float32))
+    tartan_poses(folder, "left")
+    (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
+
+
+def tartan_air_2(folder: Path) -> None:
+    """Of its second version, at 10 Hz."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"image_lcam_front/{i:06}_lcam_front.png", grey)
+        image(folder / f"depth_lcam_front/{i:06}_lcam_front_depth.png", packed(metres))
+    tartan_poses(folder, "lcam_front")
+    (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
+
+
+RTABMAP_STAMPS = [f"{1786504901.920936 + i / 30:.6f}" for i in range(4)]
+OPTICAL = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0.9]])
+"""A camera's axes in those of a robot's body, and where it lies on it."""
+
+
+def rtabmap_camera(folder: Path, name: str, fx: float = 131.0, **more: object) -> None:
+    """As RTAB-Map writes a camera, with a lens that its images do not have."""
+    folder.mkdir(exist_ok=True)
+
+    def matrix(values: np.ndarray) -> dict[str, object]:
+        return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+    camera = np.array([[fx, 0, 79.5, 0], [0, 131.0, 59.5, 0], [0, 0, 1, 0]])
+    values: dict[str, object] = {
+        "camera_name": name,
+        "image_width": 160,
+        "image_height": 120,
+        "camera_matrix": matrix(camera[:, :3] + np.diag([9.0, 9.0, 0.0])),
+        "distortion_coefficients": matrix(np.array([[0.1, -0.2, 0.0, 0.0, 0.0]])),
+        "distortion_model": "plumb_bob",
+        "rectification_matrix": matrix(np.eye(3)),
+        "projection_matrix": matrix(camera),
+        "local_transform": matrix(OPTICAL),
+    }
+    storage(folder, f"{name}.yaml", **{**values, **more})
+
+
+def rtabmap(folder: Path, prefix: str = "", poses: str = "poses.txt", ids: bool = False) -> None:
+    """As its database viewer exports it; its estimate lies there, too."""
+    rows = ["#timestamp x y z qx qy qz qw id"]
+    for i, (stamp, grey, metres, pose) in enumerate(zip(RTABMAP_STAMPS, GREYS, METRES, POSES, strict=True)):
+        name = str(i + 1) if ids else stamp
+        image(folder / f"{prefix}rgb/{name}.jpg", grey)
+        image(folder / f"{prefix}depth/{name}.png", raw(metres, 1000))
+        rtabmap_camera(folder / f"{prefix}calib", name)
+        numbers = [*(pose[:3, 3] + 0.01 * i), *quaternion_from_rotation(pose[:3, :3])]
+        rows.append(f"{stamp} {' '.join(map(str, numbers))} {i + 1}")
+    (folder / poses).write_text("\n".join(rows) + "\n")
+
+
+def rtabmap_export(folder: Path) -> None:
+    """As the command exports it with the ids of nodes for names."""
+    rtabmap(folder, "map_", "map_camera_poses.txt", ids=True)
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tum": ("TUM RGB-D folder", tum),
     "associations": ("TUM RGB-D folder", associations),
@@ -164,6 +322,11 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "one_folder": ("folder of colour and depth images", one_folder),
     "stray": ("scan of Stray Scanner", stray),
     "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
+    "open_loris": ("OpenLORIS-Scene sequence", open_loris),
+    "tartan_air": ("TartanAir trajectory", tartan_air),
+    "tartan_air_2": ("TartanAir trajectory", tartan_air_2),
+    "rtabmap": ("export of RTAB-Map", rtabmap),
+    "rtabmap_export": ("export of RTAB-Map", rtabmap_export),
     "nerf": ("folder of colour and depth images", nerf),
 }
 """By name: what the layout is recognised as, and who writes it."""

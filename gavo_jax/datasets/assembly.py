@@ -185,7 +185,8 @@ class FrameAssembler:
             depth_timestamp = stamped + self.calibration.depth_delay
         _check_size(bgr, camera, name, "camera")
         if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MUCH:
-            self._tell_once("is brighter", name, f"what exceeds {self.white} is white, in others too")
+            brighter = "is brighter than the images that were looked at first"
+            self._tell_once(brighter, name, f"what exceeds {self.white} is white, in others too")
         image = to_8_bits(bgr, self.white)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if self.color else None
@@ -216,14 +217,14 @@ class FrameAssembler:
             farthest = NO_READING / self.unit.frame
             if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MUCH:
                 so = f"depth beyond {farthest:.3g} m is left out, of others too"
-                self._tell_once("reaches further", depth.name, so)
+                self._tell_once("reaches further than frames of this source hold", depth.name, so)
         return in_frame_units(depth.raw, self.unit)
 
     def _tell_once(self, what: str, name: str, so: str) -> None:
-        """Warn of the first image that is not as those were by which the whole source is scaled."""
+        """Warn of the first image of which the scale of the whole source holds a part."""
         if what not in self._told:
             self._told.add(what)
-            warnings.warn(f"{name}: {what} than the images that were looked at first: {so}", GavoWarning, stacklevel=4)
+            warnings.warn(f"{name}: {what}: {so}", GavoWarning, stacklevel=4)
 
     @cached_property
     def _registration(self) -> Registration:

@@ -3,7 +3,7 @@
 Each class says how its folder is recognised, where the images and poses lie, and which camera took them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
+from gavo_jax.camera_exports import common_camera
 from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import (
     Entry,
@@ -30,8 +32,8 @@ from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.pairing import Paired, paired_by_number, paired_by_stamp
-from gavo_jax.datasets.truth import TRUTH, Seconds, pose_files, pose_in, pose_of, truth_in, unread_truth
-from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
+from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
@@ -245,18 +247,9 @@ class Replica(NumberedFolder):
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
         """A row of sixteen numbers for each frame: by its number, or in order where there are as many as images."""
-        if not (path / "traj.txt").exists():
-            return {}
-        rows = data_rows(path / "traj.txt")
-        if not rows:
-            raise GavoError(f"{path / 'traj.txt'}: holds no trajectory (no rows)")
-        numbers = sorted(cls.find(path).color)
-        named = numbers if len(numbers) == len(rows) else range(len(rows))
-        return {
-            number: pose
-            for number, (place, row) in zip(named, rows, strict=True)
-            if (pose := pose_of(place, row)) is not None
-        }
+        file = path / "traj.txt"
+        rows = in_order(file, cls.find(path).color) if file.exists() else ()
+        return {number: pose for number, place, row in rows if (pose := pose_of(place, row)) is not None}
 
 
 class PlainFolder(FileSequence):
@@ -270,6 +263,8 @@ class PlainFolder(FileSequence):
     scale_is_open: ClassVar[bool] = True
     has_clock: ClassVar[bool] = False
     """Whether a file says when the frames were taken."""
+    ESTIMATES: ClassVar[str] = ""
+    """Names of files of poses that the kind's own program found, which are no truth; empty where there are none."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -303,7 +298,7 @@ class PlainFolder(FileSequence):
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth)
+        left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
         is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
         sequence.times_guessed = NUMBERS if is_open else paired.guessed
@@ -371,3 +366,21 @@ def _check_identity(file: Path) -> None:
     pose = pose_in(file)
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
+
+
+def of_each_frame(folder: Path, files: Sequence[Path], load: Callable[[Path], Calibration]) -> Calibration:
+    """The camera that the frames' own have in common, see `common_camera`.
+
+    Args:
+        folder: where they lie.
+        files: of the cameras.
+        load: reads one of them.
+
+    Raises:
+        GavoError: they differ by more than focus moves them, or one cannot be read.
+    """
+    first, *_ = cameras = [load(file).color for file in files]
+    found = common_camera(str(folder), [{key: getattr(camera, key) for key in REQUIRED} for camera in cameras])
+    return Calibration(
+        replace(first, **found), origin=f"{folder}, the median of {len(files)}", states_depth_scale=False
+    )

@@ -49,6 +49,9 @@ leave them there, do not."""
 NO_READING = 65535
 """Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
 
+SIGN = 128
+"""From which on the highest byte of a float says that it is negative."""
+
 WHITES = (255, 1023, 4095, 16383, 65535)
 """Full scales of sensors: what 16-bit intensities are measured against."""
 
@@ -99,7 +102,7 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
     elif data.startswith(EXR_SIGNATURE):
         image = _decode_exr(data, name)
     else:
-        image = _decode(data, name, AS_STORED)
+        image = _unpacked(_decode(data, name, AS_STORED))
     if image.ndim == 3 and image.shape[-1] == 1:
         image = image[..., 0]
     elif image.ndim == 3 and image.shape[0] == 1:  # as PyTorch has a channel
@@ -110,6 +113,17 @@ def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np
     if image.dtype.kind in "ui" and image.max() <= NO_READING:
         return np.maximum(image, 0).astype(np.uint16)  # of 16 bits, whatever they are kept in
     return to_float32(image)
+
+
+def _unpacked(image: np.ndarray) -> np.ndarray:
+    """The floats that four channels of 8 bits are, as TartanAir packs them, lowest byte first; else the image as it is.
+
+    Transparency would be the highest byte, with the sign: no depth has one, and a picture is opaque somewhere or not to
+    be seen at all.
+    """
+    if image.dtype != np.uint8 or image.shape[2:] != (4,) or not 0 < image[..., 3].max() < SIGN:
+        return image
+    return np.ascontiguousarray(image).view("<f4")[..., 0]
 
 
 def to_float32(image: np.ndarray) -> Float[np.ndarray, "h w"]:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,22 +12,17 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_exports import common_camera
 from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
-from gavo_jax.camera_words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.folders import NumberedFolder, PlainFolder
+from gavo_jax.datasets.folders import NumberedFolder, PlainFolder, of_each_frame
 from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.datasets.pairing import Paired
-from gavo_jax.datasets.truth import Seconds
-from gavo_jax.errors import GavoError, data_rows, number, read_text
-from gavo_jax.trajectory import SHORTEST_QUATERNION, Trajectory, inverse, rotation_from_quaternion
-
-LARGEST = 1e10
-"""Largest number in a file of poses, seconds since 1970 included."""
+from gavo_jax.datasets.truth import Seconds, numbers_in, posed
+from gavo_jax.errors import GavoError, data_rows, read_text
+from gavo_jax.trajectory import Trajectory, inverse
 
 SLOWEST, FASTEST = 0.1, 1000.0
 """Frames per second that may be a rate."""
@@ -113,10 +109,7 @@ class ArkitScenes(PlainFolder):
         files = sorted((path / cls.CAMERAS).glob("*.pincam"))
         if own_camera_file(path) is not None or not files:
             return super().calibrate(path, entries, reading)
-        cameras = [load_calibration(file).color for file in files]
-        found = common_camera(str(path / cls.CAMERAS), [_numbers(camera) for camera in cameras])
-        camera = replace(cameras[0], **found, depth_scale=MILLIMETRES)
-        return Calibration(camera, origin=f"{path / cls.CAMERAS}, the median of {len(files)}", states_depth_scale=False)
+        return of_each_frame(path / cls.CAMERAS, files, partial(load_calibration, depth_scale=MILLIMETRES))
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
@@ -188,29 +181,6 @@ def _at_width(camera: Camera, width: int) -> Camera:
     return replace(camera, fx=share * camera.fx, fy=share * camera.fy, cx=cx, cy=cy, **size)
 
 
-def _numbers(camera: Camera) -> dict[str, float]:
-    return {key: getattr(camera, key) for key in REQUIRED}
-
-
-def _numbered(place: str, fields: list[str], count: int) -> list[float] | None:
-    """The numbers of a row; None where they are not all finite.
-
-    Raises:
-        GavoError: there are not so many, or it is text.
-    """
-    try:
-        values = [number(field) for field in fields]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise GavoError(f"{place}: expected {count} numbers, found {' '.join(fields)[:60]!r}")
-    if not np.isfinite(values).all():
-        return None
-    if np.abs(values).max() > LARGEST:
-        raise GavoError(f"{place}: holds an absurdly large value")
-    return values
-
-
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
     """Stamps and poses by the numbers of frames; the first line may name the columns, of which the first nine count."""
     rows, found = data_rows(path), {}
@@ -218,11 +188,10 @@ def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
         rows = rows[1:]
     for at, (place, fields) in enumerate(rows):
         is_bare = len(fields) == 7
-        values = _numbered(place, fields[:9], 7 if is_bare else 9)
-        if values is None or np.linalg.norm(values[-4:]) < SHORTEST_QUATERNION:
+        values = numbers_in(place, fields[:9], 7 if is_bare else 9)
+        pose = None if values is None else posed(values[-7:])
+        if values is None or pose is None:
             continue
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(np.array(values[-4:])), values[-7:-4]
         found[at if is_bare else int(values[1])] = None if is_bare else values[0], pose
     if not found:
         raise GavoError(f"{path}: holds no trajectory (no rows)")
@@ -231,7 +200,7 @@ def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
 
 def _read_turns(path: Path) -> Trajectory:
     """Rows of a stamp, axis times angle and shift, camera_T_world."""
-    rows = [values for place, fields in data_rows(path) if (values := _numbered(place, fields, 7)) is not None]
+    rows = [values for place, fields in data_rows(path) if (values := numbers_in(place, fields, 7)) is not None]
     if not rows:
         raise GavoError(f"{path}: holds no trajectory (no rows)")
     table = np.array(rows)

@@ -11,7 +11,10 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images, missing_word
+from gavo_jax.datasets.openloris import OpenLoris
 from gavo_jax.datasets.phones import ArkitScenes, Record3D, StrayScan
+from gavo_jax.datasets.rtabmap import RtabMap
+from gavo_jax.datasets.tartanair import TartanAir
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -73,14 +76,17 @@ class Dataset(Protocol):
 
 BUILT_IN: tuple[Dataset, ...] = (
     *(
+        OpenLoris,
         TumSequence,
         SevenScenes,
         ScanNet,
         Replica,
+        TartanAir,
         BagSequence,
         StrayScan,
         ArkitScenes,
         Record3D,
+        RtabMap,
         Open3DFolder,
         PlainFolder,
     ),

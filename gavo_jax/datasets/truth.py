@@ -1,5 +1,6 @@
 """The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
 
+import fnmatch
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -11,13 +12,15 @@ from jaxtyping import Float
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
 from gavo_jax.datasets.names import FEWEST
 from gavo_jax.errors import GavoError, data_rows, number
-from gavo_jax.trajectory import MAX_MAGNITUDE, Trajectory
+from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
 
 TRUTH = "groundtruth.txt"
 """In TUM's form."""
 
 OTHER_NAMES = re.compile(r"(gt|ground[-_]?truth|poses?|traj|trajectory)(_left)?\.(txt|csv|tum)", re.IGNORECASE)
 """Files that look like one, and are not looked for: their form is open."""
+
+NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
 
 LOG = "trajectory.log"
 """In Redwood's form, which Open3D writes, too."""
@@ -39,6 +42,9 @@ MILLISECOND = 1e-3
 
 MAX_NUMBER = 10**18
 """Largest number of a frame."""
+
+LARGEST = 1e10
+"""Of a file of poses, seconds since 1970 included."""
 
 Seconds = Callable[[np.ndarray], np.ndarray]
 """Times of frames by their numbers."""
@@ -122,10 +128,20 @@ def _is_without_gap(numbers: np.ndarray) -> bool:
     return len(numbers) > 1 and bool((np.diff(np.sort(numbers)) == 1).all())
 
 
-def unread_truth(folder: Path, truth: Trajectory | None) -> list[str]:
-    """A line for a file that may be the true trajectory and is not read, where there is no other."""
-    names = sorted(file.name for file in folder.glob("*") if OTHER_NAMES.fullmatch(file.name)) if truth is None else []
-    return [f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in names]
+def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") -> list[str]:
+    """A line for a file of poses that is not read, where there is no other: it may be the true trajectory, or is none.
+
+    Args:
+        folder: of the frames.
+        truth: that which was read.
+        estimates: the names, as of `glob`, of what the program has found that wrote the folder.
+    """
+    files = [] if truth is not None else sorted(file.name for file in folder.glob("*") if file.is_file())
+    found = set(fnmatch.filter(files, estimates))
+    others = [name for name in files if name not in found and OTHER_NAMES.fullmatch(name)]
+    return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [
+        f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in others
+    ]
 
 
 def counted_in(trajectory: Trajectory) -> float:
@@ -252,3 +268,46 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
             matrix[:3, :3], matrix[3] = rotation, (0, 0, 0, 1)
             return matrix
     raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")
+
+
+def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | None:
+    """The numbers of a row; None where they are not all finite.
+
+    Raises:
+        GavoError: there are not so many, or it is text.
+    """
+    try:
+        values = [number(field) for field in fields]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise GavoError(f"{place}: expected {count} numbers, found {' '.join(fields)[:60]!r}")
+    if not np.isfinite(values).all():
+        return None
+    if np.abs(values).max() > LARGEST:
+        raise GavoError(f"{place}: holds an absurdly large value")
+    return values
+
+
+def posed(values: Sequence[float]) -> Float[np.ndarray, "4 4"] | None:
+    """The pose of tx ty tz qx qy qz qw; None where the quaternion is zero."""
+    if np.linalg.norm(values[3:]) < SHORTEST_QUATERNION:
+        return None
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(np.array(values[3:])), values[:3]
+    return pose
+
+
+def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list[str]]]:
+    """Rows of a file of poses, with their places, by the numbers of their images.
+
+    They are those of the images in their order, where there are as many, else all numbers from 0.
+
+    Raises:
+        GavoError: there is no row.
+    """
+    rows, numbers = data_rows(path), sorted(images)
+    if not rows:
+        raise GavoError(f"{path}: holds no trajectory (no rows)")
+    named = numbers if len(numbers) == len(rows) else range(len(rows))
+    return [(number, *row) for number, row in zip(named, rows, strict=True)]

@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_files import DEPTH_SCALE, Calibration, load_calibration
 from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
@@ -25,9 +25,9 @@ from gavo_jax.datasets.files import (
     size_of_most,
 )
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
-from gavo_jax.datasets.truth import truth_in, unread_truth
+from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
 from gavo_jax.errors import GavoError, data_rows, number, without_heading
-from gavo_jax.trajectory import associate
+from gavo_jax.trajectory import Trajectory, associate
 
 MAX_DIFFERENCE = 0.02
 """Colour and depth stamps at least this far apart, in seconds, are not of one frame."""
@@ -41,13 +41,8 @@ MAX_PATH = 1000
 MAX_STAMP = 1e10
 """Seconds, three centuries since 1970: what is larger counts something else."""
 
-COLOR_LIST, DEPTH_LIST = "rgb.txt", "depth.txt"
 ASSOCIATIONS = tuple(f"{name}.txt" for name in ("associations", "association", "associated", "associate", "assoc"))
 """Both lists in one, as ICL-NUIM has it and `associate.py` prints it: `stamp path stamp path`."""
-
-OPENLORIS = ("color.txt", "aligned_depth.txt")
-"""Lists whose depth is registered, beside a `depth.txt` whose is not. Their camera and the body of their truth lie in
-files of their own, so that they are not read as they stand."""
 
 INDEX_RATE = 30.0
 """Frames per second where the stamps are nothing but the numbers of the frames."""
@@ -74,6 +69,10 @@ class TumSequence(FileSequence):
     """
 
     kind: ClassVar[str] = "TUM RGB-D folder"
+    LISTS: ClassVar[tuple[str, str]] = ("rgb.txt", "depth.txt")
+    """Of colour and of depth."""
+    DEPTH_SCALE: ClassVar[float] = DEPTH_SCALE
+    """Units per metre, where a camera file does not say them."""
 
     def __init__(
         self,
@@ -106,35 +105,59 @@ class TumSequence(FileSequence):
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
-        lists = _read_lists(resolved, self.folder, rate)
+        lists = _read_lists(resolved, self.folder, self.LISTS, rate)
         if lists.are_paired:
             entries, why = _by_place(lists.color, lists.depth), "with a stamp of its own in their row"
         else:
             entries = _associate_lists(lists.color, lists.depth, max_difference)
             why = f"within {max_difference:g} s that is not another's"
         if not entries:
-            names = f"{COLOR_LIST} and {DEPTH_LIST}"
+            names = " and ".join(self.LISTS)
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry, max_difference) for entry in entries]
         stamps = [entry.stamp for entry in files]
-        truth = truth_in(self.folder, stamps, None if lists.unit == 1 else lambda counts: lists.unit * counts)
+        seconds = None if lists.unit == 1 else lambda counts: lists.unit * counts
+        truth, unread = self.truth(self.folder, stamps, seconds)
         super().__init__(
             name or resolved.name,
             files,
-            reading.calibration(partial(_own_calibration, self.folder, files), partial(size_of_most, files)),
+            reading.calibration(
+                partial(self.calibrate, self.folder, files), partial(size_of_most, files), self.DEPTH_SCALE
+            ),
             truth,
             reading,
-            unpaired((len(lists.color), len(lists.depth)), len(entries), why) + unread_truth(self.folder, truth),
+            unpaired((len(lists.color), len(lists.depth)), len(entries), why) + unread,
         )
         self.times_guessed = "stamps are numbers" if rate is None and lists.unit == 1 / INDEX_RATE else ""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a list lies in the folder."""
-        return any((path / name).exists() for name in (COLOR_LIST, DEPTH_LIST, *ASSOCIATIONS))
+        return any((path / name).exists() for name in (*cls.LISTS, *ASSOCIATIONS))
 
     @classmethod
-    def open(cls, path: Path, reading: Reading) -> "TumSequence":
+    def calibrate(cls, folder: Path, entries: list[Entry]) -> Calibration:
+        """The camera file in the folder, else the preset that its name speaks of.
+
+        Raises:
+            GavoError: there is none, or it cannot be read.
+        """
+        load = partial(load_calibration, size=partial(size_of_most, entries))
+        file = own_camera_file(folder)
+        return preset_or_export(folder, load) if file is None else load(file)
+
+    @classmethod
+    def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
+        """The true trajectory that lies in the folder, if one does; why one that lies there is not used, a line each.
+
+        Raises:
+            GavoError: it cannot be read.
+        """
+        found = truth_in(folder, stamps, seconds)
+        return found, unread_truth(folder, found)
+
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> Self:
         """Read the folder as told."""
         return cls(
             path,
@@ -145,13 +168,6 @@ class TumSequence(FileSequence):
             depth_scale=reading.depth_scale,
             rate=reading.rate,
         )
-
-
-def _own_calibration(folder: Path, entries: list[Entry]) -> Calibration:
-    """The camera file in the folder, else the preset that its name speaks of."""
-    load = partial(load_calibration, size=partial(size_of_most, entries))
-    file = own_camera_file(folder)
-    return preset_or_export(folder, load) if file is None else load(file)
 
 
 class _Row(NamedTuple):
@@ -193,16 +209,13 @@ class _Lists(NamedTuple):
     """Whether one list has both images of a frame in a row."""
 
 
-def _read_lists(root: Path, folder: Path, rate: float | None) -> _Lists:
+def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | None) -> _Lists:
     """Read both lists, or the one in their place."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
-    if all((folder / name).exists() for name in OPENLORIS) and not (folder / COLOR_LIST).exists():
-        names, ours = " and ".join(OPENLORIS), f"{COLOR_LIST} and {DEPTH_LIST}"
-        raise GavoError(f"{folder / COLOR_LIST}: no such file; {names}, as OpenLORIS has them: copy them to {ours}")
-    if (folder / COLOR_LIST).exists() or (folder / DEPTH_LIST).exists():
+    if any((folder / name).exists() for name in names):
         both = None
     if both is None:
-        color, depth = (_read_list(root, folder / name) for name in (COLOR_LIST, DEPTH_LIST))
+        color, depth = (_read_list(root, folder / name) for name in names)
     else:
         color, depth = _read_pairs(root, both)
     are_whole = all(WHOLE.fullmatch(row.written) for row in (*color, *depth))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command import runner
-from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, image, raw
+from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, RTABMAP_STAMPS, image, raw
 from recordings import COLOR, DEPTH, Recorder, Shot, record
 
 SHOTS = [
@@ -191,13 +191,37 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["lowres_wide.traj:1: expected 7"],
     ),
     "nerf: poses of prose": ("nerf", edit("transforms.json", "0.0, 1.0", "0.0, 2.0"), ["transforms.json: frames[0]"]),
-    "openloris: lists of other names": (
-        "tum",
-        lambda clip: [
-            (clip / "rgb.txt").rename(clip / "color.txt"),
-            write("aligned_depth.txt", (clip / "depth.txt").read_text())(clip),
-        ],
-        ["rgb.txt: no such file", "color.txt and aligned_depth.txt", "copy them to rgb.txt and depth.txt"],
+    "openloris: no sensors": ("open_loris", remove("sensors.yaml"), ["sensors.yaml: no such file", "--camera"]),
+    "openloris: sensors of prose": (
+        "open_loris",
+        write("sensors.yaml", "%YAML:1.0\nwheels: 4\n"),
+        ["sensors.yaml: camera_matrix: missing"],
+    ),
+    "openloris: no registered depth": (
+        "open_loris",
+        remove("aligned_depth.txt"),
+        ["aligned_depth.txt: no such file", "unpack it"],
+    ),
+    "tartanair: depth that was not downloaded": (
+        "tartan_air_2",
+        remove("depth_lcam_front"),
+        ["depth_lcam_front: no such folder beside image_lcam_front", "download it"],
+    ),
+    "tartanair: images that were scaled": (
+        "tartan_air",
+        remove("camera.yaml"),
+        ["clip: images of 160x120", "rendered at 640x480 or 640x640", "--camera"],
+    ),
+    "tartanair: poses of prose": ("tartan_air", write("pose_left.txt", "up\n"), ["pose_left.txt:1: expected 7"]),
+    "rtabmap: a camera of prose": (
+        "rtabmap",
+        write(f"calib/{RTABMAP_STAMPS[1]}.yaml", "wide"),
+        [f"{RTABMAP_STAMPS[1]}.yaml", "not a camera file"],
+    ),
+    "rtabmap: depth of a smaller size": (
+        "rtabmap",
+        pixels(f"depth/{RTABMAP_STAMPS[0]}.png", SMALL.astype(np.uint16) + 1000),
+        [f"{RTABMAP_STAMPS[0]}.png", "80x60", "160x120", "[depth]"],
     ),
     "replica: short trajectory rows": ("replica", write("traj.txt", "1 0 0 0\n"), ["traj.txt:1", "found 4 fields"]),
     "replica: cameras of prose": ("replica", write("cam_params.json", "none"), ["cam_params.json", "not JSON"]),

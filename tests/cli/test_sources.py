@@ -50,6 +50,10 @@ def is_refused(done: Done, *words: str) -> bool:
     return done.status == 2 and not done.out and done.err.count("\n") == 1 and all(word in done.err for word in words)
 
 
+WITH_TIMES = ("tum", "stray", "arkit_scenes", "open_loris", "tartan_air_2", "rtabmap")
+"""Layouts whose frames say when they were taken."""
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_run_needs_nothing_but_the_folder_and_says_which_camera(gavo, tmp_path, name):
     (tmp_path / "clip").mkdir() if name != "tum" else None
@@ -58,7 +62,7 @@ def test_run_needs_nothing_but_the_folder_and_says_which_camera(gavo, tmp_path, 
     assert done.status == 0, done.err
     first = done.out.splitlines()[0]
     counts = "stamps" if name == "associations" else "names"
-    rate = "" if name in ("tum", "stray", "arkit_scenes") else f" at 30 frames/s ({counts} are numbers)"
+    rate = "" if name in WITH_TIMES else f" at 30 frames/s ({counts} are numbers)"
     assert first.startswith(
         f"clip: {LAYOUTS[name][0]}, 4 frames of 160x120{rate}; camera fx 131 fy 131 cx 79.5 cy 59.5 (clip/"
     )

@@ -1,0 +1,55 @@
+"""What RTAB-Map exports of a map: the images of its nodes, by `rtabmap-export` or from its database viewer."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.datasets.assembly import MILLIMETRES
+from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.folders import PlainFolder, of_each_frame
+from gavo_jax.datasets.image_folders import plain_files
+from gavo_jax.errors import GavoError
+
+
+class RtabMap(PlainFolder):
+    """Images in `rgb/` and `depth/`, their cameras in `calib/` or `calib.yaml`; a map's name may stand before each.
+
+    Depth is registered, in millimetres. Names are stamps, or the ids of nodes. A camera is that of images without
+    distortion, whatever lens its file has, as RTAB-Map itself takes it.
+    """
+
+    kind: ClassVar[str] = "export of RTAB-Map"
+    scale_is_open: ClassVar[bool] = False
+    ESTIMATES: ClassVar[str] = "*poses*.txt"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """By the cameras beside the images."""
+        return bool(_cameras(path)) and super().recognises(path)
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else what the images' cameras have in common."""
+        if own_camera_file(path) is not None:
+            return super().calibrate(path, entries, reading)
+        files = _cameras(path)
+        second = files[0].with_name(f"{entries[0].color.stem}_1.yaml")
+        if second in files:
+            how = "cut them apart, and say --camera"
+            raise GavoError(f"{second}: of a second camera, whose images lie beside the first one's: {how}")
+        load = partial(
+            load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES, is_rectified=True
+        )
+        return load(files[0]) if files[0].parent == path else of_each_frame(files[0].parent, files, load)
+
+
+def _cameras(path: Path) -> list[Path]:
+    """Files of the cameras: beside the folder of colour one of the same name but for its kind, else a file so named."""
+    color, _ = plain_files(path)
+    if not color or color[0].parent == path or "rgb" not in color[0].parent.name:
+        return []
+    folder = color[0].parent.with_name(color[0].parent.name.replace("rgb", "calib"))
+    alone = folder.with_name(f"{folder.name}.yaml")
+    return sorted(folder.glob("*.yaml")) or [alone] * alone.is_file()
