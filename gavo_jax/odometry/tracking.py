@@ -185,9 +185,9 @@ def track_frame(
         alignment,
         key,
         guesses,
-        record,
-        exchanged,
-        readout,
+        record=record,
+        exchanged=exchanged,
+        readout=readout,
         swaying=swaying,
         share=state.share,
     )
