@@ -94,17 +94,17 @@ def conclude(
     findings = as_findings(against)
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
-        motion,
-        log(motion),
-        evidence.model.error,
-        evidence.model.overlap,
-        jnp.where(known, covariance, jnp.nan),
-        gravest(findings),
-        history,
-        findings,
-        evidence.explained,
-        jnp.asarray(objective.scales.depth, jnp.float32),
-        jnp.zeros(6) if objective.sway is None else objective.sway,
+        target_T_reference=motion,
+        xi=log(motion),
+        error=evidence.model.error,
+        overlap=evidence.model.overlap,
+        covariance=jnp.where(known, covariance, jnp.nan),
+        status=gravest(findings),
+        history=history,
+        findings=findings,
+        explained=evidence.explained,
+        depth_scale=jnp.asarray(objective.scales.depth, jnp.float32),
+        sway=jnp.zeros(6) if objective.sway is None else objective.sway,
     )
 
 

@@ -102,15 +102,15 @@ def form_belief(
     total = jnp.maximum(jnp.sum(credit), 1.0)
     arisen = has * (moving > 0) * (known <= 0)
     return Belief(
-        after,
-        moving,
-        jnp.sum(credit * at_rest) / total,
-        jnp.sum(credit * (moving > 0)) / total,
-        hidden,
-        jnp.mean(arisen),
-        known,
-        _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
-        jnp.sum(credit * evidence.seen, (1, 2)) / total,
+        known=after,
+        moving=moving,
+        support=jnp.sum(credit * at_rest) / total,
+        contradicted=jnp.sum(credit * (moving > 0)) / total,
+        hidden=hidden,
+        arisen=jnp.mean(arisen),
+        carried=known,
+        suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
+        in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )
 
 

@@ -164,7 +164,13 @@ def compare(
         sample, surface = sample_grey(words, seen), sample_depth(words, seen)
         depth = (seen.inverse_depth - surface.value) * surface.valid * seen.inside
         return Residuals(
-            sample.value - grey.value, depth, seen.inside, surface.valid * seen.inside, seen, sample, surface
+            grey=sample.value - grey.value,
+            depth=depth,
+            inside=seen.inside,
+            depth_valid=surface.valid * seen.inside,
+            warped=seen,
+            grey_sample=sample,
+            depth_sample=surface,
         )
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)

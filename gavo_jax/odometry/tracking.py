@@ -212,17 +212,17 @@ def track_frame(
     unrest = state.unrest.after(sway / clock.elapsed, change)
     unrest = unrest._replace(changes=jnp.where(was_second, state.unrest.changes, unrest.changes))
     after_it = TrackerState(
-        newest,
-        keyframe,
-        packed,
-        motion,
-        motion,
-        passing,
-        unrest,
-        clock.elapsed,
-        jnp.float32(1.0),
-        exposure,
-        usual,
+        previous=newest,
+        keyframe=keyframe,
+        previous_image=packed,
+        motion=motion,
+        guess=motion,
+        passing=passing,
+        unrest=unrest,
+        seconds=clock.elapsed,
+        share=jnp.float32(1.0),
+        exposure=exposure,
+        usual=usual,
     )
     return after_it, result, populations
 
