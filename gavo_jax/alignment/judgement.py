@@ -13,10 +13,10 @@ from gavo_jax.alignment.evidence import Held, is_held
 from gavo_jax.alignment.evidence import evidence as evidence_for
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
-from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying, unswayed
-from gavo_jax.alignment.visits import Level, Search, reach_of
+from gavo_jax.alignment.sway import LARGEST_RISE, Swayed, Swaying, refine_swaying, unswayed
+from gavo_jax.alignment.visits import Level, reach_of
 from gavo_jax.frame_checks import MIN_DEPTH_SHARE
-from gavo_jax.objective.derivatives import Linearization, weighted_terms
+from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.error import Objective, Residuals
 from gavo_jax.objective.estimates import ExplainedShare, estimate_scales, explained_share
 from gavo_jax.objective.problem import Problem
@@ -49,43 +49,44 @@ SHARED_ERRORS = 9.0
 rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
 
 
+class Winner(NamedTuple):
+    """What a search ended with."""
+
+    motion: Float[Array, "4 4"]
+    rival: Float[Array, ""]
+    """See `Search`."""
+    centre: Float[Array, "4 4"]
+    """Motion that the search was held about."""
+    history: Float[Array, " iterations"]
+    judge: Objective | None = None
+    """What the evidence is asked of, where motions competed by it."""
+
+
 def conclude(
     objective: Objective,
-    search: Search,
+    winner: Winner,
     finest: Level,
     options: AlignmentOptions,
-    history: jax.Array,
-    centre: Float[Array, "4 4"],
-    judge: Objective | None = None,
     swaying: Swaying | None = None,
     share: Float[Array, ""] | float = 1.0,
 ) -> Alignment:
-    """From what the search, held about a centre, ended with to the result: estimate, refine, judge. Points of a share
-    of the image take part.
+    """From what the search ended with to the result: estimate, refine, judge. Points of a share of the image take
+    part.
     """
-    found = search.islands[0]
-    residuals = objective.residuals(found)
+    residuals = objective.residuals(winner.motion)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     points = finest.points * finest.views  # arrays may be longer
     reach = reach_of(options)
-    problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
+    problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=winner.centre, reach=reach)
     added = jnp.zeros((6, 6))
     if options.last_step and not options.symmetric:
         problem, residuals, added = _last_step(problem, residuals, swaying, points)
         objective = problem.objective
     motion = problem.origin
-    evidence = _examine(problem, residuals)
-    held, chosen_by = None, None
-    if judge is not None:
-        held = is_held(judge, motion, evidence.information.directions)
-        chosen_by = evidence_for(judge, motion)
-    covariance = _covariance(evidence, objective, held) + added
-    if held is not None:
-        determined = evidence.information.determined | held.held
-        evidence = evidence._replace(information=evidence.information._replace(determined=determined))
-    against = find_against(evidence, covariance, objective, search.rival, share * points, chosen_by)
+    evidence, covariance, chosen_by = _weigh(_examine(problem, residuals), objective, winner.judge, added)
+    against = find_against(evidence, covariance, objective, winner.rival, share * points, chosen_by)
     if options.precondition:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
         # along a way that the images leave open any motion is as good, that at the edge, too
@@ -100,7 +101,7 @@ def conclude(
         overlap=evidence.model.overlap,
         covariance=jnp.where(known, covariance, jnp.nan),
         status=gravest(findings),
-        history=history,
+        history=winner.history,
         findings=findings,
         explained=evidence.explained,
         depth_scale=jnp.asarray(objective.scales.depth, jnp.float32),
@@ -155,16 +156,37 @@ class Evidence(NamedTuple):
 
 def _examine(problem: Problem, r: Residuals) -> Evidence:
     """What the images say of the problem's origin, of which these are the residuals."""
-    # held back, or XLA would compute them anew for each that uses them
-    terms = jax.lax.optimization_barrier(weighted_terms(problem.objective, problem.objective.reference, r))
+    model, scatter, terms = problem.examine(r)
     return Evidence(
         motion=problem.origin,
         inside=jnp.sum(r.inside),
-        model=problem.linearize_terms(r, terms),
-        scatter=problem.scatter(r, terms),
+        model=model,
+        scatter=scatter,
         information=measure_information(problem, r, terms),
         explained=explained_share(r),
     )
+
+
+def _weigh(
+    evidence: Evidence, objective: Objective, judge: Objective | None, added: Float[Array, "6 6"]
+) -> tuple[Evidence, Float[Array, "6 6"], Chosen | None]:
+    """What the images say of a motion, its covariance, and the evidence for it where motions competed by that: a
+    direction is determined, too, if the evidence holds it.
+
+    Args:
+        evidence: What the images say at the finest level.
+        objective: Of that level.
+        judge: What the evidence is asked of; None where nothing competed.
+        added: To the covariance.
+    """
+    if judge is None:
+        return evidence, _covariance(evidence, objective, None) + added, None
+    held = is_held(judge, evidence.motion, evidence.information.directions)
+    chosen_by = evidence_for(judge, evidence.motion)
+    covariance = _covariance(evidence, objective, held) + added
+    determined = evidence.information.determined | held.held
+    evidence = evidence._replace(information=evidence.information._replace(determined=determined))
+    return evidence, covariance, chosen_by
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
@@ -243,6 +265,3 @@ def is_unknown(result: Alignment) -> bool:
 LARGEST_STEP = 0.01
 """Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
 images leave open; it is not taken."""
-LARGEST_RISE = 0.003
-"""Share by which the last step may raise E: between pixels E is rough, by about that much, and the step's aim is the
-middle of its basin."""

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
 from gavo_jax.alignment.evidence import evidence
-from gavo_jax.alignment.judgement import conclude
+from gavo_jax.alignment.judgement import Winner, conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import Swaying
@@ -183,10 +183,10 @@ def align_views(
         ended = search_alone()
     iterations = [solver.iterations[number] for number in searched]
     history = jnp.concatenate([row[:count] for row, count in zip(ended.histories, iterations, strict=True)])
-    search = ended.search
-    objective = level_objective(finest, target, options, search.brightness).merged()
-    result = conclude(objective, search, finest, options, history, ended.centre, ended.judge, swaying, share)
-    return result, ended.populations
+    motion, rival = ended.search.islands[0], ended.search.rival
+    winner = Winner(motion, rival, centre=ended.centre, history=history, judge=ended.judge)
+    objective = level_objective(finest, target, options, ended.search.brightness).merged()
+    return conclude(objective, winner, finest, options, swaying, share), ended.populations
 
 
 def _search_in_contest(
