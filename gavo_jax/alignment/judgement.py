@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
-from gavo_jax.alignment.evidence import Evidence as Chosen
-from gavo_jax.alignment.evidence import Held, is_held
-from gavo_jax.alignment.evidence import evidence as evidence_for
+from gavo_jax.alignment.evidence import Evidence, Held, evidence, is_held
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.alignment.sway import LARGEST_RISE, Swayed, Swaying, refine_swaying, unswayed
@@ -85,8 +83,8 @@ def conclude(
         problem, residuals, added = _last_step(problem, residuals, swaying, points)
         objective = problem.objective
     motion = problem.origin
-    evidence, covariance, chosen_by = _weigh(_examine(problem, residuals), objective, winner.judge, added)
-    against = find_against(evidence, covariance, objective, winner.rival, share * points, chosen_by)
+    examination, covariance, chosen_by = _weigh(_examine(problem, residuals), objective, winner.judge, added)
+    against = find_against(examination, covariance, objective, winner.rival, share * points, chosen_by)
     if options.precondition:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
         # along a way that the images leave open any motion is as good, that at the edge, too
@@ -97,13 +95,13 @@ def conclude(
     return Alignment(
         target_T_reference=motion,
         xi=log(motion),
-        error=evidence.model.error,
-        overlap=evidence.model.overlap,
+        error=examination.model.error,
+        overlap=examination.model.overlap,
         covariance=jnp.where(known, covariance, jnp.nan),
         status=gravest(findings),
         history=winner.history,
         findings=findings,
-        explained=evidence.explained,
+        explained=examination.explained,
         depth_scale=jnp.asarray(objective.scales.depth, jnp.float32),
         sway=jnp.zeros(6) if objective.sway is None else objective.sway,
     )
@@ -140,7 +138,7 @@ def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
     return jax.lax.optimization_barrier(jnp.where(better, stepped, problem.origin))
 
 
-class Evidence(NamedTuple):
+class Examination(NamedTuple):
     """What the images say of one motion at the finest level."""
 
     motion: Float[Array, "4 4"]
@@ -154,10 +152,10 @@ class Evidence(NamedTuple):
     explained: ExplainedShare
 
 
-def _examine(problem: Problem, r: Residuals) -> Evidence:
+def _examine(problem: Problem, r: Residuals) -> Examination:
     """What the images say of the problem's origin, of which these are the residuals."""
     model, scatter, terms = problem.examine(r)
-    return Evidence(
+    return Examination(
         motion=problem.origin,
         inside=jnp.sum(r.inside),
         model=model,
@@ -168,25 +166,25 @@ def _examine(problem: Problem, r: Residuals) -> Evidence:
 
 
 def _weigh(
-    evidence: Evidence, objective: Objective, judge: Objective | None, added: Float[Array, "6 6"]
-) -> tuple[Evidence, Float[Array, "6 6"], Chosen | None]:
+    examination: Examination, objective: Objective, judge: Objective | None, added: Float[Array, "6 6"]
+) -> tuple[Examination, Float[Array, "6 6"], Evidence | None]:
     """What the images say of a motion, its covariance, and the evidence for it where motions competed by that: a
     direction is determined, too, if the evidence holds it.
 
     Args:
-        evidence: What the images say at the finest level.
+        examination: What the images say at the finest level.
         objective: Of that level.
         judge: What the evidence is asked of; None where nothing competed.
         added: To the covariance.
     """
     if judge is None:
-        return evidence, _covariance(evidence, objective, None) + added, None
-    held = is_held(judge, evidence.motion, evidence.information.directions)
-    chosen_by = evidence_for(judge, evidence.motion)
-    covariance = _covariance(evidence, objective, held) + added
-    determined = evidence.information.determined | held.held
-    evidence = evidence._replace(information=evidence.information._replace(determined=determined))
-    return evidence, covariance, chosen_by
+        return examination, _covariance(examination, objective, None) + added, None
+    held = is_held(judge, examination.motion, examination.information.directions)
+    chosen_by = evidence(judge, examination.motion)
+    covariance = _covariance(examination, objective, held) + added
+    determined = examination.information.determined | held.held
+    examination = examination._replace(information=examination.information._replace(determined=determined))
+    return examination, covariance, chosen_by
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
@@ -194,23 +192,23 @@ def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
-def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
+def _covariance(examination: Examination, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
     """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
     residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
     that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
     """
-    information, known_within = evidence.information, jnp.zeros((6, 6))
+    information, known_within = examination.information, jnp.zeros((6, 6))
     if held is not None:
         # the gradients of frames far apart may tell less of a direction than that the motion is not a step off
         ways = information.directions
-        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (evidence.scatter @ ways), axis=0))
+        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (examination.scatter @ ways), axis=0))
         half = 0.5 * jnp.max(jnp.abs(held.steps), axis=0) / jnp.max(jnp.abs(ways), axis=0)
         vague = held.held & (~information.determined | (spread > half * jnp.abs(information.curvature)))
         information = information._replace(determined=information.determined & ~vague)
         known_within = jnp.where(vague, 0.5 * held.steps, 0.0)
     inverse = information.inverse()
-    least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
-    covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(examination.inside, 1.0) * inverse
+    covariance = SHARED_ERRORS * inverse @ examination.scatter @ inverse.T + least
     is_open = ~information.determined & jnp.all(known_within == 0.0, axis=0)
     open_ways = jnp.where(is_open, information.directions, 0.0)
     open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
@@ -220,17 +218,17 @@ def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> 
 
 
 def find_against(
-    evidence: Evidence,
+    examination: Examination,
     covariance: Float[Array, "6 6"],
     objective: Objective,
     rival: Float[Array, ""],
     points: Float[Array, ""],
-    chosen_by: Chosen | None = None,
+    chosen_by: Evidence | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
     """All that can be said against a motion, for which so many points were asked, by its status; docs/status.md gives
     the reasons.
     """
-    motion, model, explained = evidence.motion, evidence.model, evidence.explained
+    motion, model, explained = examination.motion, examination.model, examination.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
@@ -242,7 +240,7 @@ def find_against(
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     return {
         AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,
-        AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(evidence.information.determined),
+        AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(examination.information.determined),
         AlignmentStatus.HIGH_ERROR: unexplained,
         AlignmentStatus.LOW_OVERLAP: model.overlap < MIN_FINAL_OVERLAP,
         AlignmentStatus.NOT_FINITE: ~finite,

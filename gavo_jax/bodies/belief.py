@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.evidence import Evidence, View, gather_evidence
+from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
@@ -129,7 +129,7 @@ def suspect(
     return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies) if trusted else before, np.float32)
 
 
-def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """How far each pixel speaks for moving, and how far for rest; 0 to 1."""
     views = e.grey.shape[0]
     lenient = jnp.where(jnp.arange(views) > 0, 2.0, 1.0)[:, None, None]
@@ -146,7 +146,7 @@ def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     return moves, rests
 
 
-def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+def _carry(before: Float[Array, "h w"], e: PixelEvidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
     """What was known of the surfaces that the pixels lie on, where these are the `same` in the first other view."""
     height, width = before.shape
     u, v = jnp.round(e.place[0]).astype(jnp.int32)
@@ -154,16 +154,16 @@ def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -
     return jnp.where(same, before[v, u], 0.0)
 
 
-def _seen_before(e: Evidence, limit: float) -> Bool[Array, "h w"]:
+def _seen_before(e: PixelEvidence, limit: float) -> Bool[Array, "h w"]:
     """Which pixels' surfaces the first other view shows: by depth, up to some evidence against it."""
     return (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < limit))
 
 
-def _after(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def _after(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
     return jax.lax.cond(jnp.any(suspected > 0), lambda: follow(suspected, e, grey), lambda: jnp.zeros_like(suspected))
 
 
-def follow(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Suspicions carried with their surfaces, which may have moved, and spread to what of these was not seen before."""
     same = _seen_before(e, 2.0 * FAR) & (e.measured[0] > 0)
     across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))

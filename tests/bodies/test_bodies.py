@@ -19,7 +19,7 @@ from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, Candidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
-from gavo_jax.bodies.evidence import Evidence, View, gather_evidence, view_of
+from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence, view_of
 from gavo_jax.bodies.identity import Roll, identify, parts
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import Retina
@@ -225,7 +225,7 @@ def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_furth
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
     seen = np.broadcast_to((columns >= 6).astype(np.float32), shape)
     nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-    evidence = Evidence(nothing, nothing, nothing, seen, one, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = PixelEvidence(nothing, nothing, nothing, seen, one, near, place)  # pyright: ignore[reportArgumentType]
     before = np.broadcast_to(((columns >= 6) & (columns < 15)).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
@@ -241,7 +241,7 @@ def test_a_suspicion_of_what_was_not_measured_says_nothing_of_the_surface_that_s
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
     nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
     measured = np.broadcast_to((columns < 15).astype(np.float32), shape)
-    evidence = Evidence(nothing, nothing, nothing, one, measured, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = PixelEvidence(nothing, nothing, nothing, one, measured, near, place)  # pyright: ignore[reportArgumentType]
     before = np.broadcast_to((columns < 20).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
