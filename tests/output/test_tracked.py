@@ -91,7 +91,7 @@ def test_before_a_camera_the_search_behind_the_first_one_is_made_as_well() -> No
 
     first, wide = Made("first"), Made("wide")
     behind: Any = wide
-    odometry = Odometry(CAMERA, aligner=Recovering(first, lambda: wide, behind))  # pyright: ignore[reportArgumentType]
+    odometry = Odometry(CAMERA, aligner=Recovering(first, wide, behind))  # pyright: ignore[reportArgumentType]
     odometry.warm_up()
     assert made == ["first"]
     odometry.warm_up(wholly=True)
