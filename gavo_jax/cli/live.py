@@ -18,13 +18,14 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.run import conclude
 from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell, waiting
+from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.scene_map import LiveMap, MapBuilder
 from gavo_jax.settings import Settings
@@ -66,14 +67,14 @@ def run_live(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed},
+            **run_identity(device.name, method, preset, options.seed),
             "complete": end.fault is None,
             **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(name, metrics, folder.path, False)
+        print_run(name, metrics, folder.path, trajectory, has_truth=False)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")

@@ -22,19 +22,22 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
+from gavo_jax.errors import tell
 from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.run import conclude
 from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell, waiting
+from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
@@ -107,9 +110,8 @@ def run(options: Run) -> int:
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(
-            name, metrics, folder.path, sequence.ground_truth is not None, is_rendered=options.sequence == SYNTHETIC
-        )
+        has_truth, is_rendered = sequence.ground_truth is not None, options.sequence == SYNTHETIC
+        print_run(name, metrics, folder.path, trajectory, has_truth=has_truth, is_rendered=is_rendered)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
     if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
@@ -180,10 +182,7 @@ def _track(
         write_loops(folder.path, outcome.loops)
         viewer.conclude(outcome.trajectory, outcome.loops)
     metrics = {
-        "sequence": sequence.name,
-        "method": options.method,
-        "preset": options.preset,
-        "seed": options.seed,
+        **run_identity(sequence.name, options.method, options.preset, options.seed),
         "complete": len(outcome.steps) == len(sequence) - 1,
         "left_out": left_out(sequence),
         **outcome.figures,
@@ -192,7 +191,7 @@ def _track(
 
     def draw_figures() -> None:
         draw(folder.path, {options.method: outcome.trajectory}, sequence.ground_truth)
-        draw_search(folder.path, sequence, odometry, tracked.steps)
+        draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
     with waiting("drawing figures …"):
         interruptible(draw_figures)
