@@ -51,8 +51,6 @@ class Belief(NamedTuple):
     """Share of it that moves."""
     hidden: Bool[Array, "h w"]
     """Which pixels the first of the others does not see, as something stands before them."""
-    arisen: Float[Array, ""]
-    """Share of the image that moves and was not known to."""
     carried: Float[Array, "h w"]
     """What was known before, on the same surfaces, without what this frame says."""
     suspected: Float[Array, "h w"]
@@ -100,14 +98,12 @@ def form_belief(
     hidden = evidence.depth[0] < -FAR
     at_rest = (moving < 0) & ~hidden & (evidence.seen[0] > 0)
     total = jnp.maximum(jnp.sum(credit), 1.0)
-    arisen = has * (moving > 0) * (known <= 0)
     return Belief(
         known=after,
         moving=moving,
         support=jnp.sum(credit * at_rest) / total,
         contradicted=jnp.sum(credit * (moving > 0)) / total,
         hidden=hidden,
-        arisen=jnp.mean(arisen),
         carried=known,
         suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
         in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,

@@ -33,7 +33,7 @@ from gavo_jax.errors import GavoError, GavoWarning, shown, tell
 from gavo_jax.version import __version__
 
 BAD_INPUT, BROKEN_PIPE = 2, 141
-"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `cli.run.LOST` (`--strict`)."""
+"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `early.LOST` (`--strict`)."""
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""

@@ -8,16 +8,15 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files import load_calibration
-from gavo_jax.cli.map_file import check_options, write_map
+from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
-from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
-from gavo_jax.early import INTERRUPTED
+from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
@@ -42,7 +41,7 @@ def run_live(options: Run) -> int:
     check_seed(options.seed)
     _refuse_what_cannot_be(options)
     trajectory_formats = formats(options.trajectory_format)
-    shape = check_options(options.map, options.map_shape, options.voxel)
+    shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     if settings.odometry.loops:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gavo_jax.cli.map_file import check_options, save_map
+from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import (
@@ -21,7 +21,7 @@ from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
-from gavo_jax.early import INTERRUPTED
+from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import tell
 from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, summary
@@ -31,6 +31,7 @@ from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import run_identity
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import conclude
 from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.output.drawing import draw, draw_search
@@ -45,9 +46,6 @@ from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
-LOST = 3
-"""Exit status where a pair was lost and `--strict` asked to know."""
-
 CHECKPOINT_SECONDS = 2.0
 """Between two checkpoints; each takes some 20 ms."""
 
@@ -60,7 +58,7 @@ def run(options: Run) -> int:
         return run_live(options)
     check_seed(options.seed)
     trajectory_formats = formats(options.trajectory_format)
-    shape = check_options(options.map, options.map_shape, options.voxel)
+    shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     sequence = open_sequence(options, color=options.map is not None or options.viewer != "none")
@@ -88,19 +86,9 @@ def run(options: Run) -> int:
             # before an earlier run is replaced: it may not open
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
-                if options.resume:
-                    say(f"nothing to resume in {folder.path}: a new run")
-                remove_trajectories(folder.path)
-                if folder.has_run():
-                    say(f"the earlier run in {folder.path} is replaced")
-                folder.start(config, float(sequence.timestamps[0]))
+                _start(options, sequence, folder, config)
             else:
-                odometry.progress = progress
-                steps = folder.steps()
-                for step in (None, *steps):
-                    viewer.watch(None, step)
-                if mapper is not None:
-                    mapper.replay(sequence, steps, folder.moving)
+                _go_on(progress, sequence, odometry, folder, viewer, mapper)
             say(summary(sequence))
             if lines := left_out(sequence):
                 counts = ", ".join(line.partition(": ")[0] for line in lines)
@@ -120,6 +108,33 @@ def run(options: Run) -> int:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:
+    """Begin the files of a run, in place of an earlier one's."""
+    if options.resume:
+        say(f"nothing to resume in {folder.path}: a new run")
+    remove_trajectories(folder.path)
+    if folder.has_run():
+        say(f"the earlier run in {folder.path} is replaced")
+    folder.start(config, float(sequence.timestamps[0]))
+
+
+def _go_on(
+    progress: Progress,
+    sequence: Sequence,
+    odometry: Odometry,
+    folder: RunFolder,
+    viewer: Viewer,
+    mapper: BackgroundMapper | None,
+) -> None:
+    """Have the driver, the viewer and the map stand where an earlier run stopped."""
+    odometry.progress = progress
+    steps = folder.steps()
+    for step in (None, *steps):
+        viewer.watch(None, step)
+    if mapper is not None:
+        mapper.replay(sequence, steps, folder.moving)
 
 
 def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:
