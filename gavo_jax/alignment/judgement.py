@@ -45,6 +45,13 @@ MAX_DEPARTURE = 1e-4
 SHARED_ERRORS = 9.0
 """Factor on the covariance for errors that the whole image shares (interpolation, the choice of points, the pyramid's
 rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
+UNDETERMINED = 0.5
+"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
+UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
+"""Covariance of a motion that images do not tell."""
+LARGEST_STEP = 0.01
+"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
+images leave open; it is not taken."""
 
 
 class Winner(NamedTuple):
@@ -249,17 +256,6 @@ def find_against(
     }
 
 
-UNDETERMINED = 0.5
-"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
-UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
-"""Covariance of a motion that images do not tell."""
-
-
 def is_unknown(result: Alignment) -> bool:
     """Whether a result, on the host, has the covariance of a motion that images do not tell."""
     return bool(np.all(np.diagonal(result.covariance) >= UNDETERMINED**2))
-
-
-LARGEST_STEP = 0.01
-"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
-images leave open; it is not taken."""

@@ -110,7 +110,7 @@ class Ended(NamedTuple):
     histories: Float[Array, "l iterations"]
     populations: Population | None
     judge: Objective | None = None
-    """What told by the evidence, where motions competed."""
+    """What the evidence was asked of, where motions competed by it."""
 
 
 def align_views(

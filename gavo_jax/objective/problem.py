@@ -18,6 +18,9 @@ from gavo_jax.objective.derivatives import (
 from gavo_jax.objective.error import Objective, Residuals, both_directions
 from gavo_jax.se3 import adjoint, exp, right_jacobian, rigid_inverse
 
+TILES = (8, 6)
+"""Tiles across and down the image, for `Problem.scatter`."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -124,7 +127,3 @@ class Problem:
         """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
         motion = self.transform(x)
         return motion, adjoint(motion) @ right_jacobian(self.basis @ x) @ self.basis
-
-
-TILES = (8, 6)
-"""Tiles across and down the image, for `Problem.scatter`."""
