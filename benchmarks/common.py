@@ -219,7 +219,8 @@ def measure_drift(clips: Sequence[str], contenders: Sequence[Contender], seeds: 
                 if seed > 0 and not contender.random:
                     continue
                 odometry = contender.make(sequence.camera, seed)
-                metrics = track_visibly(f"{clip}, {contender.name}, seed {seed}", sequence, odometry).metrics
+                tracked = track_visibly(f"{clip}, {contender.name}, seed {seed}", sequence, odometry)
+                metrics = tracked.concluded(sequence).figures
                 if metrics[DRIFT] is None:
                     raise GavoError(f"{clip}: no ground truth over a second of it")
                 runs.append({"clip": clip, "name": contender.name, "seed": seed, "random": contender.random, **metrics})

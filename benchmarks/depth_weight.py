@@ -81,7 +81,7 @@ def optimum(objective: Objective, motion: jax.Array, unit: jax.Array) -> tuple[j
 
     x = jax.lax.fori_loop(0, STEPS, step, jnp.zeros(6))
     found = replace(problem, origin=problem.transform(x))
-    model, scatter = found.examine(objective.residuals(found.origin))
+    model, scatter, _ = found.examine(objective.residuals(found.origin))
     return x, model.hessian / unit, scatter / unit**2
 
 

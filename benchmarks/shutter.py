@@ -35,7 +35,7 @@ def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
     for milliseconds in readouts:
         camera = replace(sequence.camera, readout=milliseconds / 1000)
         odometry = Odometry(camera, settings)
-        tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry)
+        tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry).concluded(sequence)
         errors = np.array([float(step.alignment.error) for step in tracked.steps])
         first = errors if first is None else first
         both = np.isfinite(first) & np.isfinite(errors)
@@ -43,8 +43,8 @@ def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
             {
                 "readout_ms": milliseconds,
                 "error": common.geometric_mean(list(errors[both] / first[both])),
-                "translation": tracked.metrics[DRIFT],
-                "rotation": tracked.metrics[ROTATION_DRIFT],
+                "translation": tracked.figures[DRIFT],
+                "rotation": tracked.figures[ROTATION_DRIFT],
             }
         )
     return rows

@@ -47,7 +47,7 @@ def measure(clip: str, method: str) -> list[dict[str, Any]]:
         raise GavoError(f"{clip}: no ground truth")
     for name, sway in VELOCITIES.items():
         odometry = Odometry(sequence.camera, replace(settings, odometry=replace(settings.odometry, sway=sway)))
-        run = track_visibly(f"{clip}, {name}", sequence, odometry)
+        run = track_visibly(f"{clip}, {name}", sequence, odometry).concluded(sequence)
         metres, radians = pair_errors(run.trajectory, sequence.ground_truth)
         rows.append(
             {
@@ -55,8 +55,8 @@ def measure(clip: str, method: str) -> list[dict[str, Any]]:
                 "pair_m": float(np.sqrt(np.mean(metres**2))),
                 "worst_m": float(metres.max()),
                 "pair_rad": float(np.sqrt(np.mean(radians**2))),
-                "translation": run.metrics[DRIFT],
-                "rotation": run.metrics[ROTATION_DRIFT],
+                "translation": run.figures[DRIFT],
+                "rotation": run.figures[ROTATION_DRIFT],
             }
         )
     return rows

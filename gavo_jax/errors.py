@@ -1,10 +1,11 @@
-"""Bad input as one kind of exception, the text files that users hand in, and files that are written whole."""
+"""Bad input as one kind of exception, lines about it, the text files that users hand in, and files written whole."""
 
 import contextlib
 import math
 import os
 import re
 import reprlib
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -37,6 +38,11 @@ def printable(text: str) -> str:
     Names of files, and of what is in archives and on servers, are other people's words.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def tell(line: str) -> None:
+    """Print a line of the command's own on standard error: one, whatever the words are."""
+    print(f"gavo: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

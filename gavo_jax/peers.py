@@ -193,13 +193,11 @@ class PeerInfo:
 
     Attributes:
         name: key in `PEERS`.
-        description: a few words for help texts and tables.
         module: what must be importable.
         make: builds the peer for a camera.
     """
 
     name: str
-    description: str
     module: str
     make: Callable[[Camera], Peer]
 
@@ -209,42 +207,41 @@ class PeerInfo:
         return importlib.util.find_spec(self.module) is not None
 
 
-def _opencv(name: str, kind: int, what: str) -> PeerInfo:
-    return PeerInfo(name, f"OpenCV, {what}", "cv2", lambda camera: OpenCVPeer(name, camera, kind))
+def _opencv(name: str, kind: int) -> PeerInfo:
+    return PeerInfo(name, "cv2", lambda camera: OpenCVPeer(name, camera, kind))
 
 
-def _legacy(name: str, term: str, max_depth: float, what: str) -> PeerInfo:
-    return PeerInfo(name, f"Open3D, {what}", "open3d", lambda camera: Open3DLegacyPeer(name, camera, term, max_depth))
+def _legacy(name: str, term: str, max_depth: float) -> PeerInfo:
+    return PeerInfo(name, "open3d", lambda camera: Open3DLegacyPeer(name, camera, term, max_depth))
 
 
-def _tensor(name: str, method: str, what: str) -> PeerInfo:
-    return PeerInfo(name, f"Open3D tensor, {what}", "open3d", lambda camera: Open3DTensorPeer(name, camera, method))
+def _tensor(name: str, method: str) -> PeerInfo:
+    return PeerInfo(name, "open3d", lambda camera: Open3DTensorPeer(name, camera, method))
 
 
-def _features(name: str, kind: FeatureKind, what: str) -> PeerInfo:
-    return PeerInfo(name, f"OpenCV, {what}", "cv2", lambda camera: FeaturePeer(name, camera, kind))
+def _features(name: str, kind: FeatureKind) -> PeerInfo:
+    return PeerInfo(name, "cv2", lambda camera: FeaturePeer(name, camera, kind))
 
 
 PEERS: dict[str, PeerInfo] = {
     info.name: info
     for info in (
-        _opencv("opencv-rgb", cv2.ODOMETRY_TYPE_RGB, "photometric"),
-        _opencv("opencv-rgbd", cv2.ODOMETRY_TYPE_RGB_DEPTH, "photometric and point to plane"),
-        _opencv("opencv-depth", cv2.ODOMETRY_TYPE_DEPTH, "point to plane"),
-        _features("sift-pnp", "sift", "SIFT features and a pose from matches"),
-        _features("orb-pnp", "orb", "ORB features and a pose from matches"),
-        _legacy("open3d-color", "RGBDOdometryJacobianFromColorTerm", 10.0, "photometric"),
-        _legacy("open3d-hybrid", "RGBDOdometryJacobianFromHybridTerm", 4.0, "photometric and depth"),
-        _tensor("open3d-tensor-intensity", "Intensity", "photometric"),
-        _tensor("open3d-tensor-hybrid", "Hybrid", "photometric and depth"),
-        _tensor("open3d-tensor-point-to-plane", "PointToPlane", "point to plane"),
+        _opencv("opencv-rgb", cv2.ODOMETRY_TYPE_RGB),
+        _opencv("opencv-rgbd", cv2.ODOMETRY_TYPE_RGB_DEPTH),
+        _opencv("opencv-depth", cv2.ODOMETRY_TYPE_DEPTH),
+        _features("sift-pnp", "sift"),
+        _features("orb-pnp", "orb"),
+        _legacy("open3d-color", "RGBDOdometryJacobianFromColorTerm", 10.0),
+        _legacy("open3d-hybrid", "RGBDOdometryJacobianFromHybridTerm", 4.0),
+        _tensor("open3d-tensor-intensity", "Intensity"),
+        _tensor("open3d-tensor-hybrid", "Hybrid"),
+        _tensor("open3d-tensor-point-to-plane", "PointToPlane"),
         PeerInfo(
             "small-gicp",
-            "small_gicp, generalised ICP",
             "small_gicp",
             lambda camera: SmallGicpPeer("small-gicp", camera),
         ),
-        PeerInfo("kiss-icp", "kiss-icp, point to point", "kiss_icp", lambda camera: KissIcpPeer("kiss-icp", camera)),
+        PeerInfo("kiss-icp", "kiss_icp", lambda camera: KissIcpPeer("kiss-icp", camera)),
     )
 }
 """Every peer by the name that the command line knows."""

@@ -8,15 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
-from gavo_jax.alignment.evidence import Evidence as Chosen
-from gavo_jax.alignment.evidence import Held, is_held
-from gavo_jax.alignment.evidence import evidence as evidence_for
+from gavo_jax.alignment.evidence import Evidence, Held, evidence, is_held
 from gavo_jax.alignment.information import Information, measure_information
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
-from gavo_jax.alignment.sway import Swayed, Swaying, refine_swaying, unswayed
-from gavo_jax.alignment.visits import Level, Search, reach_of
+from gavo_jax.alignment.sway import LARGEST_RISE, Swayed, Swaying, refine_swaying, unswayed
+from gavo_jax.alignment.visits import Level, reach_of
 from gavo_jax.frame_checks import MIN_DEPTH_SHARE
-from gavo_jax.objective.derivatives import Linearization, weighted_terms
+from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.error import Objective, Residuals
 from gavo_jax.objective.estimates import ExplainedShare, estimate_scales, explained_share
 from gavo_jax.objective.problem import Problem
@@ -47,45 +45,53 @@ MAX_DEPARTURE = 1e-4
 SHARED_ERRORS = 9.0
 """Factor on the covariance for errors that the whole image shares (interpolation, the choice of points, the pyramid's
 rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
+UNDETERMINED = 0.5
+"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
+UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
+"""Covariance of a motion that images do not tell."""
+LARGEST_STEP = 0.01
+"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
+images leave open; it is not taken."""
+
+
+class Winner(NamedTuple):
+    """What a search ended with."""
+
+    motion: Float[Array, "4 4"]
+    rival: Float[Array, ""]
+    """See `Search`."""
+    centre: Float[Array, "4 4"]
+    """Motion that the search was held about."""
+    history: Float[Array, " iterations"]
+    judge: Objective | None = None
+    """What the evidence is asked of, where motions competed by it."""
 
 
 def conclude(
     objective: Objective,
-    search: Search,
+    winner: Winner,
     finest: Level,
     options: AlignmentOptions,
-    history: jax.Array,
-    centre: Float[Array, "4 4"],
-    judge: Objective | None = None,
     swaying: Swaying | None = None,
     share: Float[Array, ""] | float = 1.0,
 ) -> Alignment:
-    """From what the search, held about a centre, ended with to the result: estimate, refine, judge. Points of a share
-    of the image take part.
+    """From what the search ended with to the result: estimate, refine, judge. Points of a share of the image take
+    part.
     """
-    found = search.islands[0]
-    residuals = objective.residuals(found)
+    residuals = objective.residuals(winner.motion)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     points = finest.points * finest.views  # arrays may be longer
     reach = reach_of(options)
-    problem = Problem(objective=objective, origin=found, basis=jnp.eye(6), centre=centre, reach=reach)
+    problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=winner.centre, reach=reach)
     added = jnp.zeros((6, 6))
     if options.last_step and not options.symmetric:
         problem, residuals, added = _last_step(problem, residuals, swaying, points)
         objective = problem.objective
     motion = problem.origin
-    evidence = _examine(problem, residuals)
-    held, chosen_by = None, None
-    if judge is not None:
-        held = is_held(judge, motion, evidence.information.directions)
-        chosen_by = evidence_for(judge, motion)
-    covariance = _covariance(evidence, objective, held) + added
-    if held is not None:
-        determined = evidence.information.determined | held.held
-        evidence = evidence._replace(information=evidence.information._replace(determined=determined))
-    against = find_against(evidence, covariance, objective, search.rival, share * points, chosen_by)
+    examination, covariance, chosen_by = _weigh(_examine(problem, residuals), objective, winner.judge, added)
+    against = find_against(examination, covariance, objective, winner.rival, share * points, chosen_by)
     if options.precondition:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
         # along a way that the images leave open any motion is as good, that at the edge, too
@@ -94,17 +100,17 @@ def conclude(
     findings = as_findings(against)
     known = ~(findings & bit(AlignmentStatus.NO_DEPTH)).astype(bool) & jnp.all(jnp.isfinite(covariance))
     return Alignment(
-        motion,
-        log(motion),
-        evidence.model.error,
-        evidence.model.overlap,
-        jnp.where(known, covariance, jnp.nan),
-        gravest(findings),
-        history,
-        findings,
-        evidence.explained,
-        jnp.asarray(objective.scales.depth, jnp.float32),
-        jnp.zeros(6) if objective.sway is None else objective.sway,
+        target_T_reference=motion,
+        xi=log(motion),
+        error=examination.model.error,
+        overlap=examination.model.overlap,
+        covariance=jnp.where(known, covariance, jnp.nan),
+        status=gravest(findings),
+        history=winner.history,
+        findings=findings,
+        explained=examination.explained,
+        depth_scale=jnp.asarray(objective.scales.depth, jnp.float32),
+        sway=jnp.zeros(6) if objective.sway is None else objective.sway,
     )
 
 
@@ -139,7 +145,7 @@ def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
     return jax.lax.optimization_barrier(jnp.where(better, stepped, problem.origin))
 
 
-class Evidence(NamedTuple):
+class Examination(NamedTuple):
     """What the images say of one motion at the finest level."""
 
     motion: Float[Array, "4 4"]
@@ -153,18 +159,39 @@ class Evidence(NamedTuple):
     explained: ExplainedShare
 
 
-def _examine(problem: Problem, r: Residuals) -> Evidence:
+def _examine(problem: Problem, r: Residuals) -> Examination:
     """What the images say of the problem's origin, of which these are the residuals."""
-    # held back, or XLA would compute them anew for each that uses them
-    terms = jax.lax.optimization_barrier(weighted_terms(problem.objective, problem.objective.reference, r))
-    return Evidence(
+    model, scatter, terms = problem.examine(r)
+    return Examination(
         motion=problem.origin,
         inside=jnp.sum(r.inside),
-        model=problem.linearize_terms(r, terms),
-        scatter=problem.scatter(r, terms),
+        model=model,
+        scatter=scatter,
         information=measure_information(problem, r, terms),
         explained=explained_share(r),
     )
+
+
+def _weigh(
+    examination: Examination, objective: Objective, judge: Objective | None, added: Float[Array, "6 6"]
+) -> tuple[Examination, Float[Array, "6 6"], Evidence | None]:
+    """What the images say of a motion, its covariance, and the evidence for it where motions competed by that: a
+    direction is determined, too, if the evidence holds it.
+
+    Args:
+        examination: What the images say at the finest level.
+        objective: Of that level.
+        judge: What the evidence is asked of; None where nothing competed.
+        added: To the covariance.
+    """
+    if judge is None:
+        return examination, _covariance(examination, objective, None) + added, None
+    held = is_held(judge, examination.motion, examination.information.directions)
+    chosen_by = evidence(judge, examination.motion)
+    covariance = _covariance(examination, objective, held) + added
+    determined = examination.information.determined | held.held
+    examination = examination._replace(information=examination.information._replace(determined=determined))
+    return examination, covariance, chosen_by
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
@@ -172,23 +199,23 @@ def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
-def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
+def _covariance(examination: Examination, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
     """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
     residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
     that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
     """
-    information, known_within = evidence.information, jnp.zeros((6, 6))
+    information, known_within = examination.information, jnp.zeros((6, 6))
     if held is not None:
         # the gradients of frames far apart may tell less of a direction than that the motion is not a step off
         ways = information.directions
-        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (evidence.scatter @ ways), axis=0))
+        spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (examination.scatter @ ways), axis=0))
         half = 0.5 * jnp.max(jnp.abs(held.steps), axis=0) / jnp.max(jnp.abs(ways), axis=0)
         vague = held.held & (~information.determined | (spread > half * jnp.abs(information.curvature)))
         information = information._replace(determined=information.determined & ~vague)
         known_within = jnp.where(vague, 0.5 * held.steps, 0.0)
     inverse = information.inverse()
-    least = 2.0 * objective.scales.grey**2 / jnp.maximum(evidence.inside, 1.0) * inverse
-    covariance = SHARED_ERRORS * inverse @ evidence.scatter @ inverse.T + least
+    least = 2.0 * objective.scales.grey**2 / jnp.maximum(examination.inside, 1.0) * inverse
+    covariance = SHARED_ERRORS * inverse @ examination.scatter @ inverse.T + least
     is_open = ~information.determined & jnp.all(known_within == 0.0, axis=0)
     open_ways = jnp.where(is_open, information.directions, 0.0)
     open_ways *= UNDETERMINED / jnp.maximum(jnp.max(jnp.abs(open_ways), axis=0), 1e-12)
@@ -198,17 +225,17 @@ def _covariance(evidence: Evidence, objective: Objective, held: Held | None) -> 
 
 
 def find_against(
-    evidence: Evidence,
+    examination: Examination,
     covariance: Float[Array, "6 6"],
     objective: Objective,
     rival: Float[Array, ""],
     points: Float[Array, ""],
-    chosen_by: Chosen | None = None,
+    chosen_by: Evidence | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
     """All that can be said against a motion, for which so many points were asked, by its status; docs/status.md gives
     the reasons.
     """
-    motion, model, explained = evidence.motion, evidence.model, evidence.explained
+    motion, model, explained = examination.motion, examination.model, examination.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
     finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
@@ -220,7 +247,7 @@ def find_against(
     contrast = jnp.std(objective.reference.grey, where=has_reading)
     return {
         AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,
-        AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(evidence.information.determined),
+        AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(examination.information.determined),
         AlignmentStatus.HIGH_ERROR: unexplained,
         AlignmentStatus.LOW_OVERLAP: model.overlap < MIN_FINAL_OVERLAP,
         AlignmentStatus.NOT_FINITE: ~finite,
@@ -229,20 +256,6 @@ def find_against(
     }
 
 
-UNDETERMINED = 0.5
-"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
-UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
-"""Covariance of a motion that images do not tell."""
-
-
 def is_unknown(result: Alignment) -> bool:
     """Whether a result, on the host, has the covariance of a motion that images do not tell."""
     return bool(np.all(np.diagonal(result.covariance) >= UNDETERMINED**2))
-
-
-LARGEST_STEP = 0.01
-"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
-images leave open; it is not taken."""
-LARGEST_RISE = 0.003
-"""Share by which the last step may raise E: between pixels E is rough, by about that much, and the step's aim is the
-middle of its basin."""

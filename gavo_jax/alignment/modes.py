@@ -8,6 +8,8 @@ from gavo_jax.se3 import log
 
 NICHE = (0.08, 0.08)
 """Metres and radians of ξ within which two motions count as one mode."""
+CLEARED = 1e9
+"""Added to the error of a motion whose mode is taken; above any error."""
 
 
 def _niches(motions: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
@@ -42,7 +44,3 @@ def rival_error(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"]) -> F
     best = jnp.argmin(errors)
     others = jnp.where(_near(_niches(motions), best), jnp.inf, errors)
     return jnp.min(others) / jnp.maximum(errors[best], 1e-6)
-
-
-CLEARED = 1e9
-"""Added to the error of a motion whose mode is taken; above any error."""

@@ -46,9 +46,6 @@ class OwnMotion(NamedTuple):
     """The motion between the two frames' moments, that of the middle row."""
     covariance: Float64[np.ndarray, "6 6"]
     """Covariance of δ in target_T_reference · exp(δ), metres and radians."""
-    twists: Float64[np.ndarray, "2 6"]
-    """Motion of the points in the reference camera and in the target camera, (v, w) in m/s and rad/s. What both have in
-    common hardly shows."""
 
 
 def refine_moving(
@@ -96,7 +93,7 @@ def refine_moving(
     covariance = np.linalg.inv(told + np.diag(1e-9 * np.diag(told)))[:6, :6]
     if not (np.isfinite(x).all() and np.isfinite(covariance).all()):
         return None
-    return OwnMotion(start @ _step(x[:6]), covariance, x[6:].reshape(2, 6))
+    return OwnMotion(start @ _step(x[:6]), covariance)
 
 
 class _Points(NamedTuple):

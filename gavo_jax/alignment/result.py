@@ -10,6 +10,11 @@ from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.se3 import rigid
 from gavo_jax.status import AlignmentStatus, bit
 
+MAX_TRANSLATION_DEVIATION = 0.05
+"""Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
+MAX_ROTATION_DEVIATION = 0.05
+"""Radians, likewise for the rotation."""
+
 
 class Alignment(NamedTuple):
     """The motion between two frames, with what is known about it.
@@ -88,12 +93,6 @@ class Alignment(NamedTuple):
         if left_open and self.status is AlignmentStatus.LOW_TEXTURE:
             return f"{words[:-1]}, above all {left_open}."
         return f"{words} The images leave open: {left_open}." if left_open else words
-
-
-MAX_TRANSLATION_DEVIATION = 0.05
-"""Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
-MAX_ROTATION_DEVIATION = 0.05
-"""Radians, likewise for the rotation."""
 
 
 def on_host(alignment: Alignment) -> Alignment:

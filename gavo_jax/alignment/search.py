@@ -5,6 +5,7 @@ estimates what the data say about brightness and noise, chooses search coordinat
 starts the next level from its best candidate.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
 from gavo_jax.alignment.evidence import evidence
-from gavo_jax.alignment.judgement import conclude
+from gavo_jax.alignment.judgement import Winner, conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import Swaying
@@ -45,6 +46,20 @@ from gavo_jax.se3 import exp, log
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
+
+REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
+"""What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
+pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+FINALISTS = 4
+"""Islands, those that most speaks for, whose motions are refined."""
+REFINED_OVERLAP = 0.1
+"""Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
+SCOUT_RANGE = (0.5, 2.0)
+"""Factors on the scouts' translations, from the first one to the last."""
+SCOUTED_POINTS = 480
+"""Points of a frame that a scout's evidence is taken on."""
+SCOUTS_AT_ONCE = 32
+"""Motions whose evidence is taken side by side."""
 
 
 def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[Array, "4 4"]:
@@ -78,6 +93,26 @@ class Population(NamedTuple):
         return host._replace(xi=host.xi[rows][:, places], error=host.error[rows][:, places])
 
 
+class Frames(NamedTuple):
+    """What all searches of a pair have in common."""
+
+    target: Target
+    options: AlignmentOptions
+    exchanged: Exchanged | None
+
+
+class Ended(NamedTuple):
+    """What the searches of a pair ended with."""
+
+    search: Search
+    centre: Float[Array, "4 4"]
+    """Motion that it was held about."""
+    histories: Float[Array, "l iterations"]
+    populations: Population | None
+    judge: Objective | None = None
+    """What the evidence was asked of, where motions competed by it."""
+
+
 def align_views(
     views: tuple[Reference, ...],
     target: Target,
@@ -87,6 +122,7 @@ def align_views(
     options: AlignmentOptions,
     key: PRNGKeyArray,
     guesses: Float[Array, "g 4 4"],
+    *,
     record: bool = False,
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
@@ -129,61 +165,61 @@ def align_views(
     rows = visits if searched == levels.numbers else jax.tree.map(lambda leaf: leaf[places], visits)
     frames = Frames(target, options, exchanged)
 
-    def search_all() -> tuple[Search, Float[Array, "4 4"], tuple[jax.Array, Population | None]]:
+    def search_alone() -> Ended:
         origins = _origins(frames, first, guesses, keys[-1, 0])
         start = Search(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
         search, histories, populations = _search_levels(
             frames, solver, start, rows, keys[:-1], centre=origins[0], record=record
         )
-        return search, origins[0], (histories, populations)
+        return Ended(search, origins[0], histories, populations)
 
-    judge = None
     if options.refine:
         known = guesses if hypotheses is None else jnp.concatenate([guesses, hypotheses])
-        judged = finest if len(levels.numbers) == 1 else jax.tree.map(lambda leaf: leaf[-2], visits)
-        judge = comparable_objective(judged, target, options, exchanged)
-
-        def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
-            search, _, kept = search_all()
-            return search.islands[: min(FINALISTS, options.islands[searched[-1]])], kept
-
-        def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
-            search = _refine(frames, visits, motion, box, is_last)
-            return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
-
-        aliases = jnp.full((1, 4, 4), jnp.nan)
-        if exchanged is not None:
-            second = jax.tree.map(lambda leaf: leaf[min(1, len(levels.numbers) - 1)], visits)
-            itself = comparable_objective(second, target, options, None)
-            aliases = self_motions(itself, exchanged.target)
-        winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine, record)
-        search = Search(winner.motion[None], box, winner.brightness, lead)
-        centre = winner.motion
+        finalists = min(FINALISTS, options.islands[searched[-1]])
+        ended = _search_in_contest(frames, visits, known, box, search_alone, finalists=finalists, record=record)
         # nothing competes any more
         finest = finest._replace(is_first=jnp.array(False), islands=jnp.int32(1))
     else:
-        search, centre, (histories, populations) = search_all()
+        ended = search_alone()
     iterations = [solver.iterations[number] for number in searched]
-    history = jnp.concatenate([row[:count] for row, count in zip(histories, iterations, strict=True)])
-    objective = level_objective(finest, target, options, search.brightness).merged()
-    return conclude(objective, search, finest, options, history, centre, judge, swaying, share), populations
+    history = jnp.concatenate([row[:count] for row, count in zip(ended.histories, iterations, strict=True)])
+    motion, rival = ended.search.islands[0], ended.search.rival
+    winner = Winner(motion, rival, centre=ended.centre, history=history, judge=ended.judge)
+    objective = level_objective(finest, target, options, ended.search.brightness).merged()
+    return conclude(objective, winner, finest, options, swaying, share), ended.populations
 
 
-class Frames(NamedTuple):
-    """What all searches of a pair have in common."""
+def _search_in_contest(
+    frames: Frames,
+    visits: Level,
+    known: Float[Array, "k 4 4"],
+    box: Float[Array, " 6"],
+    search_alone: Callable[[], Ended],
+    *,
+    finalists: int,
+    record: bool,
+) -> Ended:
+    """The winner of motions that are known, of what islands find, and of the aliases of either."""
+    (target, options, exchanged), count = frames, visits.number.shape[0]
+    judged = jax.tree.map(lambda leaf: leaf[-min(2, count)], visits)
+    judge = comparable_objective(judged, target, options, exchanged)
 
-    target: Target
-    options: AlignmentOptions
-    exchanged: Exchanged | None
+    def search_islands() -> tuple[jax.Array, tuple[jax.Array, Population | None]]:
+        found = search_alone()
+        return found.search.islands[:finalists], (found.histories, found.populations)
 
+    def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
+        search = _refine(frames, visits, motion, box, is_last)
+        return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
 
-REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
-"""What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
-pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
-FINALISTS = 4
-"""Islands, those that most speaks for, whose motions are refined."""
-REFINED_OVERLAP = 0.1
-"""Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
+    aliases = jnp.full((1, 4, 4), jnp.nan)
+    if exchanged is not None:
+        second = jax.tree.map(lambda leaf: leaf[min(1, count - 1)], visits)
+        itself = comparable_objective(second, target, options, None)
+        aliases = self_motions(itself, exchanged.target)
+    winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine, record)
+    search = Search(winner.motion[None], box, winner.brightness, lead)
+    return Ended(search, winner.motion, histories, populations, judge)
 
 
 def _refine(
@@ -204,9 +240,9 @@ def _refine(
     views = visits.reference.grey.shape[1]
     start = Search(motion[None], box, Brightness.unchanged(views), jnp.float32(jnp.inf))
     keys = jax.random.split(jax.random.key(0), (count, 1))
-    return _search_levels(frames._replace(options=options), REFINER, start, visits, keys, centre=motion, record=False)[
-        0
-    ]
+    frames = frames._replace(options=options)
+    search, _, _ = _search_levels(frames, REFINER, start, visits, keys, centre=motion, record=False, skips_empty=True)
+    return search
 
 
 def _search_levels(
@@ -218,42 +254,14 @@ def _search_levels(
     *,
     centre: Float[Array, "4 4"],
     record: bool,
+    skips_empty: bool = False,
 ) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
     """Search some levels, one after the other, each from the islands of the last; held about a centre.
-    A level without islands is left out.
-    """
-    (target, options, exchanged), places = frames, start.islands.shape[0]
 
-    @jax.jit  # traced once, where its shapes are asked for first
-    def search_level(
-        search: Search, visit: tuple[Level, PRNGKeyArray]
-    ) -> tuple[Search, tuple[jax.Array, Population | None]]:
-        level, keys = visit
-        objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
-        basis = jnp.eye(6)
-        if options.precondition:
-            basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
-        problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=centre)
-        island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
-        inhabited = jnp.arange(places) < level.islands
-        if places == 1:
-            results = jax.tree.map(lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0]))
-        else:
-            results = jax.vmap(island)(keys, search.islands, inhabited)
-        found, errors, history, trail = results
-        population = None
-        if trail is not None:
-            about = centre if options.precondition else search.islands[0]
-            motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
-            population = Population(level.number, log(motions), error, log(about), search.box)
-        if options.refine and places > 1:
-            judge = comparable_objective(level, target, options, exchanged)
-            total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
-            errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
-        order = best_distinct(found, errors, places)
-        rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
-        search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
-        return search, (history[order[0]], population)
+    Whether a level without islands is left out is static: where every level has some, the test would cost time.
+    """
+    # traced once, where its shapes are asked for first
+    search_level = jax.jit(partial(_search_level, frames, solver, centre, record))
 
     def visit_level(search: Search, visit: tuple[Level, PRNGKeyArray]) -> Any:
         blank = jax.tree.map(
@@ -261,9 +269,51 @@ def _search_levels(
         )
         return jax.lax.cond(visit[0].islands > 0, search_level, lambda search, _: (search, blank), search, visit)
 
-    visit_one = visit_level if solver is REFINER else search_level
+    visit_one = visit_level if skips_empty else search_level
     search, (histories, populations) = jax.lax.scan(visit_one, start, (visits, keys))
     return search, histories, populations
+
+
+def _search_level(
+    frames: Frames,
+    solver: Solver,
+    centre: Float[Array, "4 4"],
+    record: bool,
+    search: Search,
+    visit: tuple[Level, PRNGKeyArray],
+) -> tuple[Search, tuple[Float[Array, " iterations"], Population | None]]:
+    """Search one level, from the islands of the last one, in the paper's five steps.
+
+    Take the reference's points (the visit has them), estimate brightness and noise, choose search coordinates, have
+    the solver minimise E on every island, and hand the best distinct motions on to the next level.
+    """
+    (target, options, exchanged), places = frames, search.islands.shape[0]
+    level, keys = visit
+    objective, brightness = fit_objective(level, target, options, search.islands[0], exchanged)
+    basis = jnp.eye(6)
+    if options.precondition:
+        basis = preconditioner(reference_curvature(objective.sample(options.estimation_points).merged()))
+    problem = Problem(objective=objective, origin=search.islands[0], basis=basis, centre=centre)
+    island = partial(_search_island, problem, solver.at_level(level.number), options, search.box, record)
+    inhabited = jnp.arange(places) < level.islands
+    if places == 1:
+        results = jax.tree.map(lambda leaf: leaf[None], island(keys[0], search.islands[0], inhabited[0]))
+    else:
+        results = jax.vmap(island)(keys, search.islands, inhabited)
+    found, errors, history, trail = results
+    population = None
+    if trail is not None:
+        about = centre if options.precondition else search.islands[0]
+        motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
+        population = Population(level.number, log(motions), error, log(about), search.box)
+    if options.refine and places > 1:
+        judge = comparable_objective(level, target, options, exchanged)
+        total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
+        errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
+    order = best_distinct(found, errors, places)
+    rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
+    search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
+    return search, (history[order[0]], population)
 
 
 def _search_island(
@@ -326,11 +376,3 @@ def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: 
         twists *= jnp.concatenate([jnp.repeat(farther, 3, axis=1), jnp.ones((options.scouts, 3))], axis=1)
     scouts = leader @ exp(twists.at[0].set(0.0))
     return scouts[best_distinct(scouts, errors_of(scouts), places)]
-
-
-SCOUT_RANGE = (0.5, 2.0)
-"""Factors on the scouts' translations, from the first one to the last."""
-SCOUTED_POINTS = 480
-"""Points of a frame that a scout's evidence is taken on."""
-SCOUTS_AT_ONCE = 32
-"""Motions whose evidence is taken side by side."""

@@ -40,7 +40,8 @@ FRAMES = 2.0
 ROUNDS = 2
 """Gauss-Newton steps; one falls short of half the way."""
 LARGEST_RISE = 0.003
-"""Share by which E may rise; beyond, there is no sway and the motion stays."""
+"""Share by which what refines a search's result may raise E: between pixels E is rough, by about that much, and the aim
+is the middle of its basin. Beyond, the motion stays, without sway."""
 
 
 class VelocityChange(NamedTuple):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.evidence import Evidence, View, gather_evidence
+from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
@@ -51,8 +51,6 @@ class Belief(NamedTuple):
     """Share of it that moves."""
     hidden: Bool[Array, "h w"]
     """Which pixels the first of the others does not see, as something stands before them."""
-    arisen: Float[Array, ""]
-    """Share of the image that moves and was not known to."""
     carried: Float[Array, "h w"]
     """What was known before, on the same surfaces, without what this frame says."""
     suspected: Float[Array, "h w"]
@@ -100,17 +98,15 @@ def form_belief(
     hidden = evidence.depth[0] < -FAR
     at_rest = (moving < 0) & ~hidden & (evidence.seen[0] > 0)
     total = jnp.maximum(jnp.sum(credit), 1.0)
-    arisen = has * (moving > 0) * (known <= 0)
     return Belief(
-        after,
-        moving,
-        jnp.sum(credit * at_rest) / total,
-        jnp.sum(credit * (moving > 0)) / total,
-        hidden,
-        jnp.mean(arisen),
-        known,
-        _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
-        jnp.sum(credit * evidence.seen, (1, 2)) / total,
+        known=after,
+        moving=moving,
+        support=jnp.sum(credit * at_rest) / total,
+        contradicted=jnp.sum(credit * (moving > 0)) / total,
+        hidden=hidden,
+        carried=known,
+        suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
+        in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )
 
 
@@ -129,7 +125,7 @@ def suspect(
     return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies) if trusted else before, np.float32)
 
 
-def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """How far each pixel speaks for moving, and how far for rest; 0 to 1."""
     views = e.grey.shape[0]
     lenient = jnp.where(jnp.arange(views) > 0, 2.0, 1.0)[:, None, None]
@@ -146,7 +142,7 @@ def _weigh(e: Evidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     return moves, rests
 
 
-def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+def _carry(before: Float[Array, "h w"], e: PixelEvidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
     """What was known of the surfaces that the pixels lie on, where these are the `same` in the first other view."""
     height, width = before.shape
     u, v = jnp.round(e.place[0]).astype(jnp.int32)
@@ -154,16 +150,16 @@ def _carry(before: Float[Array, "h w"], e: Evidence, same: Bool[Array, "h w"]) -
     return jnp.where(same, before[v, u], 0.0)
 
 
-def _seen_before(e: Evidence, limit: float) -> Bool[Array, "h w"]:
+def _seen_before(e: PixelEvidence, limit: float) -> Bool[Array, "h w"]:
     """Which pixels' surfaces the first other view shows: by depth, up to some evidence against it."""
     return (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < limit))
 
 
-def _after(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def _after(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
     return jax.lax.cond(jnp.any(suspected > 0), lambda: follow(suspected, e, grey), lambda: jnp.zeros_like(suspected))
 
 
-def follow(suspected: Float[Array, "h w"], e: Evidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Suspicions carried with their surfaces, which may have moved, and spread to what of these was not seen before."""
     same = _seen_before(e, 2.0 * FAR) & (e.measured[0] > 0)
     across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))

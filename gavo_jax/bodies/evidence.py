@@ -57,7 +57,7 @@ def inverse_depth_of(view: View) -> Float64[np.ndarray, "h w"]:
     return (np.asarray(view.image.depth) & 65535) * INVERSE_DEPTH_STEP
 
 
-class Evidence(NamedTuple):
+class PixelEvidence(NamedTuple):
     """What every pixel of a view says of a motion, by each of V others; [V, h, w]."""
 
     grey: Float[Array, "v h w"]
@@ -90,7 +90,7 @@ FEW = 16
 """One pixel of so many tells the brightness."""
 
 
-def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera) -> Evidence:
+def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera) -> PixelEvidence:
     """Every pixel of a view seen in V other views.
 
     Args:
@@ -112,7 +112,7 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     shape = (views, height, width)
     clipped = jnp.maximum(seen_grey, r.grey_sample.value) > SATURATED
     told = r.inside * jnp.where(clipped, 0.0, 1.0)
-    return Evidence(
+    return PixelEvidence(
         grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
         depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
         texture=(told * steep / GREY_NOISE).reshape(shape),
@@ -164,7 +164,13 @@ def compare(
         sample, surface = sample_grey(words, seen), sample_depth(words, seen)
         depth = (seen.inverse_depth - surface.value) * surface.valid * seen.inside
         return Residuals(
-            sample.value - grey.value, depth, seen.inside, surface.valid * seen.inside, seen, sample, surface
+            grey=sample.value - grey.value,
+            depth=depth,
+            inside=seen.inside,
+            depth_valid=surface.valid * seen.inside,
+            warped=seen,
+            grey_sample=sample,
+            depth_sample=surface,
         )
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)

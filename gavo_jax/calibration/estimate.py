@@ -27,7 +27,6 @@ from gavo_jax.precision import in_32_bits
 
 Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
 ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")
-ON_WISH: tuple[Wanted, ...] = ("focal_length", "principal_point")
 
 WINDOW = 45
 """Frames of a stretch, a second and a half; enough for many a turn back and forth."""

@@ -29,11 +29,11 @@ from gavo_jax.cli.options import (
 )
 from gavo_jax.cli.usage import HelpPage, asking_for_help, fault_of_usage
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError, GavoWarning, printable, shown
+from gavo_jax.errors import GavoError, GavoWarning, shown, tell
 from gavo_jax.version import __version__
 
 BAD_INPUT, BROKEN_PIPE = 2, 141
-"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `cli.run.LOST` (`--strict`)."""
+"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `early.LOST` (`--strict`)."""
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _stop(words: str) -> int:
     interrupts.ignore()
-    _tell(f"interrupted{words}")
+    tell(f"interrupted{words}")
     return INTERRUPTED
 
 
@@ -102,13 +102,13 @@ def _told_warnings() -> Iterator[None]:
     """Print this package's warnings as one line each; others as they always are."""
     show = warnings.showwarning
 
-    def tell(message: Any, category: type[Warning], *where: Any) -> None:
+    def show_line(message: Any, category: type[Warning], *where: Any) -> None:
         if issubclass(category, GavoWarning):
-            _tell(f"warning: {message}")
+            tell(f"warning: {message}")
         else:
             show(message, category, *where)
 
-    warnings.showwarning = tell
+    warnings.showwarning = show_line
     try:
         yield
     finally:
@@ -212,10 +212,5 @@ def _silence_output() -> None:
 
 
 def _refuse(message: str) -> int:
-    _tell(message)
+    tell(message)
     return BAD_INPUT
-
-
-def _tell(message: str) -> None:
-    """Print one line on standard error, whatever the words are."""
-    print(f"gavo: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)

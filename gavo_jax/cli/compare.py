@@ -16,7 +16,7 @@ from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, tell
 from gavo_jax.inspection import summary
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry
@@ -28,6 +28,7 @@ from gavo_jax.odometry.metrics import (
     FRAMES_PER_SECOND,
     MILLISECONDS,
     ROTATION_DRIFT,
+    run_identity,
 )
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
@@ -42,7 +43,7 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.report import REPORT, Picture, Table, write_report
-from gavo_jax.output.screen import DASH, known_columns, number, print_table, say, tell, waiting
+from gavo_jax.output.screen import DASH, known_columns, number, print_table, say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
@@ -227,15 +228,13 @@ def _run_method(sequence: Sequence, method: str, preset_name: str, seed: int | N
     tracked = track_visibly(label, sequence, odometry)
     if tracked.interrupted:
         raise KeyboardInterrupt
+    outcome = tracked.concluded(sequence)
     metrics = {
-        "sequence": sequence.name,
-        "method": method,
-        "preset": None if peer else preset_name,
-        "seed": seed,
-        **tracked.metrics,
+        **run_identity(sequence.name, method, None if peer else preset_name, seed),
+        **outcome.figures,
         "versions": make_peer(method, sequence.camera).versions if peer else environment(),
     }
-    return Entry(method, metrics, tracked.trajectory)
+    return Entry(method, metrics, outcome.trajectory)
 
 
 def _typical_runs(entries: list[Entry]) -> list[Entry]:

@@ -9,7 +9,7 @@ import numpy as np
 from gavo_jax.cli.options import Evaluate
 from gavo_jax.datasets.clocks import INTERVALS
 from gavo_jax.datasets.truth import counted_in
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, tell
 from gavo_jax.evaluation import (
     MAX_DIFFERENCE,
     ErrorSeries,
@@ -21,7 +21,7 @@ from gavo_jax.evaluation import (
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
-from gavo_jax.output.screen import number, print_table, say, tell, waiting
+from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import Trajectory, associate
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}

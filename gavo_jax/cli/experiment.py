@@ -26,7 +26,7 @@ from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.report import REPORT as PAGE
 from gavo_jax.output.report import Picture, write_report
 from gavo_jax.output.report import Table as ReportTable
-from gavo_jax.output.screen import counted, known_columns, markdown_table, number, pair_progress, print_table, say
+from gavo_jax.output.screen import DASH, counted, known_columns, markdown_table, number, pair_progress, print_table, say
 
 REPORT = "report"
 PLAN, FIGURE = "experiment.json", "drift"
@@ -261,7 +261,7 @@ def _summary_row(summary: Summary, printed: Printed) -> list[Any]:
 
 
 def _comparison_row(found: Comparison) -> list[Any]:
-    p = "–" if found.p is None else f"{found.p:.2g}"
+    p = DASH if found.p is None else f"{found.p:.2g}"
     return [f"{found.first} / {found.second}", found.pairs, number(found.ratio, 4), p]
 
 

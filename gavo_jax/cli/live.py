@@ -8,23 +8,23 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files import load_calibration
-from gavo_jax.cli.map_file import check_options, write_map
+from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
-from gavo_jax.cli.run import LOST
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
-from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError
+from gavo_jax.early import INTERRUPTED, LOST
+from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.run import conclude
 from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell, waiting
+from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.scene_map import LiveMap, MapBuilder
 from gavo_jax.settings import Settings
@@ -41,7 +41,7 @@ def run_live(options: Run) -> int:
     check_seed(options.seed)
     _refuse_what_cannot_be(options)
     trajectory_formats = formats(options.trajectory_format)
-    shape = check_options(options.map, options.map_shape, options.voxel)
+    shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     if settings.odometry.loops:
@@ -66,14 +66,14 @@ def run_live(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **{"sequence": device.name, "method": method, "preset": preset, "seed": options.seed},
+            **run_identity(device.name, method, preset, options.seed),
             "complete": end.fault is None,
             **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(name, metrics, folder.path, False)
+        print_run(name, metrics, folder.path, trajectory, has_truth=False)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")

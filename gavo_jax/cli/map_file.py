@@ -12,7 +12,7 @@ from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxe
 from gavo_jax.trajectory import Trajectory
 
 
-def check_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:
+def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:
     """Refuse a map that cannot be made or written; return what it is to be.
 
     Raises:

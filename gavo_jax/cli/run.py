@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gavo_jax.cli.map_file import check_options, save_map
+from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import (
@@ -21,29 +21,30 @@ from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
-from gavo_jax.early import INTERRUPTED
+from gavo_jax.early import INTERRUPTED, LOST
+from gavo_jax.errors import tell
 from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.hindsight import revised
+from gavo_jax.odometry.metrics import run_identity
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import conclude
 from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, tell, waiting
+from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
-
-LOST = 3
-"""Exit status where a pair was lost and `--strict` asked to know."""
 
 CHECKPOINT_SECONDS = 2.0
 """Between two checkpoints; each takes some 20 ms."""
@@ -57,7 +58,7 @@ def run(options: Run) -> int:
         return run_live(options)
     check_seed(options.seed)
     trajectory_formats = formats(options.trajectory_format)
-    shape = check_options(options.map, options.map_shape, options.voxel)
+    shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     sequence = open_sequence(options, color=options.map is not None or options.viewer != "none")
@@ -85,19 +86,9 @@ def run(options: Run) -> int:
             # before an earlier run is replaced: it may not open
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
-                if options.resume:
-                    say(f"nothing to resume in {folder.path}: a new run")
-                remove_trajectories(folder.path)
-                if folder.has_run():
-                    say(f"the earlier run in {folder.path} is replaced")
-                folder.start(config, float(sequence.timestamps[0]))
+                _start(options, sequence, folder, config)
             else:
-                odometry.progress = progress
-                steps = folder.steps()
-                for step in (None, *steps):
-                    viewer.watch(None, step)
-                if mapper is not None:
-                    mapper.replay(sequence, steps, folder.moving)
+                _go_on(progress, sequence, odometry, folder, viewer, mapper)
             say(summary(sequence))
             if lines := left_out(sequence):
                 counts = ", ".join(line.partition(": ")[0] for line in lines)
@@ -107,9 +98,8 @@ def run(options: Run) -> int:
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(
-            name, metrics, folder.path, sequence.ground_truth is not None, is_rendered=options.sequence == SYNTHETIC
-        )
+        has_truth, is_rendered = sequence.ground_truth is not None, options.sequence == SYNTHETIC
+        print_run(name, metrics, folder.path, trajectory, has_truth=has_truth, is_rendered=is_rendered)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
     if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
@@ -118,6 +108,33 @@ def run(options: Run) -> int:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:
+    """Begin the files of a run, in place of an earlier one's."""
+    if options.resume:
+        say(f"nothing to resume in {folder.path}: a new run")
+    remove_trajectories(folder.path)
+    if folder.has_run():
+        say(f"the earlier run in {folder.path} is replaced")
+    folder.start(config, float(sequence.timestamps[0]))
+
+
+def _go_on(
+    progress: Progress,
+    sequence: Sequence,
+    odometry: Odometry,
+    folder: RunFolder,
+    viewer: Viewer,
+    mapper: BackgroundMapper | None,
+) -> None:
+    """Have the driver, the viewer and the map stand where an earlier run stopped."""
+    odometry.progress = progress
+    steps = folder.steps()
+    for step in (None, *steps):
+        viewer.watch(None, step)
+    if mapper is not None:
+        mapper.replay(sequence, steps, folder.moving)
 
 
 def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:
@@ -180,10 +197,7 @@ def _track(
         write_loops(folder.path, outcome.loops)
         viewer.conclude(outcome.trajectory, outcome.loops)
     metrics = {
-        "sequence": sequence.name,
-        "method": options.method,
-        "preset": options.preset,
-        "seed": options.seed,
+        **run_identity(sequence.name, options.method, options.preset, options.seed),
         "complete": len(outcome.steps) == len(sequence) - 1,
         "left_out": left_out(sequence),
         **outcome.figures,
@@ -192,7 +206,7 @@ def _track(
 
     def draw_figures() -> None:
         draw(folder.path, {options.method: outcome.trajectory}, sequence.ground_truth)
-        draw_search(folder.path, sequence, odometry, tracked.steps)
+        draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
     with waiting("drawing figures …"):
         interruptible(draw_figures)

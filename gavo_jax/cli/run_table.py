@@ -1,6 +1,5 @@
 """What `gavo run` prints in the end: its figures, and in words why one that people look for is missing."""
 
-import csv
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +19,8 @@ from gavo_jax.odometry.metrics import (
     MILLISECONDS,
     ROTATION_DRIFT,
 )
-from gavo_jax.output.files import BODIES, TRAJECTORY
+from gavo_jax.output.bodies import read_bodies
+from gavo_jax.output.files import BODIES
 from gavo_jax.output.frames import read_steps
 from gavo_jax.output.screen import number, print_table, say
 from gavo_jax.status import AlignmentStatus
@@ -54,17 +54,25 @@ OF_RENDERED = {FRAMES_PER_SECOND: "speed, rendering included"}
 Row = tuple[str, str, str]
 
 
-def print_run(name: str, metrics: Mapping[str, Any], folder: Path, has_truth: bool, is_rendered: bool = False) -> None:
+def print_run(
+    name: str,
+    metrics: Mapping[str, Any],
+    folder: Path,
+    trajectory: Trajectory,
+    *,
+    has_truth: bool,
+    is_rendered: bool = False,
+) -> None:
     """Print the table of a run and where its files are.
 
     Args:
         name: of the run.
         metrics: as in metrics.json.
         folder: the run's.
+        trajectory: as its file has it.
         has_truth: whether the sequence has a ground truth.
         is_rendered: whether its frames are those of the synthetic room.
     """
-    trajectory = Trajectory.read_tum(folder / TRAJECTORY)
     known = [row for row in ERRORS + BEFORE_LOOPS if metrics.get(row[1]) is not None]
     rows: list[Row] = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in known]
     if not known:
@@ -98,17 +106,14 @@ def _of_frozen(steps: list[Step]) -> list[Row]:
 
 def _of_bodies(path: Path) -> list[Row]:
     """What bodies.csv tells, where anything was seen to move."""
-    covered: dict[str, float] = defaultdict(float)
-    bodies: set[str] = set()
-    if path.exists():
-        with path.open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                covered[row["timestamp"]] += float(row["share"])
-                bodies.add(row["body"])
-    if not bodies:
+    seen = read_bodies(path)
+    if not seen:
         return []
+    covered: dict[float, float] = defaultdict(float)
+    for row in seen:
+        covered[row.timestamp] += row.share
     return [
-        ("bodies that moved", str(len(bodies)), ""),
+        ("bodies that moved", str(len({row.body for row in seen})), ""),
         ("frames that show one", str(len(covered)), ""),
         ("largest share of an image", number(100 * max(covered.values()), 0), "%"),
     ]

@@ -13,7 +13,7 @@ from gavo_jax.experiments.tuning import Choice, Tuning, read_tuning, without_pas
 from gavo_jax.experiments.tuning import tune as search
 from gavo_jax.locks import hold
 from gavo_jax.output.files import prepare_folder, remove_files, write_json
-from gavo_jax.output.screen import number, print_table, say
+from gavo_jax.output.screen import DASH, number, print_table, say
 from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"
@@ -60,7 +60,7 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
 
 
 def _row(choice: Choice, names: list[str]) -> list[Any]:
-    settings = [choice.settings.get(name, "–") for name in names]
+    settings = [choice.settings.get(name, DASH) for name in names]
     return [choice.trial, number(choice.drift, 5), number(choice.milliseconds, 1), *map(_short, settings)]
 
 

@@ -12,14 +12,14 @@ from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.files import CONFIG, VIEW
 from gavo_jax.output.frames import RecordedRun, read_run
-from gavo_jax.output.screen import pair_progress, say, tell
+from gavo_jax.output.screen import pair_progress, say
 from gavo_jax.settings_file import load_settings
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer

@@ -175,13 +175,13 @@ class Objective:
         depth = reference.facing * (depth_sample.value - seen.inverse_depth)
         depth_valid = depth_sample.valid * seen.inside
         return Residuals(
-            jnp.where(seen.inside > 0, grey, 0.0),
-            jnp.where(depth_valid > 0, depth, 0.0),
-            seen.inside,
-            depth_valid,
-            warped,
-            grey_sample,
-            depth_sample,
+            grey=jnp.where(seen.inside > 0, grey, 0.0),
+            depth=jnp.where(depth_valid > 0, depth, 0.0),
+            inside=seen.inside,
+            depth_valid=depth_valid,
+            warped=warped,
+            grey_sample=grey_sample,
+            depth_sample=depth_sample,
         )
 
     def shutter(self, reference: Reference) -> Shutter | None:

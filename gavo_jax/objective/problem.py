@@ -18,6 +18,9 @@ from gavo_jax.objective.derivatives import (
 from gavo_jax.objective.error import Objective, Residuals, both_directions
 from gavo_jax.se3 import adjoint, exp, right_jacobian, rigid_inverse
 
+TILES = (8, 6)
+"""Tiles across and down the image, for `Problem.scatter`."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -107,10 +110,13 @@ class Problem:
         used = jnp.sum(jnp.any(by_tile != 0, axis=0))
         return (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
 
-    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"]]:
-        """E's derivatives at x = 0, of which these are the residuals, and the covariance of its gradient."""
-        terms = weighted_terms(self.objective, self.objective.reference, r)
-        return self.linearize_terms(r, terms), self.scatter(r, terms)
+    def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"], list[Term]]:
+        """E's derivatives at x = 0, of which these are the residuals; the covariance of its gradient; and the channels'
+        terms that both are made of.
+        """
+        # held back, or XLA would compute them anew for each that uses them
+        terms = jax.lax.optimization_barrier(weighted_terms(self.objective, self.objective.reference, r))
+        return self.linearize_terms(r, terms), self.scatter(r, terms), terms
 
     @property
     def tangent(self) -> Float[Array, "6 6"]:
@@ -121,7 +127,3 @@ class Problem:
         """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
         motion = self.transform(x)
         return motion, adjoint(motion) @ right_jacobian(self.basis @ x) @ self.basis
-
-
-TILES = (8, 6)
-"""Tiles across and down the image, for `Problem.scatter`."""

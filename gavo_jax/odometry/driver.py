@@ -238,18 +238,18 @@ class Odometry:
             return None
         milliseconds = stopwatch.seconds * 1e3
         return Step(
-            before.last_index,
-            reference_timestamp,
-            timestamp,
-            result,
-            after.world_T_camera.copy(),
-            milliseconds,
-            lost,
-            self.settings.odometry.on_lost if lost else "",
-            after.segment,
-            origin,
-            bodies,
-            outcome.revises,
+            index=before.last_index,
+            reference_timestamp=reference_timestamp,
+            timestamp=timestamp,
+            alignment=result,
+            world_T_camera=after.world_T_camera.copy(),
+            milliseconds=milliseconds,
+            lost=lost,
+            policy=self.settings.odometry.on_lost if lost else "",
+            segment=after.segment,
+            origin=origin,
+            bodies=bodies,
+            revises=outcome.revises,
         )
 
     def _accepted(self, frame: Frame | FrameError | None, timestamp: float) -> Frame | FrameError | None:

@@ -69,6 +69,11 @@ FRAMES_PER_SECOND: Final = "frames_per_second"
 ERRORS: Final = (DRIFT, ROTATION_DRIFT, DRIFT_PER_FRAME, ABSOLUTE_ERROR, FINAL_DISTANCE)
 
 
+def run_identity(sequence: str, method: str | None, preset: str | None, seed: int | None) -> dict[str, Any]:
+    """Of which run the metrics are: what they begin with."""
+    return {"sequence": sequence, "method": method, "preset": preset, "seed": seed}
+
+
 def errors_before(causal: Mapping[str, Any]) -> dict[str, Any]:
     """The errors of a trajectory that loops have corrected since, under names of their own."""
     return {f"odometry_{name}": causal[name] for name in ERRORS}

@@ -17,7 +17,7 @@ from gavo_jax.mapping.correction import Doubts, correct, loop_figures
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
-from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before
+from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before, run_identity
 from gavo_jax.odometry.stream import track, unwatched
 from gavo_jax.precision import in_32_bits
 from gavo_jax.presets import names_of
@@ -116,10 +116,7 @@ def run_odometry(
     outcome = conclude(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)
     metrics: Any = {
-        "sequence": sequence.name,
-        "method": method,
-        "preset": preset,
-        "seed": seed,
+        **run_identity(sequence.name, method, preset, seed),
         "complete": len(steps) == len(sequence) - 1,
         **outcome.figures,
     }

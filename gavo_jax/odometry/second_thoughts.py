@@ -3,7 +3,6 @@
 Each is an aligner around another one, as settings ask for it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,13 +52,12 @@ class Recovering(SecondThought):
 
     Attributes:
         first: What is asked first.
-        second: What is asked where that is unusable; made when it is needed.
+        second: What is asked where that is unusable; it compiles when it is asked.
         wide: What the second one searches with.
-        is_loaded: Whether `warm_up` loads the wide search's program, where it was compiled before; else it is made when
-            it is needed.
+        is_loaded: Whether `warm_up` loads the wide search's program where it was compiled before.
     """
 
-    second: Callable[[], Aligner]
+    second: Aligner
     wide: Search | None = None
     is_loaded: bool = False
 
@@ -83,7 +81,7 @@ class Recovering(SecondThought):
         attempt = self.first.align(state, frame, clock)
         if attempt.usable:
             return attempt
-        again = self.second().align(state, frame, clock)
+        again = self.second.align(state, frame, clock)
         if again.usable:
             return again
         confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
@@ -183,12 +181,8 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
     if not search.settings.odometry.recover:
         return with_bodies(aligner, search)
     careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
-
     wide = wide_search(search)
-
-    def behind() -> Aligner:
-        return with_bodies(Polished(wide, search), wide)
-
+    behind = with_bodies(Polished(wide, search), wide)
     # loading it takes seconds, which a short run had better spare and a long one had better not stop for
     return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
 

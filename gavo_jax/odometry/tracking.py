@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.search import Population, align_views
@@ -133,6 +133,57 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)
 
 
+class Moved(NamedTuple):
+    """The motion that the next frame's search goes by: none at a first frame."""
+
+    is_first: Bool[Array, ""]
+    target_T_reference: Float[Array, "4 4"]
+    motion: Float[Array, " 6"]
+    """Its twist, ξ."""
+    sway: Float[Array, " 6"]
+    instant_motion: Float[Array, " 6"]
+    """Twist that ξ would be, had the camera moved as it did at the frame's own moment."""
+
+    @classmethod
+    def by(cls, result: Alignment, is_first: Bool[Array, ""]) -> "Moved":
+        """As a result says."""
+        motion, sway = jnp.where(is_first, 0.0, result.xi), jnp.where(is_first, 0.0, result.sway)
+        return cls(is_first, jnp.where(is_first, jnp.eye(4), result.target_T_reference), motion, sway, motion + sway)
+
+
+def _readout(camera: Camera, clock: Clock) -> Float[Array, ""]:
+    """A readout over the time between the frames; 0 where it is longer than that, as stamps may be off."""
+    return jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
+
+
+def _settle(
+    newest: Reference, keyframe: Reference, moved: Moved, readout: Float[Array, ""]
+) -> tuple[Reference, Reference]:
+    """Points of both references where they were at their image's moment, by the motion that is known now; those of a
+    first frame are still where their rows' moments left them.
+    """
+    unsettled = newest.row_time
+    newest = settle_reference(newest, moved.instant_motion * readout)
+    keyframe = settle_reference(keyframe, moved.motion * readout)
+    return newest._replace(row_time=jnp.where(moved.is_first, unsettled, newest.row_time)), keyframe
+
+
+def _velocity_change_after(state: TrackerState, moved: Moved, elapsed: Float[Array, ""]) -> VelocityChange:
+    """The velocity's changes with one more pair, so many seconds apart."""
+    change = moved.motion / elapsed - state.motion / state.seconds
+    was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
+    velocity_change = state.velocity_change.after(moved.sway / elapsed, change)
+    return velocity_change._replace(
+        changes=jnp.where(was_second, state.velocity_change.changes, velocity_change.changes)
+    )
+
+
+def _usual_after(usual: Usual, result: Alignment, exposure: Exposure, is_first: Bool[Array, ""]) -> Usual:
+    """What is usual with one more result; a first frame has none."""
+    after = usual.after(result, exposure.spread)
+    return jax.tree.map(lambda new, old: jnp.where(is_first, old, new), after, usual)
+
+
 @partial(CachedProgram, static=("record",), returns=(TrackerState, Reference, Points, Target, Alignment, Population))
 def track_frame(
     state: TrackerState,
@@ -153,78 +204,55 @@ def track_frame(
     motion, so that its points are still where their rows' moments left them. The same program serves, as another one
     would have to be compiled too.
     """
-    is_first = ~jnp.any(state.previous.points.q > 0)
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
-    share = clock.elapsed / state.seconds
-    predicted, guess = state.motion * share, state.guess * share
+    exposure = Exposure.of(raw)
+    since = clock.elapsed / state.seconds
+    predicted, guess = state.motion * since, state.guess * since
     levels = levels_of(camera, solver, alignment)
     finest = levels.numbers[-1]
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * guess, finest) if options.synchronise else raw
-    readout = None
-    if options.rolling_shutter:  # longer than the time between two frames, and stamps may be off, it cannot be
-        readout = jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
-    exposure = Exposure.of(raw)
-    previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
-    views = (previous, keyframe) if options.reference == "keyframe" else (previous,)
-    guesses = jnp.eye(4)[None]
-    if options.prior:
-        guesses = jnp.concatenate([exp(guess)[None], guesses])
     packed = prepare_target(target, levels)
+    readout = _readout(camera, clock) if options.rolling_shutter else None
+    previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
     exchanged = None
     if alignment.symmetric:
         exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
-    key = jax.random.fold_in(key, clock.index)
-    swaying = Swaying(clock.elapsed, state.velocity_change) if options.sway else None
     result, populations = align_views(
-        views,
+        (previous, keyframe) if options.reference == "keyframe" else (previous,),
         packed,
         camera,
         levels,
         solver,
         alignment,
-        key,
-        guesses,
-        record,
-        exchanged,
-        readout,
-        swaying=swaying,
+        jax.random.fold_in(key, clock.index),
+        jnp.stack([exp(guess), jnp.eye(4)]) if options.prior else jnp.eye(4)[None],
+        record=record,
+        exchanged=exchanged,
+        readout=readout,
+        swaying=Swaying(clock.elapsed, state.velocity_change) if options.sway else None,
         share=state.share,
     )
     result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
-    motion = jnp.where(is_first, 0.0, result.xi)
-    sway = jnp.where(is_first, 0.0, result.sway)
-    instant_motion = motion + sway
+    moved = Moved.by(result, is_first=~jnp.any(state.previous.points.q > 0))
     if options.synchronise:
-        target = _synchronised(raw, camera, delay * instant_motion, finest)
+        target = _synchronised(raw, camera, delay * moved.instant_motion, finest)
     newest = make_references(target, camera, levels)
     if readout is not None:
-        unsettled = newest.row_time
-        newest = settle_reference(newest, instant_motion * readout)
-        keyframe = settle_reference(keyframe, motion * readout)
-        newest = newest._replace(row_time=jnp.where(is_first, unsettled, newest.row_time))
-    keyframe = move_reference(keyframe, jnp.where(is_first, jnp.eye(4), result.target_T_reference))
-    keyframe = renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap)
-    usual = jax.tree.map(
-        lambda new, old: jnp.where(is_first, old, new), state.usual.after(result, exposure.spread), state.usual
-    )
-    change = motion / clock.elapsed - state.motion / state.seconds
-    was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
-    velocity_change = state.velocity_change.after(sway / clock.elapsed, change)
-    changes = jnp.where(was_second, state.velocity_change.changes, velocity_change.changes)
-    velocity_change = velocity_change._replace(changes=changes)
+        newest, keyframe = _settle(newest, keyframe, moved, readout)
+    keyframe = move_reference(keyframe, moved.target_T_reference)
     after_it = TrackerState(
-        newest,
-        keyframe,
-        packed,
-        motion,
-        motion,
-        instant_motion,
-        velocity_change,
-        clock.elapsed,
-        jnp.float32(1.0),
-        exposure,
-        usual,
+        previous=newest,
+        keyframe=renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap),
+        previous_image=packed,
+        motion=moved.motion,
+        guess=moved.motion,
+        instant_motion=moved.instant_motion,
+        velocity_change=_velocity_change_after(state, moved, clock.elapsed),
+        seconds=clock.elapsed,
+        share=jnp.float32(1.0),
+        exposure=exposure,
+        usual=_usual_after(state.usual, result, exposure, moved.is_first),
     )
     return after_it, result, populations
 

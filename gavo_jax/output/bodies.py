@@ -1,6 +1,8 @@
 """bodies.csv: a row per body and frame."""
 
-from typing import Any
+import csv
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,3 +22,22 @@ def body_rows(step: Step) -> list[list[Any]]:
         + [body.status]
         for body in sorted(step.bodies, key=lambda body: body.number)
     ]
+
+
+class BodyRow(NamedTuple):
+    """What a row of bodies.csv says of how much moves."""
+
+    timestamp: float
+    """Colour stamp, seconds."""
+    body: int
+    share: float
+    """Of the image."""
+
+
+def read_bodies(path: Path) -> list[BodyRow]:
+    """The rows of bodies.csv; none where there is no such file."""
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = csv.DictReader(file)
+        return [BodyRow(float(row["timestamp"]), int(row["body"]), float(row["share"])) for row in rows]

@@ -105,16 +105,16 @@ def _read_step(
         covariance=np.diag(deviations**2),
     )
     return Step(
-        int(row["index"]),
-        reference_timestamp,
-        timestamp,
-        alignment,
-        world_T_camera,
-        float(row["milliseconds"]),
-        row["lost"] == "1",
-        row["on_lost"],  # pyright: ignore[reportArgumentType]
-        int(row.get("segment") or 0),
-        row.get("origin") or ("guessed" if row["lost"] == "1" else "tracked"),  # pyright: ignore[reportArgumentType]
+        index=int(row["index"]),
+        reference_timestamp=reference_timestamp,
+        timestamp=timestamp,
+        alignment=alignment,
+        world_T_camera=world_T_camera,
+        milliseconds=float(row["milliseconds"]),
+        lost=row["lost"] == "1",
+        policy=row["on_lost"],  # pyright: ignore[reportArgumentType]
+        segment=int(row.get("segment") or 0),
+        origin=row.get("origin") or ("guessed" if row["lost"] == "1" else "tracked"),  # pyright: ignore[reportArgumentType]
         revises=int(row.get("revises") or 0),
     )
 

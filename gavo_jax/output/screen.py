@@ -33,11 +33,6 @@ def _wrapped(line: str) -> str:
     return textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
-def tell(line: str) -> None:
-    """Print a line of the command's own on standard error."""
-    print(f"gavo: {printable(line)}", file=sys.stderr, flush=True)
-
-
 class PairProgress:
     """A bar that counts pairs; it says `compiling …` until the first one is done, and whenever that is so again."""
 

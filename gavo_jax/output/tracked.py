@@ -1,16 +1,16 @@
 """A sequence through a driver under the eyes of a user, who may stop it with Ctrl-C."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.errors import tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.run import conclude
+from gavo_jax.odometry.run import RunOutcome, conclude
 from gavo_jax.odometry.stream import track
-from gavo_jax.output.screen import pair_progress, tell
-from gavo_jax.trajectory import Trajectory
+from gavo_jax.output.screen import pair_progress
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
 from gavo_jax.waits import Stopwatch, told_of_waits
 
@@ -18,14 +18,17 @@ from gavo_jax.waits import Stopwatch, told_of_waits
 class Tracked(NamedTuple):
     """What came of a sequence; where the user stopped it, up to there."""
 
-    trajectory: Trajectory
     steps: list[Step]
-    metrics: dict[str, Any]
-    """As `Metrics` names them."""
+    """As they came."""
     interrupted: bool
     seconds: float
     """Wall time, decoding included, compilation left out."""
     compile_seconds: float
+
+    def concluded(self, sequence: Sequence) -> RunOutcome:
+        """What a run over a sequence comes to, which was tracked from its first frame on."""
+        first, truth = float(sequence.timestamps[0]), sequence.ground_truth
+        return conclude(first, self.steps, truth, None, self.seconds, self.compile_seconds)
 
 
 def track_visibly(
@@ -69,6 +72,4 @@ def track_visibly(
         seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     if interrupted:
         tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
-    first, truth = float(sequence.timestamps[0]), sequence.ground_truth
-    outcome = conclude(first, steps, truth, None, seconds, compile_seconds)
-    return Tracked(outcome.trajectory, outcome.steps, outcome.figures, interrupted, seconds, compile_seconds)
+    return Tracked(steps, interrupted, seconds, compile_seconds)

@@ -108,7 +108,7 @@ def write_euroc(trajectory: Trajectory, path: Path) -> None:
     write_lines(path, [EUROC_HEADER, *_euroc_rows(trajectory)])
 
 
-def write_json(trajectory: Trajectory, path: Path) -> None:
+def write_json_trajectory(trajectory: Trajectory, path: Path) -> None:
     """Write one object: `frame`, `units` and `poses`, each with timestamp, translation, quaternion and segment."""
     poses = [
         {
@@ -154,7 +154,7 @@ WRITERS: dict[str, Callable[[Trajectory, Path], None]] = {
     "tum": Trajectory.write_tum,
     "kitti": Trajectory.write_kitti,
     "euroc": write_euroc,
-    "json": write_json,
+    "json": write_json_trajectory,
     "bag": write_bag,
 }
 

@@ -143,7 +143,7 @@ best_distinct = jax.jit(modes.best_distinct, static_argnames="count")
 def examine(problem: Problem) -> Any:
     """As a search ends: the points of all views in one row."""
     problem = replace(problem, objective=problem.objective.merged())
-    return problem.examine(problem.objective.residuals(problem.origin))
+    return problem.examine(problem.objective.residuals(problem.origin))[:2]
 
 
 def exp_deviation(rows: int) -> float:

@@ -15,7 +15,7 @@ from small import CAMERA, NEWTON
 from gavo_jax import presets
 from gavo_jax.alignment import pairs
 from gavo_jax.alignment.information import Information
-from gavo_jax.alignment.judgement import Evidence, find_against
+from gavo_jax.alignment.judgement import Examination, find_against
 from gavo_jax.alignment.pairs import align, align_batch, stacked_images
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.visits import levels_of, prepare_pair, stack_levels, visited_levels
@@ -198,9 +198,11 @@ def test_what_speaks_against_a_motion_whatever_the_images(scale: float, asked: i
 
     @jax.jit
     def judge(motion: jax.Array) -> jax.Array:
-        evidence = Evidence(motion, jnp.float32(100.0), model, jnp.eye(6), information, explained)
+        examination = Examination(motion, jnp.float32(100.0), model, jnp.eye(6), information, explained)
         return gravest(
-            as_findings(find_against(evidence, 1e-6 * jnp.eye(6), objective, jnp.float32(np.inf), jnp.float32(asked)))
+            as_findings(
+                find_against(examination, 1e-6 * jnp.eye(6), objective, jnp.float32(np.inf), jnp.float32(asked))
+            )
         )
 
     assert AlignmentStatus(int(judge(motion))) is status

@@ -706,7 +706,7 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
     first: Alignment, second: Alignment, x: float | None
 ) -> None:
     sequence = Rendered(frames=2, camera=CAMERA, noise=NONE)
-    odometry = Odometry(CAMERA, aligner=Recovering(Told(first), lambda: Told(second)))
+    odometry = Odometry(CAMERA, aligner=Recovering(Told(first), Told(second)))
     odometry.register(sequence[0], 0.0)
     step = odometry.register(sequence[1], 1 / 30)
     assert step is not None and step.lost is (x is None)
@@ -718,7 +718,7 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
 def test_a_frame_that_is_not_explained_is_no_reference_while_the_old_one_is_in_reach() -> None:
     """The next frame would be compared with what was wrong in it: pairs behind one were off by three times as much."""
     poor = Told(found(AlignmentStatus.HIGH_ERROR, 0.02))
-    odometry = Odometry(CAMERA, aligner=Recovering(poor, lambda: poor))
+    odometry = Odometry(CAMERA, aligner=Recovering(poor, poor))
     sequence = Rendered(frames=6, camera=CAMERA, noise=NONE)
     steps = [odometry.register(frame, frame.timestamp) for frame in sequence]
     of = [int(np.argmin(np.abs(sequence.timestamps - step.reference_timestamp))) for step in steps if step is not None]
@@ -829,7 +829,7 @@ def test_the_stamp_that_is_registered_is_the_frame_s() -> None:
 def test_the_wide_search_stands_behind_the_default_one() -> None:
     aligner = Odometry(CAMERA, SOLVER, seed=3).aligner
     assert isinstance(aligner, Recovering) and isinstance(aligner.first, DoubtingDepth)
-    rivalled = aligner.first.first, aligner.first.alone, aligner.second()
+    rivalled = aligner.first.first, aligner.first.alone, aligner.second
     first, alone, second = (one.first for one in rivalled if isinstance(one, WithRival))
     assert isinstance(first, BodyAware) and isinstance(alone, BodyAware) and isinstance(second, BodyAware)
     search, wide = first.search, second.search

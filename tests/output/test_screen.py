@@ -63,7 +63,7 @@ def test_a_run_tells_of_the_bodies_it_saw(
     rows = [(stamp, number, share) for stamp, number, share in zip(stamps, numbers, shares, strict=False)]
     lines = [",".join([*row, *["0"] * 9, "seen"]) for row in rows]
     (tmp_path / "bodies.csv").write_text("\n".join([",".join(BODY_COLUMNS), *lines]) + "\n")
-    print_run("run", {}, tmp_path, has_truth=False)
+    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), has_truth=False)
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table}
     if shares:
@@ -86,7 +86,13 @@ def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys:
         for index, (status, error) in enumerate(pairs, start=1):
             alignment = no_alignment(status)._replace(error=np.float32(error))
             rows.writerow(frame_row(Step(index, 0.0, 1.0, alignment, np.eye(4), 1.0, False)))
-    print_run("run", {"statuses": {"frozen": 3, "ok": 1, "gap": 1}}, tmp_path, has_truth=False)
+    print_run(
+        "run",
+        {"statuses": {"frozen": 3, "ok": 1, "gap": 1}},
+        tmp_path,
+        Trajectory.read_tum(tmp_path / "trajectory.txt"),
+        has_truth=False,
+    )
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table if row[0].startswith("pairs:")}
     assert told == {
@@ -102,7 +108,7 @@ def test_of_the_end_nothing_is_said_where_the_way_there_is_unknown(
 ) -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     Trajectory(np.arange(2.0), poses, np.array(segments)).write_tum(tmp_path / "trajectory.txt")
-    print_run("run", {}, tmp_path, has_truth=False)
+    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), has_truth=False)
     assert ("end: turned by" in capsys.readouterr().out) == (segments == (0, 0))
 
 

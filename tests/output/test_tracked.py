@@ -64,7 +64,7 @@ def test_what_is_compiled_on_the_way_is_said_and_does_not_slow_the_run(monkeypat
     tracked = track_visibly("clip", sequence, Odometry(CAMERA, aligner=CompilesLate()), steps.append)
     assert said == [1]
     assert tracked.compile_seconds >= SECONDS
-    assert tracked.metrics[COMPILE_SECONDS] == tracked.compile_seconds
+    assert tracked.concluded(sequence).figures[COMPILE_SECONDS] == tracked.compile_seconds
     others = time.perf_counter() - start - SECONDS
     assert tracked.seconds < others
     assert sum(step.milliseconds for step in steps) < 1e3 * others
@@ -91,7 +91,7 @@ def test_before_a_camera_the_search_behind_the_first_one_is_made_as_well() -> No
 
     first, wide = Made("first"), Made("wide")
     behind: Any = wide
-    odometry = Odometry(CAMERA, aligner=Recovering(first, lambda: wide, behind))  # pyright: ignore[reportArgumentType]
+    odometry = Odometry(CAMERA, aligner=Recovering(first, wide, behind))  # pyright: ignore[reportArgumentType]
     odometry.warm_up()
     assert made == ["first"]
     odometry.warm_up(wholly=True)
