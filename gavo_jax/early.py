@@ -8,9 +8,9 @@ import signal
 import sys
 
 INTERRUPTED = 130
-"""Exit status,"""
+"""Exit status after Ctrl-C."""
 LOST = 3
-"""and that of a run in which a pair was lost, where `--strict` asked to know."""
+"""Exit status of a run in which a pair was lost, where `--strict` asked to know."""
 
 is_ours = False
 """Whether Ctrl-C is the command's: in other people's programs it is left alone."""

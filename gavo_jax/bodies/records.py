@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -62,6 +62,16 @@ class Body:
         height, width = size
         return cv2.resize(self.field, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
+    def moved(self, new_T_old: Float64[np.ndarray, "4 4"]) -> Self:
+        """The same body in another world, in which the camera was found."""
+        rotation = new_T_old[:3, :3]
+        return replace(
+            self,
+            centroid=rotation @ self.centroid + new_T_old[:3, 3],
+            displacement=rotation @ self.displacement,
+            rotation=rotation @ self.rotation,
+        )
+
     @property
     def status(self) -> str:
         """In a word: that of its motion; `seen` where there is none."""
@@ -78,11 +88,17 @@ def covered(bodies: Iterable[Body]) -> Bool[np.ndarray, "height width"] | None:
     return np.any(masks, axis=0) if masks else None
 
 
-def without_moving(frame: Frame, moving: Bool[np.ndarray, "height width"] | None) -> Frame:
-    """A frame without depth where something moves on its own, and around it; None: nothing does."""
+def without_moving(frame: Frame, moving: Bool[np.ndarray, "height width"] | None, border: float = BORDER) -> Frame:
+    """A frame without depth where something moves on its own, and around it.
+
+    Args:
+        frame: The frame.
+        moving: Pixels that do; None: nothing does.
+        border: Width of what is left out around these, over the image's width.
+    """
     if moving is None:
         return frame
-    side = 2 * round(BORDER * moving.shape[1]) + 1
+    side = 2 * round(border * moving.shape[1]) + 1
     around = cv2.dilate(moving.astype(np.uint8), np.ones((side, side), np.uint8))
     return replace(frame, depth=np.where(around > 0, 0, frame.depth))
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from gavo_jax.mapping.keyframes import Keyframe
-from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.mapper import Loops, tied_segments
 from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.rigid_motions import interpolate
 from gavo_jax.trajectory import Trajectory, inverse
@@ -82,12 +82,9 @@ def _begins(keyframes: list[Keyframe], number: int, segment: int) -> bool:
 
 def joined(segments: Int[np.ndarray, " n"], loops: Loops) -> Int[np.ndarray, " n"]:
     """The segments of poses, those that loops join under the number of the first of them."""
-    first = {int(segment): int(segment) for segment in np.unique(segments)}
-    for edge, weight in zip(loops.edges, loops.solution.weights, strict=True):
-        a, b = (first.get(loops.keyframes[number].segment) for number in (edge.earlier, edge.later))
-        if weight > COUNTED and a is not None and b is not None and a != b:
-            first = {segment: min(a, b) if to in (a, b) else to for segment, to in first.items()}
-    return np.array([first[int(segment)] for segment in segments])
+    weighted = zip(loops.edges, loops.solution.weights, strict=True)
+    first = tied_segments(loops.keyframes, (edge for edge, weight in weighted if weight > COUNTED))
+    return np.array([first.get(int(segment), int(segment)) for segment in segments])
 
 
 def loop_figures(loops: Loops) -> dict[str, int | float]:

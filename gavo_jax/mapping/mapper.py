@@ -115,7 +115,7 @@ class Mapper:
             twist = np.zeros(6)
         else:
             self._follow(step, motion)
-        if frame is not None and _may_be_keyframe(step):
+        if frame is not None and (due or _may_be_keyframe(step)):
             frame = without_moving(frame, moving(step))
         if frame is not None and due:
             keyframe = self._made(frame, step, twist, None if is_found else self._known.get(_key(step.timestamp)))
@@ -183,18 +183,15 @@ class Mapper:
         return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
     def _join(self) -> None:
-        """Look for segments that nothing ties to others, by their first keyframes."""
-        tied = {
-            keyframes[number].segment
-            for edge in self.edges
-            for number in (edge.earlier, edge.later)
-            if (keyframes := self.keyframes.all)[edge.earlier].segment != keyframes[edge.later].segment
-        }
+        """Look for segments that no edge ties to earlier ones, by their first keyframes."""
         kept = self.keyframes.searchable()
-        for segment in sorted({keyframe.segment for keyframe in kept} - {0} - tied):
+        for segment in sorted({keyframe.segment for keyframe in kept}):
+            first = tied_segments(self.keyframes.all, self.edges)
+            if first[segment] < segment:
+                continue
             own = [keyframe for keyframe in kept if keyframe.segment == segment]
-            others = [keyframe for keyframe in kept if keyframe.segment < segment]
-            for keyframe in own[:SOUGHT_OF_SEGMENT]:
+            others = [keyframe for keyframe in kept if first[keyframe.segment] < segment]
+            for keyframe in own[:SOUGHT_OF_SEGMENT] if others else ():
                 place = self.recogniser.find(keyframe, others)
                 if place is not None:
                     self._link(keyframe, place.edge)
@@ -221,7 +218,7 @@ class Mapper:
     def _follow(self, step: Step, motion: np.ndarray) -> None:
         """Keep the covariance of the motion since the last keyframe."""
         before = self._known.get(_key(step.reference_timestamp))
-        covariance = np.asarray(step.alignment.covariance, np.float64) + STEP_FLOOR**2 * np.eye(6)
+        covariance = mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
         if before is not None and np.isfinite(covariance).all():
             covariance = transport_covariance(motion, before.covariance + covariance)
             self._known[_key(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
@@ -281,6 +278,23 @@ class Mapper:
                 covariance = covariance + DOUBTED**2 * np.eye(6)
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
+
+
+def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
+    """The upper triangle of a covariance on both sides, as motions.csv keeps it: one that was computed is symmetric but
+    for its last digits, and a resumed run is to make the same map.
+    """
+    return np.triu(covariance) + np.triu(covariance, 1).T
+
+
+def tied_segments(keyframes: list[Keyframe], edges: Iterable[Edge]) -> dict[int, int]:
+    """Of each segment the first one that edges tie it to, over others or not; itself where nothing does."""
+    first = {keyframe.segment: keyframe.segment for keyframe in keyframes}
+    for edge in edges:
+        a, b = (first[keyframes[number].segment] for number in (edge.earlier, edge.later))
+        if a != b:
+            first = {segment: min(a, b) if to in (a, b) else to for segment, to in first.items()}
+    return first
 
 
 def is_in_doubt(step: Step) -> bool:

@@ -56,7 +56,7 @@ def judge_by_depth(
     if AlignmentStatus.DEPTH_MISMATCH in result.statuses:
         return result, watch
     explained = float(result.explained.grey)
-    at_rest = without_moving(frame, covered(bodies))
+    at_rest = without_moving(frame, covered(bodies), border=0.0)
     change = watch.change.after(at_rest, elapsed, result.target_T_reference, explained, camera)
     watch = watch._replace(change=change)
     watch = watch._replace(told=watch.is_wrong)

@@ -223,12 +223,12 @@ class Odometry:
                 world_T_reference=found.world_T_camera,
                 world_T_camera=found.world_T_camera,
                 segment=found.segment,
-                adrift=0,
+                adrift=after.adrift + 1 if found.segment else 0,  # another one may be adrift itself
                 unknown=0,
                 beginning=None,
             )
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
-            bodies = ()  # those that were seen moved against the last frame, which is not the reference any more
+            bodies = tuple(body.moved(found.world_T_camera @ inverse(outcome.after.world_T_camera)) for body in bodies)
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:

@@ -176,14 +176,12 @@ def conclude(
 
 
 def doubts_of(steps: list[Step]) -> Doubts:
-    """Which poses of `trajectory_of` are guesses."""
+    """Which poses of `trajectory_of` are guesses. A lost frame that others were aligned with is known by these."""
     kept = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
-    guessed, lost = ([False] + [said(step) for step in kept] for said in (_is_guess, lambda step: step.lost))
-    return Doubts(np.array(guessed), np.array(lost))
-
-
-def _is_guess(step: Step) -> bool:
-    return step.origin == "guessed"
+    references = {step.reference_timestamp for step in kept if not step.lost}
+    guessed = [step.origin == "guessed" for step in kept]
+    lost = [step.lost and step.timestamp not in references for step in kept]
+    return Doubts(np.array([False, *guessed]), np.array([False, *lost]))
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:

@@ -133,7 +133,7 @@ class RunFolder:
         self._seen = SeenImages(images)
         self._poses = trajectory
         self._files: dict[str, _GrowingFile] = {}
-        self._segment = 0
+        self._segment, self._last_pose = 0, 0.0
         self._whole: tuple[dict[str, Mark], str, Progress | None] = ({}, "", None)
         """The growing files after the last frame that is in both, the images seen and the driver's progress then."""
 
@@ -165,6 +165,7 @@ class RunFolder:
             self._files[MOTIONS].append(",".join(MOTION_COLUMNS))
         self._files[self._poses].append(TRAJECTORY_HEADER)
         self._files[self._poses].append(format_tum_row(timestamp, np.eye(4)))
+        self._last_pose = timestamp
         self._whole = (self._marks(), self._seen.up_to(0), None)
 
     def resume(self, config: Mapping[str, Any], blank: Any) -> Progress | None:
@@ -201,7 +202,8 @@ class RunFolder:
         remove_files(self.path, METRICS, LOOPS, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
-        remove_masks(self.path, after=max((step.timestamp for step in self._said()), default=-np.inf))
+        self._last_pose = float(Trajectory.read_tum(self.path / self._poses).timestamps[-1])
+        remove_masks(self.path, after=self._last_pose)
         return progress
 
     def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:
@@ -242,10 +244,11 @@ class RunFolder:
             self._files[MOTIONS].append(as_line(motion_row(step)))
         if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP:
             if step.segment != self._segment:
-                comment = segment_comment(step.segment, step.reference_timestamp, step.timestamp)
+                comment = segment_comment(step.segment, self._last_pose, step.timestamp)
                 self._files[self._poses].append(comment)
                 self._segment = step.segment
             self._files[self._poses].append(format_tum_row(step.timestamp, step.world_T_camera))
+            self._last_pose = step.timestamp
         images = self._whole[1] if progress is None else self._seen.up_to(progress.last_index)
         self._whole = (self._marks(), images, progress)
 

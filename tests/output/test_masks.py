@@ -86,6 +86,24 @@ def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
     assert not (tmp_path / MASKS).exists()
 
 
+def test_a_comment_names_the_last_pose_and_not_the_reference(tmp_path: Path):
+    """Of a frame that a keyframe was found for it named that: what is known was called unknown."""
+    with RunFolder(tmp_path) as folder:
+        folder.start({"odometry": OdometryOptions()}, 100.0)
+        folder.add(replace(stepped(1), timestamp=101.0))
+        folder.add(replace(stepped(2), timestamp=102.0, reference_timestamp=0.0, segment=1))
+    assert "from 101.000000 to 102.000000 is unknown" in (tmp_path / "trajectory.txt").read_text()
+
+
+def test_a_body_goes_with_the_camera_into_another_world():
+    turned = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    moving = replace(body(1, 0, 4), centroid=np.array([1.0, 0, 0]), displacement=np.array([0.1, 0, 0]))
+    after = moving.moved(turned)
+    np.testing.assert_allclose(after.centroid, [1.0, 1.0, 0.0])
+    np.testing.assert_allclose(after.displacement, [0.0, 0.1, 0.0])
+    np.testing.assert_array_equal(after.mask, moving.mask)
+
+
 def test_what_came_after_a_checkpoint_is_removed(tmp_path: Path):
     """The last frame's own was removed where its stamp had been rounded up."""
     stamps = [index / 30 for index in (2, 3, 4)]
