@@ -19,6 +19,7 @@ from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.files import CONFIG, VIEW
 from gavo_jax.output.frames import RecordedRun, read_run
+from gavo_jax.output.recorded_bodies import RecordedBodies
 from gavo_jax.output.screen import pair_progress, say
 from gavo_jax.settings_file import load_settings
 from gavo_jax.viewer.base import Viewer
@@ -28,6 +29,7 @@ from gavo_jax.viewer.live import make_viewer
 def view(options: View) -> int:
     """Show the run of a folder; without its frames where the sequence is no longer there."""
     run = read_run(options.folder)
+    bodies = RecordedBodies(options.folder)
     viewer = make_viewer(options.viewer, options.folder / VIEW)
     sequence = _find_sequence(run, options.folder)
     if sequence is None:
@@ -38,11 +40,11 @@ def view(options: View) -> int:
     with hold(options.folder) if options.viewer == "save" else nullcontext(), viewer:
         viewer.open(options.folder.resolve().name, camera, stamps, truth)
         if sequence is not None and search is not None:
-            _show_with_search(run, sequence, search, viewer)
+            _show_with_search(run, bodies, sequence, search, viewer)
         else:
             viewer.watch(_read(sequence, 0), None)
             for step in run.steps:
-                viewer.watch(_read(sequence, step.index), step)
+                viewer.watch(_read(sequence, step.index), bodies.restore(step))
     if options.viewer == "save":
         say(f"written {options.folder / VIEW}")
     viewer.stay()
@@ -60,14 +62,17 @@ def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry
         return None
 
 
-def _show_with_search(run: RecordedRun, sequence: Sequence, odometry: Odometry, viewer: Viewer) -> None:
+def _show_with_search(
+    run: RecordedRun, bodies: RecordedBodies, sequence: Sequence, odometry: Odometry, viewer: Viewer
+) -> None:
     """Track the frames once more for the particles; what is shown of the poses is what the run found."""
     enable_compilation_cache()
     recorded = {step.index: step for step in run.steps}
     apart = 0.0
 
     def watch(frame: Frame | None, step: Step | None) -> None:
-        viewer.watch(frame, None if step is None else recorded[step.index], odometry.candidates)
+        shown = None if step is None else bodies.restore(recorded[step.index])
+        viewer.watch(frame, shown, odometry.candidates)
 
     with pair_progress("the search", len(recorded)) as bar:
         interruptible(odometry.warm_up)

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
+from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
 
 BODY_COLUMNS = ("timestamp", "body", "share", "x", "y", "z", "dx", "dy", "dz", "rx", "ry", "rz", "status")
@@ -25,19 +27,33 @@ def body_rows(step: Step) -> list[list[Any]]:
 
 
 class BodyRow(NamedTuple):
-    """What a row of bodies.csv says of how much moves."""
+    """What a row of bodies.csv says, but for the status."""
 
     timestamp: float
     """Colour stamp, seconds."""
     body: int
     share: float
-    """Of the image."""
+    """Share of the image that the body covers."""
+    centroid: Float64[np.ndarray, " 3"]
+    displacement: Float64[np.ndarray, " 3"]
+    rotation: Float64[np.ndarray, " 3"]
+    """Metres, metres and radians in the world, as of `Body`."""
 
 
 def read_bodies(path: Path) -> list[BodyRow]:
-    """The rows of bodies.csv; none where there is no such file."""
+    """The rows of bodies.csv; none where there is no such file.
+
+    Raises:
+        GavoError: It cannot be read.
+    """
     if not path.exists():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(file)
-        return [BodyRow(float(row["timestamp"]), int(row["body"]), float(row["share"])) for row in rows]
+    try:
+        return [_row(*fields) for fields in csv.reader(read_text(path).splitlines()[1:])]
+    except (TypeError, ValueError):
+        raise GavoError(f"{path}: not the bodies of a run") from None
+
+
+def _row(timestamp: str, body: str, share: str, *more: str) -> BodyRow:
+    *numbers, _ = more
+    return BodyRow(float(timestamp), int(body), float(share), *np.array(numbers, np.float64).reshape(3, 3))

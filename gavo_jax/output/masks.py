@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Integer
 
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.odometry.driver import Step
@@ -43,7 +43,13 @@ def write_masks(folder: Path, step: Step) -> None:
 
 
 def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width"] | None:
-    """Where any body was in a frame; None where the run saw none.
+    """Where any body was in a frame; see `read_labels`."""
+    labels = read_labels(folder, timestamp)
+    return None if labels is None else labels > 0
+
+
+def read_labels(folder: Path, timestamp: float) -> Integer[np.ndarray, "height width"] | None:
+    """Number of the body at each pixel of a frame, 0 beside them; None where the run saw none.
 
     Args:
         folder: Of the run.
@@ -62,7 +68,7 @@ def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width
     labels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if labels is None or labels.ndim != 2:
         raise GavoError(f"{path}: not an image of bodies")
-    return labels > 0
+    return labels
 
 
 def remove_masks(folder: Path, after: float = -np.inf) -> None:

@@ -12,7 +12,9 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies.records import Body
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
+from gavo_jax.output.files import ODOMETRY
 from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
+from gavo_jax.output.recorded_bodies import RecordedBodies
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.settings import OdometryOptions
 from gavo_jax.status import AlignmentStatus
@@ -84,6 +86,28 @@ def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
     with RunFolder(tmp_path) as folder:
         folder.start(config, 0.0)
     assert not (tmp_path / MASKS).exists()
+
+
+def test_a_recorded_run_gets_its_bodies_back(tmp_path: Path):
+    """`gavo view` showed none, and took them for the scene."""
+    seen = replace(body(2, 4, 9), centroid=np.array([1.0, 2.0, 3.0]), displacement=np.array([0.1, 0.0, 0.0]))
+    config = {"odometry": OdometryOptions()}
+    with RunFolder(tmp_path, trajectory=ODOMETRY) as folder:
+        folder.start(config, 0.0)
+        folder.add(stepped(1, seen, body(5, 12, 14)))
+        folder.add(stepped(2))
+    bodies = RecordedBodies(tmp_path)
+    corrected = np.eye(4)
+    corrected[0, 3] = 10.0
+    step = bodies.restore(replace(stepped(1), world_T_camera=corrected))
+    assert [found.number for found in step.bodies] == [2, 5] and bodies.restore(stepped(2)).bodies == ()
+    again = step.bodies[0]
+    np.testing.assert_array_equal(again.mask, seen.mask)
+    np.testing.assert_allclose(again.centroid, [11.0, 2.0, 3.0])
+    np.testing.assert_allclose(again.displacement, seen.displacement)
+    (tmp_path / "bodies.csv").write_text("timestamp\n1.0,2,x\n")
+    with pytest.raises(GavoError, match=r"bodies\.csv: not the bodies of a run"):
+        RecordedBodies(tmp_path)
 
 
 def test_a_comment_names_the_last_pose_and_not_the_reference(tmp_path: Path):

@@ -1,0 +1,58 @@
+"""The bodies of a run that has ended, as bodies.csv and masks/ tell of them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gavo_jax.bodies.records import Body
+from gavo_jax.odometry.driver import Step
+from gavo_jax.output.bodies import BodyRow, read_bodies
+from gavo_jax.output.files import BODIES, ODOMETRY
+from gavo_jax.output.masks import read_labels
+from gavo_jax.trajectory import Trajectory, inverse
+
+
+class RecordedBodies:
+    """Gives the steps of a recorded run their bodies back, without the alignments of these.
+
+    Args:
+        folder: The run's.
+
+    Raises:
+        GavoError: A file cannot be read.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._rows: dict[str, list[BodyRow]] = {}
+        for row in read_bodies(folder / BODIES):
+            self._rows.setdefault(_key(row.timestamp), []).append(row)
+        self._odometry: dict[str, np.ndarray] = {}
+        if (folder / ODOMETRY).exists():  # bodies are told in its world, steps in the one that loops corrected
+            odometry = Trajectory.read_tum(folder / ODOMETRY)
+            self._odometry = dict(zip(map(_key, odometry.timestamps), odometry.world_T_camera, strict=True))
+
+    def restore(self, step: Step) -> Step:
+        """A step with its bodies, in the world of its pose.
+
+        Raises:
+            GavoError: The image of where they are cannot be read.
+        """
+        rows = self._rows.get(_key(step.timestamp), [])
+        labels = read_labels(self._folder, step.timestamp) if rows else None
+        if labels is None:
+            return step
+        before = self._odometry.get(_key(step.timestamp), step.world_T_camera)
+        bodies = (_body(row, labels).moved(step.world_T_camera @ inverse(before)) for row in rows)
+        return replace(step, bodies=tuple(bodies))
+
+
+def _body(row: BodyRow, labels: np.ndarray) -> Body:
+    height, width = labels.shape
+    field = np.where(labels == row.body, np.float32(1.0), np.float32(-1.0))
+    return Body(row.body, row.share, row.centroid, row.displacement, row.rotation, None, field, (height, width))
+
+
+def _key(stamp: float) -> str:
+    return f"{stamp:.6f}"
