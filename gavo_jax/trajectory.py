@@ -202,6 +202,11 @@ class Trajectory:
         return result, valid
 
 
+def stamp_name(timestamp: float) -> str:
+    """A stamp in seconds as a run's files name frames by it: to the microsecond."""
+    return f"{timestamp:.6f}"
+
+
 def format_tum_row(timestamp: float, world_T_camera: Float[np.ndarray, "4 4"]) -> str:
     """Return `timestamp tx ty tz qx qy qz qw` without a line end: shortest digits that read back exactly, qw ≥ 0.
 

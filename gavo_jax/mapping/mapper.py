@@ -19,7 +19,7 @@ from gavo_jax.mapping.verification import Edge, Verifier
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
 from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.status import GRAVITY, AlignmentStatus
-from gavo_jax.trajectory import inverse
+from gavo_jax.trajectory import inverse, stamp_name
 
 STEP_FLOOR = 5e-4
 """Metres and radians that a step of the odometry is off by beside what its covariance says."""
@@ -118,7 +118,7 @@ class Mapper:
         if frame is not None and (due or _may_be_keyframe(step)):
             frame = without_moving(frame, moving(step))
         if frame is not None and due:
-            keyframe = self._made(frame, step, twist, None if is_found else self._known.get(_key(step.timestamp)))
+            keyframe = self._made(frame, step, twist, None if is_found else self._known.get(stamp_name(step.timestamp)))
             self._add(keyframe)
             if is_found:
                 self._tie(keyframe)
@@ -158,7 +158,8 @@ class Mapper:
         for step in steps:
             frame = _decoded(sequence, step.index) if self.is_due(step) or step.index == last else None
             if frame is not None and step.origin == "relocalised":
-                by = [k for k in self.keyframes.searchable() if _key(k.timestamp) == _key(step.reference_timestamp)]
+                reference = stamp_name(step.reference_timestamp)
+                by = [k for k in self.keyframes.searchable() if stamp_name(k.timestamp) == reference]
                 self._place = self._find(frame, by)
             self.watch(frame, step, moving)
 
@@ -170,7 +171,7 @@ class Mapper:
         """
         if self._newest is not None:
             frame, step, twist = self._newest
-            self._add(self._made(frame, step, twist, self._known.get(_key(step.timestamp))))
+            self._add(self._made(frame, step, twist, self._known.get(stamp_name(step.timestamp))))
             self._newest = None
         self._doubt(steps)
         if not self.keyframes.all:
@@ -206,29 +207,29 @@ class Mapper:
 
     def _doubt(self, steps: Iterable[Step]) -> None:
         """Doubt the ways between keyframes that lead over motions which are in doubt in hindsight."""
-        tracked = {_key(step.timestamp): step for step in steps if not step.lost}
-        stamps = {_key(keyframe.timestamp) for keyframe in self.keyframes.all}
+        tracked = {stamp_name(step.timestamp): step for step in steps if not step.lost}
+        stamps = {stamp_name(keyframe.timestamp) for keyframe in self.keyframes.all}
         for keyframe in self.keyframes.all:
-            step = tracked.get(_key(keyframe.timestamp))
+            step = tracked.get(stamp_name(keyframe.timestamp))
             while step is not None:
                 keyframe.in_doubt |= is_in_doubt(step)
-                before = _key(step.reference_timestamp)
+                before = stamp_name(step.reference_timestamp)
                 step = None if before in stamps else tracked.get(before)
 
     def _follow(self, step: Step, motion: np.ndarray) -> None:
         """Keep the covariance of the motion since the last keyframe."""
-        before = self._known.get(_key(step.reference_timestamp))
+        before = self._known.get(stamp_name(step.reference_timestamp))
         covariance = mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
         if before is not None and np.isfinite(covariance).all():
             covariance = transport_covariance(motion, before.covariance + covariance)
-            self._known[_key(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
+            self._known[stamp_name(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
 
     def _add(self, keyframe: Keyframe) -> None:
         self.keyframes.add(keyframe)
         self._known.clear()
-        self._known[_key(keyframe.timestamp)] = _Way(np.zeros((6, 6)), False)
+        self._known[stamp_name(keyframe.timestamp)] = _Way(np.zeros((6, 6)), False)
         self._close(self._candidates(keyframe))
         if len(self.keyframes.all) >= self._next:
             self._next = int(GROWTH * len(self.keyframes.all)) + 1
@@ -312,7 +313,3 @@ def _decoded(sequence: Sequence, index: int) -> Frame | None:
         return sequence[index]
     except FrameError:
         return None
-
-
-def _key(stamp: float) -> str:
-    return f"{stamp:.6f}"

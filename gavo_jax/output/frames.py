@@ -14,7 +14,7 @@ from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY, read_json
 from gavo_jax.status import AlignmentStatus, bit
-from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 DEVIATIONS = tuple(f"std_{name}" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))
 FRAME_COLUMNS = (
@@ -47,7 +47,7 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     """
     poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
     found = Trajectory.read_tum(folder / ODOMETRY) if (folder / ODOMETRY).exists() else poses
-    by_stamp, found_at = ({f"{t:.6f}": i for i, t in enumerate(one.timestamps)} for one in (poses, found))
+    by_stamp, found_at = ({stamp_name(t): i for i, t in enumerate(one.timestamps)} for one in (poses, found))
     steps: list[Step] = []
     place = now = 0
     for number, row in enumerate(_rows_of(folder / FRAMES), start=1):
@@ -150,8 +150,8 @@ def frame_row(step: Step) -> list[Any]:
     deviations = np.sqrt(np.maximum(np.diag(np.asarray(alignment.covariance, np.float64)), 0.0))
     return [
         step.index,
-        f"{step.reference_timestamp:.6f}",
-        f"{step.timestamp:.6f}",
+        stamp_name(step.reference_timestamp),
+        stamp_name(step.timestamp),
         _digits(alignment.error),
         _digits(alignment.overlap),
         str(alignment.status),

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Integer
 
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.odometry.driver import Step
+from gavo_jax.trajectory import stamp_name
 
 MASKS = "masks"
 """The folder, in that of a run."""
@@ -82,7 +83,7 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
         return
     try:
         for path in inside.glob("*.png"):
-            if _stamp(path) > float(f"{after:.6f}"):  # as names have it
+            if _stamp(path) > float(stamp_name(after)):  # as names have it
                 path.unlink()
         if not any(inside.iterdir()):
             inside.rmdir()
@@ -91,7 +92,7 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
 
 
 def _path(folder: Path, timestamp: float) -> Path:
-    return folder / MASKS / f"{timestamp:.6f}.png"
+    return folder / MASKS / f"{stamp_name(timestamp)}.png"
 
 
 def _stamp(path: Path) -> float:

@@ -10,7 +10,7 @@ from gavo_jax.odometry.driver import Step
 from gavo_jax.output.bodies import BodyRow, read_bodies
 from gavo_jax.output.files import BODIES, ODOMETRY
 from gavo_jax.output.masks import read_labels
-from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 
 class RecordedBodies:
@@ -27,11 +27,11 @@ class RecordedBodies:
         self._folder = folder
         self._rows: dict[str, list[BodyRow]] = {}
         for row in read_bodies(folder / BODIES):
-            self._rows.setdefault(_key(row.timestamp), []).append(row)
+            self._rows.setdefault(stamp_name(row.timestamp), []).append(row)
         self._odometry: dict[str, np.ndarray] = {}
         if (folder / ODOMETRY).exists():  # bodies are told in its world, steps in the one that loops corrected
             odometry = Trajectory.read_tum(folder / ODOMETRY)
-            self._odometry = dict(zip(map(_key, odometry.timestamps), odometry.world_T_camera, strict=True))
+            self._odometry = dict(zip(map(stamp_name, odometry.timestamps), odometry.world_T_camera, strict=True))
 
     def restore(self, step: Step) -> Step:
         """A step with its bodies, in the world of its pose.
@@ -39,11 +39,11 @@ class RecordedBodies:
         Raises:
             GavoError: The image of where they are cannot be read.
         """
-        rows = self._rows.get(_key(step.timestamp), [])
+        rows = self._rows.get(stamp_name(step.timestamp), [])
         labels = read_labels(self._folder, step.timestamp) if rows else None
         if labels is None:
             return step
-        before = self._odometry.get(_key(step.timestamp), step.world_T_camera)
+        before = self._odometry.get(stamp_name(step.timestamp), step.world_T_camera)
         bodies = (_body(row, labels).moved(step.world_T_camera @ inverse(before)) for row in rows)
         return replace(step, bodies=tuple(bodies))
 
@@ -52,7 +52,3 @@ def _body(row: BodyRow, labels: np.ndarray) -> Body:
     height, width = labels.shape
     field = np.where(labels == row.body, np.float32(1.0), np.float32(-1.0))
     return Body(row.body, row.share, row.centroid, row.displacement, row.rotation, None, field, (height, width))
-
-
-def _key(stamp: float) -> str:
-    return f"{stamp:.6f}"

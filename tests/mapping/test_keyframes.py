@@ -32,16 +32,7 @@ from gavo_jax.trajectory import Trajectory, inverse
 
 def test_what_is_found_in_a_segment_that_is_adrift_itself_is_looked_for_further():
     """The search for the world where the run began was over once another stretch had been recognised."""
-    relocaliser = Knows(None)
-    driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=relocaliser)
-    steps = []
-    for i in range(26):
-        frame = replace(WALK[i % len(WALK)], timestamp=i / RATE)
-        if 4 <= i < 8 or 12 <= i < 16:
-            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
-        relocaliser.segment = {16: 1, 17: 1, 18: 0}.get(i)
-        if (step := driver.register(frame, frame.timestamp)) is not None:
-            steps.append(step)
+    steps = covered_twice(26, {16: 1, 17: 1, 18: 0})
     assert [step.segment for step in steps[15:19]] == [1, 1, 0, 0]
     assert [step.origin for step in steps[15:19]] == ["relocalised"] * 3 + ["tracked"]
 
@@ -275,19 +266,23 @@ class Knows:
         return Found(no_alignment(AlignmentStatus.OK), 0.1, pose, self.segment)
 
 
-def test_a_segment_s_number_is_given_once():
-    """Lost, found in the first segment, and lost again: the new stretch had the number of the second."""
-    relocaliser = Knows(0)
+def covered_twice(frames: int, known: dict[int, int]) -> list[Step]:
+    """Steps of a camera that is covered twice, by a map that knows the segments of some frames."""
+    relocaliser, steps = Knows(None), []
     driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=relocaliser)
-    steps = []
-    for i in range(24):
+    for i in range(frames):
         frame = replace(WALK[i % len(WALK)], timestamp=i / RATE)
         if 4 <= i < 8 or 12 <= i < 16:
             frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
-        relocaliser.segment = 0 if i == 10 else None
-        step = driver.register(frame, frame.timestamp)
-        if step is not None:
+        relocaliser.segment = known.get(i)
+        if (step := driver.register(frame, frame.timestamp)) is not None:
             steps.append(step)
+    return steps
+
+
+def test_a_segment_s_number_is_given_once():
+    """Lost, found in the first segment, and lost again: the new stretch had the number of the second."""
+    steps = covered_twice(24, {10: 0})
     trajectory = trajectory_of(0.0, steps)
     assert list(dict.fromkeys(trajectory.segments.tolist())) == [0, 1, 2]
     assert trajectory.segments[10] == 0 and trajectory.segments[-1] == 2
