@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, UInt32
 
+from gavo_jax.bodies.lighting import light_residual
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import Levels, image_plane
 from gavo_jax.image.sampling import INVERSE_DEPTH_STEP, GreySample, Target, look_up, sample_depth, sample_grey
@@ -179,5 +180,10 @@ def compare(
     few = few._replace(inside=few.inside * (jnp.abs(few.depth) < LARGE_DEPTH_RESIDUAL))
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
-    r = r._replace(grey=r.grey_sample.value - brightness.seen(seen_grey))
+    lit = brightness.seen(seen_grey)
+    residual = r.grey_sample.value - lit
+    same = r.inside * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL) * (r.grey_sample.value < SATURATED)
+    shape = (-1, -(-height // stride), -(-width // stride))
+    change = light_residual(*(one.reshape(shape) for one in (residual, lit, same)))
+    r = r._replace(grey=residual - change.reshape(residual.shape))
     return Compared(r, grey, seen_grey, q, (u, v))

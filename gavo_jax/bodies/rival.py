@@ -38,13 +38,13 @@ APART = (0.025, np.radians(1.0))
 AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
 """Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
 away, however many frames are taken meanwhile."""
-DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
+DROPPED_EARLY, LEAST_DOUBT = 0.15, 12.0
 """Seconds after which it is dropped if the first one's motion is within its covariance as often as not."""
 FORGOTTEN = 1.0
 """Seconds after which it counts as clear whose motion the first one's is."""
-LARGEST = 100.0
+LARGEST = 60.0
 """Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ."""
-CONTRADICTED = 30.0
+CONTRADICTED = 18.0
 """The same distance from which on the far part contradicts the first motion."""
 CLEAR, DOUBTFUL = 0.75, 0.5
 """Certainty (that distance over `LARGEST`, at most 1, plus the far part's margin) above which the rival is taken, and
@@ -92,8 +92,8 @@ class Rival(NamedTuple):
     """Motion since the anchor by the first search."""
     rival_T_anchor: Float[np.ndarray, "4 4"]
     """Motion since the anchor by the rival's search."""
-    vaguest: Float[np.ndarray, "6 6"]
-    """Covariance of the rival's motion where it was known least well since the anchor; see `_in_target`."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Of the rival's motion since the anchor, by a step on the target's side: errors of its frames add up."""
     age: Span
     """Time since the anchor."""
     ahead: Any
@@ -183,8 +183,9 @@ class WithRival:
         first = np.asarray(attempt.result.target_T_reference) @ before
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = float(rival.age.seconds)
-        vaguest = max(rival.vaguest, _in_target(other.result), key=np.trace)
-        contradiction = _distance(first, second, _in_target(attempt.result) + vaguest)
+        onward = np.asarray(other.result.target_T_reference, np.float64)
+        covariance = _in_target(other.result) + transport_covariance(onward, np.float64(rival.covariance))
+        contradiction = _distance(first, second, _in_target(attempt.result) + covariance)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
             return attempt._replace(state=self._alone(attempt.state, open_for))
@@ -215,7 +216,7 @@ class WithRival:
             state=other.state,
             first_T_anchor=first.astype(np.float32),
             rival_T_anchor=second.astype(np.float32),
-            vaguest=np.asarray(vaguest, np.float32),
+            covariance=np.asarray(covariance, np.float32),
             ahead=np.int32(ahead),
         )
         return attempt._replace(state=RivalledState(attempt.state, after, open_for))

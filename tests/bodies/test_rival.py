@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -116,6 +117,16 @@ def test_where_nothing_moves_a_rival_changes_nothing(data_dir: Path, clip: str) 
     for step, other in zip(with_rival, without, strict=True):
         assert (step.world_T_camera == other.world_T_camera).all()
         assert step.alignment.findings == other.alignment.findings == 0
+
+
+def test_a_rival_that_sees_little_of_a_blurred_image_is_not_the_camera(data_dir: Path) -> None:
+    """Its first errors stayed, its covariance was that of one frame, and so it seemed to contradict the first motion."""
+    clip = TumSequence(data_dir / "fr1_rpy")
+    odometry = Odometry(clip.camera, preset("ga", "fast"))
+    for frame in (clip[index] for index in range(20)):
+        blurred = replace(frame, grey=cv2.GaussianBlur(frame.grey, (0, 0), 4.0))
+        step = odometry.register(blurred, frame.timestamp)
+        assert step is None or AlignmentStatus.MOVING_BODY not in step.alignment.statuses
 
 
 def steps_of(sequence: Sequence, aligner: Any) -> list[Step]:
