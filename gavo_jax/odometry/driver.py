@@ -227,8 +227,10 @@ class Odometry:
                 unknown=0,
                 beginning=None,
             )
+            new_T_old = found.world_T_camera @ inverse(outcome.after.world_T_camera)
+            # what a lost search took for a body did not fit a motion that was wrong
+            bodies = () if lost else tuple(body.moved(new_T_old) for body in bodies)
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
-            bodies = tuple(body.moved(found.world_T_camera @ inverse(outcome.after.world_T_camera)) for body in bodies)
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:
