@@ -3,6 +3,7 @@
 It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
@@ -17,7 +18,7 @@ from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
@@ -168,6 +169,9 @@ class Odometry:
         require_camera(camera)
         self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
+        if self.settings.odometry.loops and relocaliser is None:
+            fault = "a driver that is fed frame by frame keeps no map and closes no loops: run_odometry does"
+            warnings.warn(f"odometry.loops: {fault}", GavoWarning, stacklevel=3)
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
