@@ -105,7 +105,8 @@ class OdometryOptions:
         bodies: Whether what moves on its own is left out of the search: `off` no, `mask` yes; `track` finds each body's
             own motion, too. See docs/bodies.md.
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
-        loops: Whether a map of keyframes is kept, which closes loops: the trajectory is then corrected by them.
+        loops: Whether `run_odometry` and the command keep a map of keyframes, which closes loops: the trajectory is
+            then corrected by them. Frames that are given to an `Odometry` one by one have no map.
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Compare
-from gavo_jax.cli.run_table import path_and_end, why_no_drift
+from gavo_jax.cli.run_table import covered_in_part, path_and_end, why_no_drift
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -161,6 +161,8 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
         if reason := why_no_drift(entry.metrics, entry.trajectory, sequence.ground_truth is not None):
             say(reason)
             break
+    if _drifts(entries) and (part := covered_in_part(typical[0].trajectory, sequence.ground_truth)):
+        say(part)
     with waiting("drawing figures …"):
         pictures = _draw(entries, typical, sequence, folder)
     write_report(

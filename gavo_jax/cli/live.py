@@ -73,7 +73,7 @@ def run_live(options: Run) -> int:
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        print_run(name, metrics, folder.path, trajectory, has_truth=False)
+        print_run(name, metrics, folder.path, trajectory, truth=None)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
     say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")

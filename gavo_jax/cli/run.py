@@ -98,11 +98,11 @@ def run(options: Run) -> int:
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-        has_truth, is_rendered = sequence.ground_truth is not None, options.sequence == SYNTHETIC
-        print_run(name, metrics, folder.path, trajectory, has_truth=has_truth, is_rendered=is_rendered)
+        truth, is_rendered = sequence.ground_truth, options.sequence == SYNTHETIC
+        print_run(name, metrics, folder.path, trajectory, truth=truth, is_rendered=is_rendered)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
-    if sequence.ground_truth is not None and is_w_first(sequence.ground_truth, trajectory):
+    if truth is not None and is_w_first(truth, trajectory):
         say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
     if interrupted:
         return INTERRUPTED
@@ -189,7 +189,7 @@ def _track(
             mapper,
             tracked.seconds,
             tracked.compile_seconds,
-            len(tracked.steps) + 1,
+            len(tracked.steps),
         )
     )
     if outcome.loops is not None:

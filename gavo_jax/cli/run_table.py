@@ -60,7 +60,7 @@ def print_run(
     folder: Path,
     trajectory: Trajectory,
     *,
-    has_truth: bool,
+    truth: Trajectory | None,
     is_rendered: bool = False,
 ) -> None:
     """Print the table of a run and where its files are.
@@ -70,7 +70,7 @@ def print_run(
         metrics: as in metrics.json.
         folder: the run's.
         trajectory: as its file has it.
-        has_truth: whether the sequence has a ground truth.
+        truth: that of the sequence; None where it has none.
         is_rendered: whether its frames are those of the synthetic room.
     """
     known = [row for row in ERRORS + BEFORE_LOOPS if metrics.get(row[1]) is not None]
@@ -92,8 +92,10 @@ def print_run(
         rows.append(("segments, the motion between them unknown", str(metrics["segments"]), ""))
     rows += _of_bodies(folder / BODIES)
     print_table(name, ("", "", "unit"), rows)
-    if reason := why_no_drift(metrics, trajectory, has_truth):
+    if reason := why_no_drift(metrics, trajectory, truth is not None):
         say(reason if known else f"{reason} The table has what the trajectory itself tells.")
+    if known and (part := covered_in_part(trajectory, truth)):
+        say(part)
     say(f"files in {folder}")
 
 
@@ -154,3 +156,13 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
     if apart > 1:
         return f"No drift over 1 s: the frames are {apart:.2f} s apart; see the errors per frame and of the whole run."
     return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart: see the other errors."
+
+
+def covered_in_part(trajectory: Trajectory, truth: Trajectory | None) -> str | None:
+    """One sentence where the truth covers only some of the poses: no error tells of the others."""
+    if truth is None:
+        return None
+    covered = int(np.count_nonzero(truth.interpolate(trajectory.timestamps)[1]))
+    if covered in (0, len(trajectory)):
+        return None
+    return f"The ground truth covers {covered} of {len(trajectory)} poses: errors are of these, up to the last of them."

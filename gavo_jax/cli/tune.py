@@ -5,6 +5,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gavo_jax import presets
 from gavo_jax.cli.options import Tune
 from gavo_jax.compilation_cache import enable_compilation_cache
@@ -40,7 +42,8 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     say(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {without_password(storage)}")
 
     def show(trial: int, drift: float, milliseconds: float) -> None:
-        say(f"trial {trial}: {number(drift, 5)} m/s, {number(milliseconds, 1)} ms/pair")
+        drifts = f"{number(drift, 5)} m/s" if np.isfinite(drift) else "lost the camera"
+        say(f"trial {trial}: {drifts}, {number(milliseconds, 1)} ms/pair")
 
     try:
         front = search(tuning, storage, trials, show)

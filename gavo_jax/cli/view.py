@@ -1,7 +1,7 @@
 """`gavo view`: a finished run in the viewer."""
 
 from contextlib import nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,7 @@ def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry
     """Return the driver of the run, or None, with a line that says why, where config.json does not tell it."""
     try:
         settings = load_settings(folder / CONFIG).settings
+        settings = replace(settings, odometry=replace(settings.odometry, loops=False))  # the run has found its own
         seed = int(run.config["options"]["seed"])
         return Odometry(sequence.camera, settings, seed=seed, record=True)
     except (GavoError, KeyError, TypeError, ValueError) as error:
@@ -77,11 +78,19 @@ def _show_with_search(
     with pair_progress("the search", len(recorded)) as bar:
         interruptible(odometry.warm_up)
         for step in track(sequence[: len(recorded) + 1], odometry=odometry, watch=watch):
-            before, now = (s.alignment.target_T_reference for s in (recorded[step.index], step))
-            apart = max(apart, float(np.linalg.norm(np.asarray(now - before)[:3, 3])))
+            if _is_of_the_search(recorded[step.index]):
+                before, now = (s.alignment.target_T_reference for s in (recorded[step.index], step))
+                apart = max(apart, float(np.linalg.norm(np.asarray(now - before)[:3, 3])))
             bar.advance()
     if apart > SAME:
         tell(f"the search, done once more, comes out up to {1e3 * apart:.1f} mm elsewhere than that of the run")
+
+
+def _is_of_the_search(step: Step) -> bool:
+    """Whether a step's motion in the run's files is the search's: of a lost pair they have what was recorded instead,
+    and a relocalised one is from a keyframe of the map.
+    """
+    return not step.lost and step.origin != "relocalised"
 
 
 SAME = 1e-3

@@ -210,16 +210,17 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
         for choice in itertools.product(*swept.values()):
             values = fixed | dict(zip(swept, choice, strict=True))
             settings = override(presets.preset(method, preset), values, place)
-            if settings.odometry.loops:
-                _require_loops(place)
+            require_what_loops_need(place, settings)
             text = ", ".join(f"{name.partition('.')[2]}={_short(value)}" for name, value in values.items())
             variants.append(_Variant(method, preset, text, settings, seeds, printed))
     return variants
 
 
-def _require_loops(place: str) -> None:
+def require_what_loops_need(place: str, settings: Settings) -> None:
+    """Raise GavoError for settings with loops where GTSAM is not installed, before anything runs."""
     try:
-        require_gtsam()
+        if settings.odometry.loops:
+            require_gtsam()
     except GavoError as error:
         raise GavoError(f"{place}: {error}") from None
 

@@ -16,7 +16,7 @@ from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, read_toml, shown
 from gavo_jax.experiments.plan import Part, frames_of
-from gavo_jax.experiments.plan_file import parts_of
+from gavo_jax.experiments.plan_file import parts_of, require_what_loops_need
 from gavo_jax.experiments.values import seeds_of, text_of, whole_of
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS
@@ -90,7 +90,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     for key, spec in space.items():
         place = f"{path}: space.{key}"
         for bound in _bounds(place, spec):
-            override(start, {key: bound}, place)
+            require_what_loops_need(place, override(start, {key: bound}, place))
         if isinstance(spec, Mapping) and takes_whole(start, key) and not isinstance(spec.get("step", 1), int):
             raise GavoError(f"{place}: step: must be a whole number, not {shown(spec['step'])}")
     return Tuning(
@@ -139,7 +139,7 @@ def tune(
         with _storage_faults(told):
             if len(_finished(optuna, study)) >= trials:
                 front = [Choice(t.number, t.values[0], t.values[1], dict(t.params)) for t in study.best_trials]
-                return sorted(front, key=lambda choice: choice.milliseconds)
+                return sorted(_tracked(tuning, front), key=lambda choice: choice.milliseconds)
             trial = study.ask()
         try:
             with _storage_faults(told):
@@ -218,7 +218,8 @@ def _refuse_without_drift(name: str, sequence: FrameSequence) -> None:
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:
-    """Geometric means of drift (m/s) and of the median time per pair (ms), run by run: nothing shares the machine.
+    """Geometric means of drift (m/s) and of the median time per pair (ms), run by run: nothing shares the machine. The
+    drift is infinite where the camera was lost before a second of any stretch was over.
 
     Raises:
         GavoError: no ground truth over a second of a sequence.
@@ -226,12 +227,21 @@ def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int
     figures = []
     for sequence in sequences:
         for seed in seeds:
-            run = run_odometry(sequence, settings, seed=seed)
-            if run.metrics[DRIFT] is None:
+            metrics = run_odometry(sequence, settings, seed=seed).metrics
+            drift, is_whole = metrics[DRIFT], metrics["segments"] == 1 and metrics["complete"]
+            if drift is None and is_whole:
                 raise GavoError(f"{sequence.name}: no ground truth over a second of it")
-            figures.append((run.metrics[DRIFT], run.metrics[MILLISECONDS]))
+            figures.append((np.inf if drift is None else drift, metrics[MILLISECONDS]))
     drift, milliseconds = np.exp(np.mean(np.log(figures), axis=0))
     return float(drift), float(milliseconds)
+
+
+def _tracked(tuning: Tuning, front: list[Choice]) -> list[Choice]:
+    """The choices of a front that do not lose the camera; one that does may be the fastest of all."""
+    kept = [choice for choice in front if np.isfinite(choice.drift)]
+    if not kept:
+        raise GavoError(f"{tuning.name}: every trial lost the camera within a second: no drift to choose by")
+    return kept
 
 
 def _finished(optuna: Any, study: Any) -> list[Any]:

@@ -22,6 +22,8 @@ SPACING = 0.15
 SMALLER = 3
 """Pyramid level, from the keyframe's images, of the small blurred image that tells whether two keyframes look alike
 (Klein and Murray, ECCV 2008); 40 x 30 pixels of a frame of 640 x 480."""
+FEWEST_PIXELS = 60
+"""Of that image; it is of a finer level where frames are smaller than about 150 x 110."""
 BLUR = 1.0
 """Standard deviation of that image's blur, in its pixels."""
 NEAREST = 0.05
@@ -44,7 +46,8 @@ class Thumbnail(NamedTuple):
     @classmethod
     def of(cls, images: Still, camera: Camera) -> Self:
         """That of a keyframe's images, and their camera."""
-        tiny, side = camera.level(SMALLER), 2**SMALLER
+        level = level_of_thumbnail(camera)
+        tiny, side = camera.level(level), 2**level
         small = cv2.resize(images.grey, (tiny.width, tiny.height), interpolation=cv2.INTER_AREA).astype(np.float32)
         small = cv2.GaussianBlur(small, (0, 0), BLUR)
         depth = images.depth[side // 2 :: side, side // 2 :: side][: tiny.height, : tiny.width]
@@ -72,7 +75,7 @@ class Thumbnail(NamedTuple):
             Share of the points that it sees, and the correlation of their grey in the two; 0 where too few are seen.
         """
         seen = other_T_self[:3, :3] @ self.points + other_T_self[:3, 3:]
-        tiny, z = camera.level(SMALLER), np.where(seen[2] > NEAREST, seen[2], 1.0)
+        tiny, z = camera.level(level_of_thumbnail(camera)), np.where(seen[2] > NEAREST, seen[2], 1.0)
         u, v = to_pixels(tiny, seen[0], seen[1], 1.0 / z)
         inside = (seen[2] > NEAREST) & (u >= 0) & (u <= tiny.width - 1) & (v >= 0) & (v <= tiny.height - 1)
         if inside.sum() < FEWEST:
@@ -80,6 +83,12 @@ class Thumbnail(NamedTuple):
         column, row = (axis[inside].astype(np.float32)[None] for axis in (u, v))
         there = cv2.remap(other.small, column, row, cv2.INTER_LINEAR)[0]
         return float(inside.mean()), correlation(self.grey[inside], there)
+
+
+def level_of_thumbnail(camera: Camera) -> int:
+    """Pyramid level of the small image, from the images of keyframes of a camera."""
+    coarse_to_fine = range(SMALLER, 0, -1)
+    return next((k for k in coarse_to_fine if (camera.width >> k) * (camera.height >> k) >= FEWEST_PIXELS), 0)
 
 
 NOTHING_SEEN = Thumbnail(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zeros(0, np.float32))

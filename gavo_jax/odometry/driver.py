@@ -3,6 +3,7 @@
 It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
@@ -17,7 +18,7 @@ from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
@@ -168,6 +169,9 @@ class Odometry:
         require_camera(camera)
         self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)
+        if self.settings.odometry.loops and relocaliser is None:
+            fault = "a driver that is fed frame by frame keeps no map and closes no loops: run_odometry does"
+            warnings.warn(f"odometry.loops: {fault}", GavoWarning, stacklevel=3)
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
@@ -227,8 +231,10 @@ class Odometry:
                 unknown=0,
                 beginning=None,
             )
+            new_T_old = found.world_T_camera @ inverse(outcome.after.world_T_camera)
+            # what a lost search took for a body did not fit a motion that was wrong
+            bodies = () if lost else tuple(body.moved(new_T_old) for body in bodies)
             result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
-            bodies = tuple(body.moved(found.world_T_camera @ inverse(outcome.after.world_T_camera)) for body in bodies)
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:

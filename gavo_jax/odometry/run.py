@@ -143,7 +143,7 @@ def conclude(
     mapper: BackgroundMapper | None,
     seconds: float,
     compile_seconds: float,
-    frames: int | None = None,
+    pairs: int | None = None,
 ) -> RunOutcome:
     """Look back on a run whose last frame was tracked: hindsight, then loops, then figures.
 
@@ -154,7 +154,7 @@ def conclude(
         mapper: What kept the run's map: it is finished here.
         seconds: Wall time of the tracking, decoding included, compilation left out.
         compile_seconds: Time of the compilation.
-        frames: How many were tracked in that time, where it was not all: the run was resumed.
+        pairs: How many were tracked in that time, where it was not all: the run was resumed. Of none no speed is known.
     """
     start = time.perf_counter()
     steps = revised(steps)
@@ -162,9 +162,9 @@ def conclude(
     loops = mapper.finish(steps) if mapper else None
     if loops is not None:
         trajectory = correct(causal, loops, doubts_of(steps))
-    seconds += time.perf_counter() - start
-    if frames is not None:
-        seconds *= (len(steps) + 1) / frames  # as if all had been tracked at this speed
+    ending = time.perf_counter() - start
+    share = 1.0 if pairs is None else pairs / max(len(steps), 1)
+    seconds = seconds / share + ending if share else 0.0  # as if all had been tracked at this speed
 
     def figures(of: Trajectory) -> dict[str, Any]:
         return {**compute_metrics(of, ground_truth, steps, seconds, compile_seconds)}

@@ -120,7 +120,7 @@ def test_where_nothing_moves_a_rival_changes_nothing(data_dir: Path, clip: str) 
 
 
 def test_a_rival_that_sees_little_of_a_blurred_image_is_not_the_camera(data_dir: Path) -> None:
-    """Its first errors stayed, its covariance was that of one frame, and so it seemed to contradict the first motion."""
+    """Its first errors stayed, its covariance was one frame's, and so it seemed to contradict the first motion."""
     clip = TumSequence(data_dir / "fr1_rpy")
     odometry = Odometry(clip.camera, preset("ga", "fast"))
     for frame in (clip[index] for index in range(20)):

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -17,19 +18,22 @@ from small import CAMERA
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
-from gavo_jax.cli import compare, options
+from gavo_jax.cli import compare, options, view
 from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.cli.usage import COMMANDS
 from gavo_jax.datasets.sensor_noise import KINECT
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.evaluation import relative_pose_error
+from gavo_jax.odometry.driver import Step
 from gavo_jax.output import tracked
 from gavo_jax.output.files import json_text
 from gavo_jax.output.frames import FRAME_COLUMNS, read_run
 from gavo_jax.presets import METHODS, PRESETS
+from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.viewer.base import NO_VIEWER
 
 METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_translation_rmse_m_per_s
 rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
@@ -589,6 +593,25 @@ def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     done = gavo("view", "../out", "--viewer", "save")
     assert done.status == 0 and done.err.count("\n") == 1 and "no such folder" in done.err
     assert 0 < (tmp_path / "out" / "view.rrd").stat().st_size < whole / 2
+
+
+@pytest.mark.parametrize(("lost", "origin"), [(True, "guessed"), (False, "relocalised"), (False, "tracked")])
+def test_view_compares_motions_of_the_search_alone(monkeypatch, capsys, lost, origin):
+    """Of a lost pair the files have what was recorded, of a relocalised one the way from a keyframe: it was said that
+    the search comes out elsewhere.
+    """
+    found = no_alignment(AlignmentStatus.OK)._replace(target_T_reference=exp(np.full(6, 0.1)))
+    [recorded, now] = [
+        Step(1, 0.0, 0.1, alignment, np.eye(4), 1.0, lost, origin=origin)
+        for alignment in (no_alignment(AlignmentStatus.OK), found)
+    ]
+    monkeypatch.setattr(view, "track", lambda *_, **__: iter([now]))
+    monkeypatch.setattr(view, "enable_compilation_cache", lambda: None)
+    run: Any = SimpleNamespace(steps=[recorded])
+    driver: Any = SimpleNamespace(warm_up=lambda: 0.0)
+    unmoved: Any = None
+    view._show_with_search(run, unmoved, SyntheticSequence(2), driver, NO_VIEWER)
+    assert ("elsewhere" in capsys.readouterr().err) == (origin == "tracked")
 
 
 @pytest.mark.usefixtures("undrawn")

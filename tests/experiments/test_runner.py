@@ -1,11 +1,13 @@
 """From a file to a table: resumed, interrupted, reported; and tuned."""
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gavo_jax import presets
@@ -194,6 +196,21 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
     assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
 
 
+@pytest.mark.parametrize("drifts", [(np.inf, 0.1, np.inf), (np.inf,)])
+def test_a_trial_that_loses_the_camera_is_one_of_many(tuned, tmp_path, capsys, monkeypatch, drifts):
+    """It ended the study, which said that there was no ground truth."""
+    told = iter(zip(drifts, (1.0, 3.0, 2.0), strict=False))
+    monkeypatch.setattr(tuning, "measure", lambda *_: next(told))
+    command = ["tune", str(tuned), "--output", str(tmp_path / "study"), "--trials", str(len(drifts))]
+    assert main(command) == (0 if len(drifts) > 1 else 2)
+    words = capsys.readouterr()
+    assert "trial 0: lost the camera, 1.0 ms/pair" in words.out
+    if len(drifts) > 1:
+        assert [choice["trial"] for choice in json.loads((tmp_path / "study" / "front.json").read_text())] == [1]
+    else:
+        assert "every trial lost the camera" in words.err and words.err.count("\n") == 1
+
+
 def test_an_interrupted_study_says_how_it_goes_on(tuned, tmp_path, capsys, monkeypatch):
     def stopped(*arguments: object) -> None:
         raise KeyboardInterrupt
@@ -234,6 +251,21 @@ def test_what_a_trial_measures(tuned):
     preset = override(presets.preset("gauss-newton"), SMALL)
     drift, milliseconds = measure([read_tuning(tuned).parts[0].open()], preset, (0,))
     assert 0 < drift < 0.5 and milliseconds > 0
+
+
+def test_what_a_trial_measures_of_a_camera_that_is_lost(tuned):
+    preset = override(presets.preset("gauss-newton"), SMALL | {"alignment.min_overlap": 1.0})
+    drift, _ = measure([read_tuning(tuned).parts[0].open()], preset, (0,))
+    assert drift == np.inf
+
+
+def test_loops_are_not_tuned_without_what_they_need(tuned, monkeypatch):
+    """The first trial with them ended the study."""
+    tuned.write_text(tuned.read_text() + "odometry.loops = [false, true]\n")
+    assert read_tuning(tuned).space["odometry.loops"] == [False, True]
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(GavoError, match=r"space.odometry.loops: loops need GTSAM: pip install"):
+        read_tuning(tuned)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment, with_finding
-from gavo_jax.bodies.records import Body
+from gavo_jax.bodies.records import Body, Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.sensor_noise import NONE
@@ -35,6 +35,17 @@ def test_what_is_found_in_a_segment_that_is_adrift_itself_is_looked_for_further(
     steps = covered_twice(26, {16: 1, 17: 1, 18: 0})
     assert [step.segment for step in steps[15:19]] == [1, 1, 0, 0]
     assert [step.origin for step in steps[15:19]] == ["relocalised"] * 3 + ["tracked"]
+
+
+@pytest.mark.parametrize(("width", "height"), [(160, 120), (80, 60), (40, 32), (16, 16)])
+def test_keyframes_of_images_of_any_size_can_be_compared(width: int, height: int):
+    """Of images below 112 x 80 the small image had too few pixels: no loop was ever found, without a word."""
+    camera = Camera(0.8 * width, 0.8 * width, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    frame = SyntheticSequence(1, camera=camera)[0]
+    keyframes = Keyframes(camera)
+    one, other = (keyframes.make(frame, index, 0, np.eye(4), np.zeros(6)) for index in range(2))
+    share, correlation = one.thumbnail.agreement(other.thumbnail, np.eye(4), keyframes.camera)
+    assert share > 0.6 and correlation > 0.99
 
 
 def test_segments_are_tied_over_others():
@@ -230,10 +241,10 @@ def test_loops_bring_the_end_back_to_where_it_was():
 
 
 class Sure:
-    """An aligner that finds no motion of dark frames or of what comes right after them."""
+    """An aligner that finds no motion of dark frames or of what comes right after them, and the same bodies always."""
 
-    def __init__(self):
-        self.was_dark = False
+    def __init__(self, bodies: tuple[Seen, ...] = ()):
+        self.bodies = bodies
 
     def warm_up(self) -> float:
         return 0.0
@@ -247,7 +258,7 @@ class Sure:
     def align(self, state: Any, frame: Frame, clock: Any) -> Attempt:
         status = AlignmentStatus.HIGH_ERROR if clock.elapsed > 1.5 / RATE else AlignmentStatus.OK
         result = no_alignment(status)._replace(overlap=np.float32(1.0), error=np.float32(1.0))
-        return Attempt(0, result, status is AlignmentStatus.OK)
+        return Attempt(0, result, status is AlignmentStatus.OK, bodies=self.bodies)
 
 
 class Knows:
@@ -288,6 +299,22 @@ def test_a_segment_s_number_is_given_once():
     assert trajectory.segments[10] == 0 and trajectory.segments[-1] == 2
     metrics = compute_metrics(trajectory, None, steps, 1.0, 0.0)
     assert metrics["segments"] == 3 and metrics["unknown_motions"] == 3
+
+
+@pytest.mark.parametrize("found_at", [8, 9])
+def test_a_frame_that_is_found_shows_no_body_of_a_search_that_failed(found_at: int):
+    """Nearly all of the first frame after a loss was masked: to the wrong motion the scene is what moves."""
+    relocaliser = Knows(None)
+    aligner = Sure((Seen(1, np.ones((3, 4), np.float32), 0.9, np.zeros(3)),))
+    driver, step = Odometry(CAMERA, Settings(), aligner=aligner, relocaliser=relocaliser), None
+    for i in range(found_at + 1):
+        frame = replace(WALK[i], timestamp=i / RATE)
+        if 4 <= i < 8:
+            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        relocaliser.segment = 0 if i == found_at else None
+        step = driver.register(frame, frame.timestamp)
+    assert step is not None and step.origin == "relocalised"
+    assert len(step.bodies) == (0 if found_at == 8 else 1), "the next one's is seen by a motion that holds"
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -2,6 +2,7 @@
 
 import gc
 import threading
+import time
 import tracemalloc
 import weakref
 from collections.abc import Callable
@@ -26,14 +27,16 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.sensor_noise import NONE
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.warp import Points
+from gavo_jax.mapping.mapper import Loops
+from gavo_jax.mapping.pose_graph import Solution
 from gavo_jax.objective.points import make_references, move_reference
 from gavo_jax.odometry.aligners import BEGINNING, Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step, rectified
 from gavo_jax.odometry.metrics import compute_metrics
-from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
+from gavo_jax.odometry.run import OdometryRun, conclude, run_odometry, trajectory_of
 from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering, blank_of, wide_search
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
@@ -240,6 +243,35 @@ def test_metrics(plain_run: OdometryRun, sequence: SyntheticSequence) -> None:
     assert metrics["rpe_translation_rmse_m_per_s"] is None, "the sequence is shorter than a second"
     for key in ("compile_seconds", "milliseconds_per_pair_median", "frames_per_second"):
         assert known(metrics[key]) > 0
+
+
+def test_a_driver_alone_says_that_it_closes_no_loops(sequence: SyntheticSequence) -> None:
+    """It took `loops` without a word, and made no map."""
+    settings = replace(SEARCH_ALONE, odometry=replace(PLAIN, loops=True))
+    with pytest.warns(GavoWarning, match="closes no loops: run_odometry does"):
+        Odometry(CAMERA, settings)
+
+
+class SlowlyMapped:
+    """A map without keyframes that takes its time in the end."""
+
+    def finish(self, steps: list[Step]) -> Loops:
+        time.sleep(0.3)
+        return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
+
+
+def test_a_resumed_run_is_as_fast_as_what_was_tracked_of_it(plain_run: OdometryRun) -> None:
+    """What comes at the end once was counted as often as pairs had been tracked before."""
+
+    def speed(seconds: float, pairs: int, mapper: Any = None) -> float | None:
+        outcome = conclude(0.0, plain_run.steps, None, mapper, seconds, 0.0, pairs)
+        return outcome.figures["frames_per_second"]
+
+    pairs = len(plain_run.steps)
+    assert speed(20.0, pairs) == pytest.approx((pairs + 1) / 20.0, rel=0.01)
+    assert speed(20.0 / pairs, 1) == pytest.approx((pairs + 1) / 20.0, rel=0.01)
+    assert known(speed(20.0 / pairs, 1, SlowlyMapped())) == pytest.approx((pairs + 1) / 20.3, rel=0.02)
+    assert speed(1e-4, 0) is None, "nothing was tracked: nothing is known"
 
 
 def test_without_ground_truth_there_are_no_errors(sequence: SyntheticSequence) -> None:

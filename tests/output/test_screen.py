@@ -63,7 +63,7 @@ def test_a_run_tells_of_the_bodies_it_saw(
     rows = [(stamp, number, share) for stamp, number, share in zip(stamps, numbers, shares, strict=False)]
     lines = [",".join([*row, *["0"] * 9, "seen"]) for row in rows]
     (tmp_path / "bodies.csv").write_text("\n".join([",".join(BODY_COLUMNS), *lines]) + "\n")
-    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), has_truth=False)
+    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), truth=None)
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table}
     if shares:
@@ -91,7 +91,7 @@ def test_a_run_tells_whether_images_or_depth_were_frozen(tmp_path: Path, capsys:
         {"statuses": {"frozen": 3, "ok": 1, "gap": 1}},
         tmp_path,
         Trajectory.read_tum(tmp_path / "trajectory.txt"),
-        has_truth=False,
+        truth=None,
     )
     [table] = boxes(capsys.readouterr().out)
     told = {row[0]: row[1] for row in table if row[0].startswith("pairs:")}
@@ -108,8 +108,21 @@ def test_of_the_end_nothing_is_said_where_the_way_there_is_unknown(
 ) -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     Trajectory(np.arange(2.0), poses, np.array(segments)).write_tum(tmp_path / "trajectory.txt")
-    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), has_truth=False)
+    print_run("run", {}, tmp_path, Trajectory.read_tum(tmp_path / "trajectory.txt"), truth=None)
     assert ("end: turned by" in capsys.readouterr().out) == (segments == (0, 0))
+
+
+@pytest.mark.parametrize(("ends", "words"), [(1.5, "covers 2 of 4 poses"), (3.0, None)])
+def test_a_truth_of_part_of_the_poses_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], ends: float, words: str | None
+) -> None:
+    """The distance error at the end was that of another pose than the last one, without a word."""
+    trajectory = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
+    stamps = np.linspace(0.0, ends, 31)
+    truth = Trajectory(stamps, np.tile(np.eye(4), (len(stamps), 1, 1)))
+    print_run("run", {"distance_error_final_m": 0.0}, tmp_path, trajectory, truth=truth)
+    printed = capsys.readouterr().out
+    assert "of 4 poses" not in printed if words is None else words in printed
 
 
 LONG = "clip: a folder of frames, 40 frames of 640x480; camera fx 517.3 fy 516.5 cx 318.6 cy 255.3 (file); depth in mm"
