@@ -58,6 +58,8 @@ SCOUT_RANGE = (0.5, 2.0)
 """Factors on the scouts' translations, from the first one to the last."""
 SCOUTED_POINTS = 480
 """Points of a frame that a scout's evidence is taken on."""
+LEAST_ERROR = 1e-6
+"""Squared grey levels that the best error counts as at least, where a rival's is compared with it."""
 SCOUTS_AT_ONCE = 32
 """Motions whose evidence is taken side by side."""
 
@@ -311,7 +313,10 @@ def _search_level(
         total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
         errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
     order = best_distinct(found, errors, places)
-    rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
+    rival = search.rival
+    if places > 1:
+        ratio = rival_error(found, errors, order[0]) / jnp.maximum(errors[order[0]], LEAST_ERROR)
+        rival = jnp.where(level.islands > 1, ratio, rival)
     search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
     return search, (history[order[0]], population)
 
