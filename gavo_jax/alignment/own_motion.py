@@ -19,7 +19,7 @@ from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.settling import filled_inverse_depth, pixel_flow
 from gavo_jax.image.shutter import row_time
 from gavo_jax.se3 import log
-from gavo_jax.status import GRAVITY, AlignmentStatus, bit
+from gavo_jax.status import AlignmentStatus, bit, gravest
 from gavo_jax.trajectory import inverse
 
 USUAL_SPEED = (0.5, 1.0)
@@ -206,14 +206,13 @@ def with_own_motion(result: Alignment, found: OwnMotion) -> Alignment:
     motion = found.target_T_reference
     variance = np.diag(found.covariance)
     most = np.repeat(np.square([MAX_TRANSLATION_DEVIATION, MAX_ROTATION_DEVIATION]), 3)
-    is_vague = not np.all((variance >= 0) & (variance <= most))
     findings = int(result.findings) & ~bit(AlignmentStatus.LOW_TEXTURE)
-    findings |= bit(AlignmentStatus.LOW_TEXTURE) if is_vague else 0
-    status = [status for status in GRAVITY if findings & bit(status)]
+    if not np.all((variance >= 0) & (variance <= most)):
+        findings |= bit(AlignmentStatus.LOW_TEXTURE)
     return result._replace(
         target_T_reference=motion,
         xi=np.asarray(log(jnp.asarray(motion, jnp.float32))),
         covariance=found.covariance.astype(np.float32),
         findings=np.int32(findings),
-        status=np.int32(status[-1] if status else AlignmentStatus.OK),
+        status=np.int32(gravest(findings)),
     )

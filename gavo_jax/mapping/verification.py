@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment.pairs import Images, align_rows
+from gavo_jax.alignment.pairs import align_rows
 from gavo_jax.alignment.repetition import another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.stacking import Images
 from gavo_jax.camera import Camera
 from gavo_jax.image.settling import Still
 from gavo_jax.mapping.candidates import MOST, LoopCandidate

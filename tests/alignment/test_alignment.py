@@ -16,8 +16,9 @@ from gavo_jax import presets
 from gavo_jax.alignment import pairs
 from gavo_jax.alignment.information import Information
 from gavo_jax.alignment.judgement import Examination, find_against
-from gavo_jax.alignment.pairs import align, align_batch, stacked_images
+from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.stacking import stacked_images
 from gavo_jax.alignment.visits import levels_of, prepare_pair, stack_levels, visited_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
