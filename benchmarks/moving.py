@@ -233,7 +233,7 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
                 score.displacements_mm.append(apart)
                 score.rotations_deg += [] if turned is None else [turned]
 
-    steps = track_visibly(label, sequence, odometry, on_step).concluded(sequence).steps
+    steps = track_visibly(label, sequence, odometry, on_step).outcome(sequence).steps
     if score is not None:
         for error, step in zip(errors, steps, strict=True):
             count(score, error, step.alignment.status != 0)

@@ -58,7 +58,7 @@ class DepthEdges(NamedTuple):
         """Before the first frame."""
         return cls(np.zeros((len(FAULTS), 2 * REACH + 1, 2 * REACH + 1), np.float32))
 
-    def spoken_of(self, pairs: int) -> int:
+    def pairs_covered(self, pairs: int) -> int:
         """Of so many pairs so far, how many of the last its figures speak of."""
         return pairs if self.references <= EARLY + SELDOM else SELDOM
 

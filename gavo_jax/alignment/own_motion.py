@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float64, UInt8, UInt16
 from gavo_jax.alignment.corners import track_corners
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.camera import Camera, to_pixels, to_ray
-from gavo_jax.image.settling import filled_inverse_depth, pixel_flow
+from gavo_jax.image.motion_compensation import filled_inverse_depth, pixel_flow
 from gavo_jax.image.shutter import row_time
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit, gravest

@@ -22,7 +22,7 @@ from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_gr
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, moved
 from gavo_jax.objective.estimates import estimate_scales
-from gavo_jax.objective.points import Reference, make_references, settle_reference
+from gavo_jax.objective.points import Reference, make_references, undo_rolling_shutter
 from gavo_jax.se3 import exp, log, rigid_inverse
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -202,7 +202,7 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         # the target's rows are taken as moving on by the mean velocity; so the reference's move by as much less as the
         # camera really gained between the two
         gained = kinematics.velocity[first + 1] - kinematics.velocity[first]
-        reference = settle_reference(reference, (kinematics.between[first] - gained) * unknowns.readout)
+        reference = undo_rolling_shutter(reference, (kinematics.between[first] - gained) * unknowns.readout)
         share = unknowns.readout / (stretch.stamps[first + 1] - stretch.stamps[first])
         key, guess = jax.random.key(0), kinematics.guesses[first][None]
         found, _ = align_views((reference,), target, seen, levels, SOLVER, OPTIONS, key, guess, readout=share)

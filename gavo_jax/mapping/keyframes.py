@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
-from gavo_jax.image.settling import Still, still
+from gavo_jax.image.motion_compensation import CompensatedImages, compensate_motion
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
@@ -42,7 +42,7 @@ class Thumbnail(NamedTuple):
     """Grey of these pixels."""
 
     @classmethod
-    def of(cls, images: Still, camera: Camera) -> Self:
+    def of(cls, images: CompensatedImages, camera: Camera) -> Self:
         """That of a keyframe's images, and their camera."""
         tiny, side = camera.level(SMALLER), 2**SMALLER
         small = cv2.resize(images.grey, (tiny.width, tiny.height), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -118,7 +118,7 @@ class Keyframe:
     world_T_odometry: Float64[np.ndarray, "4 4"]
     world_T_camera: Float64[np.ndarray, "4 4"]
     step: Float64[np.ndarray, "6 6"] | None
-    images: Still | None
+    images: CompensatedImages | None
     thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Earlier keyframes that it was aligned with, by number, with the guess of that."""
@@ -187,7 +187,7 @@ class Keyframes:
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """
         delay = frame.depth_delay
-        images = still(frame.grey, frame.depth, self.full, twist, delay)
+        images = compensate_motion(frame.grey, frame.depth, self.full, twist, delay)
         return Keyframe(
             number=len(self.all),
             index=index,

@@ -56,7 +56,7 @@ def linearization(
     objective: Objective, tangent: Float[Array, "6 6"], sums: jax.Array, gradient: jax.Array, hessian: jax.Array
 ) -> Linearization:
     """E and its derivatives from sums over the points: of costs and points inside, and of the normal equations."""
-    error, overlap = objective.conclude(sums)
+    error, overlap = objective.error_and_overlap(sums)
     factor = 2.0 / objective.divisor(sums[1])
     return Linearization(error, overlap, factor * tangent.T @ gradient, factor * tangent.T @ hessian @ tangent)
 

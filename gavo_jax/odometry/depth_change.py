@@ -60,7 +60,7 @@ class DepthChange(NamedTuple):
         """Whether the motions explain the change of depth hardly better than rest."""
         return self.usually_left > MOST_LEFT
 
-    def spoken_of(self, pairs: int) -> int:
+    def pairs_covered(self, pairs: int) -> int:
         """Of so many pairs so far, how many of the last its figures speak of: all, until one has been forgotten."""
         return len(self.left) if len(self.left) == REMEMBERED else pairs
 

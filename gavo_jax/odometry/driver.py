@@ -301,8 +301,8 @@ class Odometry:
         if not lost and before.depth is not None:
             result, watch = judge_by_depth(before.depth, frame, bodies, float(clock.elapsed), result, self.camera)
             after = after._replace(depth=watch)
-            if watch.told and not before.depth.told:
-                revises = max(revises, watch.spoken_of(before.last_index))
+            if watch.found_wrong and not before.depth.found_wrong:
+                revises = max(revises, watch.pairs_covered(before.last_index))
         return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:

@@ -19,7 +19,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, synchronise_depth, warp
-from gavo_jax.objective.points import Reference, make_references, move_reference, settle_reference
+from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
 from gavo_jax.odometry.plausibility import Usual, judge_by_history
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
@@ -156,15 +156,15 @@ def _readout(camera: Camera, clock: Clock) -> Float[Array, ""]:
     return jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
 
 
-def _settle(
+def _undo_rolling_shutter(
     newest: Reference, keyframe: Reference, moved: Moved, readout: Float[Array, ""]
 ) -> tuple[Reference, Reference]:
     """Points of both references where they were at their image's moment, by the motion that is known now; those of a
     first frame are still where their rows' moments left them.
     """
     unsettled = newest.row_time
-    newest = settle_reference(newest, moved.instant_motion * readout)
-    keyframe = settle_reference(keyframe, moved.motion * readout)
+    newest = undo_rolling_shutter(newest, moved.instant_motion * readout)
+    keyframe = undo_rolling_shutter(keyframe, moved.motion * readout)
     return newest._replace(row_time=jnp.where(moved.is_first, unsettled, newest.row_time)), keyframe
 
 
@@ -239,7 +239,7 @@ def track_frame(
         target = _synchronised(raw, camera, delay * moved.instant_motion, finest)
     newest = make_references(target, camera, levels)
     if readout is not None:
-        newest, keyframe = _settle(newest, keyframe, moved, readout)
+        newest, keyframe = _undo_rolling_shutter(newest, keyframe, moved, readout)
     keyframe = move_reference(keyframe, moved.target_T_reference)
     after_it = TrackerState(
         previous=newest,

@@ -20,9 +20,9 @@ from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief, follow, form_belief, suspect
 from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence, view_of
-from gavo_jax.bodies.identity import Roll, associate, body_components
+from gavo_jax.bodies.identity import BodyTracks, associate, body_components
 from gavo_jax.bodies.records import Seen, in_world
-from gavo_jax.bodies.scene import Retina
+from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -109,33 +109,33 @@ def view(grey: jax.Array, depth: jax.Array, levels: Levels) -> View:
 
 def beliefs(sequence: Carded) -> list[Belief]:
     """What the true motion, none, makes of each frame after the first."""
-    retina = Retina(CAMERA, TRACKED)
-    views = [view(frame.grey, frame.depth, retina.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
-    known, found = jnp.zeros(retina.size), []
+    segmenter = MotionSegmenter(CAMERA, TRACKED)
+    views = [view(frame.grey, frame.depth, segmenter.levels) for frame in map(sequence.__getitem__, range(FRAMES))]
+    known, found = jnp.zeros(segmenter.size), []
     for before, here in pairwise(views):
         others = jax.tree.map(lambda leaf: leaf[None], before)
-        found.append(form_belief(here, others, jnp.eye(4)[None], retina.camera, known, carried=True))
+        found.append(form_belief(here, others, jnp.eye(4)[None], segmenter.camera, known, carried=True))
         known = found[-1].known
     return found
 
 
 def test_a_body_is_found_where_it_is() -> None:
     sequence = Carded()
-    roll = Roll.empty(Retina(CAMERA, TRACKED).size)
+    tracks = BodyTracks.empty(MotionSegmenter(CAMERA, TRACKED).size)
     for index, belief in enumerate(beliefs(sequence)[1:], start=2):
         moving = np.asarray(belief.moving)
-        labels = body_components(moving, np.asarray(belief.known), roll.labels > 0)
-        roll = associate(labels, roll)
+        labels = body_components(moving, np.asarray(belief.known), tracks.labels > 0)
+        tracks = associate(labels, tracks)
         field = np.where(labels == 1, moving, -1.0).astype(np.float32)
         mask = in_world(Seen(1, field, 0.0, np.zeros(3)), np.eye(4), np.eye(4), (CAMERA.height, CAMERA.width)).mask
         true = sequence.mask(index)
         assert np.sum(mask & true) / np.sum(mask | true) > 0.75
-        assert set(roll.numbers) == {0, 1}
+        assert set(tracks.numbers) == {0, 1}
 
 
 def test_a_large_body_leaves_the_brightness_of_the_rest_alone() -> None:
     """A regression on what it covers took contrast out, so that a dark screen seemed to change, and became a body."""
-    retina = Retina(CAMERA, TRACKED)
+    segmenter = MotionSegmenter(CAMERA, TRACKED)
     frame = SyntheticSequence(frames=1, camera=CAMERA)[0]
     here = np.array(frame.grey)
     here[:60] = 6  # a screen without texture
@@ -144,9 +144,9 @@ def test_a_large_body_leaves_the_brightness_of_the_rest_alone() -> None:
     before[60:, 60:] = cv2.resize(noise, (CAMERA.width - 60, CAMERA.height - 60), interpolation=cv2.INTER_CUBIC)
     nearer = depth.copy()
     nearer[60:, 60:] = 0.5 * CAMERA.depth_scale
-    now, others = view(here, depth, retina.levels), view(before, nearer, retina.levels)
+    now, others = view(here, depth, segmenter.levels), view(before, nearer, segmenter.levels)
     others = jax.tree.map(lambda leaf: leaf[None], others)
-    seen = gather_evidence(now, others, jnp.eye(4)[None], retina.camera)
+    seen = gather_evidence(now, others, jnp.eye(4)[None], segmenter.camera)
     screen = np.asarray(seen.grey[0, 4:24, 4:-4])
     assert np.median(screen) < 0.5
 
@@ -208,7 +208,7 @@ def test_a_body_that_stops_stays_out_of_the_search() -> None:
     for index in range(FRAMES):
         odometry.register(sequence[index], index / 30)
     state = odometry.progress.tracker.first
-    factor = CAMERA.height // Retina(CAMERA, TRACKED).size[0]
+    factor = CAMERA.height // MotionSegmenter(CAMERA, TRACKED).size[0]
     on_card = sequence.mask(FRAMES - 1)[::factor, ::factor]
     suspected = np.asarray(state.scene.suspected) > SUSPECTED
     assert suspected[on_card].mean() > 0.9 and suspected[~on_card].mean() < 0.1
@@ -262,14 +262,14 @@ def test_a_suspicion_fades_ends_where_all_is_at_rest_and_is_not_learnt_from_a_wr
 @pytest.mark.parametrize(("rate", "frames"), [(30, 7), (10, 3), (5, 2)])
 def test_the_oldest_view_is_of_about_a_quarter_of_a_second_ago_at_any_frame_rate(rate: int, frames: int) -> None:
     """Counted in frames it lay two seconds back where there are five a second, and all the drift since was a body."""
-    retina = Retina(CAMERA, TRACKED)
+    segmenter = MotionSegmenter(CAMERA, TRACKED)
     tracker = Search(CAMERA, TRACKED, jax.random.key(0)).start(SyntheticSequence(frames=1, camera=CAMERA)[0])
     tracker = tracker._replace(seconds=np.float32(1 / rate))
-    scene, kept = retina.first(tracker), []
+    scene, kept = segmenter.first(tracker), []
     for _ in range(frames):
         before = scene.age
-        look = retina.look(scene, tracker, np.eye(4))
-        scene = retina.renewed(scene, look, 1 / rate)
+        look = segmenter.look(scene, tracker, np.eye(4))
+        scene = segmenter.renewed(scene, look, 1 / rate)
         kept.append(float(scene.age) > float(before))
     assert kept == [True] * (frames - 1) + [False]
 
@@ -296,14 +296,14 @@ def test_no_frame_after_the_warm_up_waits_for_a_program(monkeypatch: pytest.Monk
 def test_an_older_view_that_sees_little_of_the_image_goes_at_once(in_view: float, goes: bool) -> None:
     odometry = Odometry(CAMERA, TRACKED)
     odometry.register(Carded()[0], 0.0)
-    state, retina = odometry.progress.tracker.first, Retina(CAMERA, TRACKED)
+    state, segmenter = odometry.progress.tracker.first, MotionSegmenter(CAMERA, TRACKED)
     state = state._replace(tracker=state.tracker._replace(seconds=np.float32(1 / 30)))
-    look = retina.look(state.scene, state.tracker, np.eye(4))
+    look = segmenter.look(state.scene, state.tracker, np.eye(4))
     belief = look.belief._replace(in_view=jnp.array([1.0, in_view]))
-    scene = retina.renewed(state.scene, look._replace(belief=belief), 1 / 30)
+    scene = segmenter.renewed(state.scene, look._replace(belief=belief), 1 / 30)
     older, between = scene.views_T_last[1], jnp.eye(4).at[0, 3].set(0.1)
     scene = scene._replace(views_T_last=scene.views_T_last.at[2].set(between))
-    after = retina.renewed(scene, retina.look(scene, state.tracker, np.eye(4)), 1 / 30)
+    after = segmenter.renewed(scene, segmenter.look(scene, state.tracker, np.eye(4)), 1 / 30)
     np.testing.assert_allclose(after.views_T_last[1], between if goes else older, atol=1e-6)
 
 
@@ -412,11 +412,11 @@ def test_the_largest_part_needs_less_where_depth_disagrees() -> None:
 
 def test_points_that_are_left_out_are_not_asked_for() -> None:
     """A body's own search has few points, each with a reading: there is depth enough."""
-    retina = Retina(CAMERA, TRACKED)
-    mask = np.ones(retina.size, bool)
-    mask[: retina.size[0] // 4] = False
+    segmenter = MotionSegmenter(CAMERA, TRACKED)
+    mask = np.ones(segmenter.size, bool)
+    mask[: segmenter.size[0] // 4] = False
     state = blank_state(CAMERA, TRACKED.solver, TRACKED.alignment)
-    assert float(state.share) == 1 and float(retina.without(state, mask).share) == pytest.approx(0.25)
+    assert float(state.share) == 1 and float(segmenter.without(state, mask).share) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("status", [AlignmentStatus.OK, AlignmentStatus.LOW_TEXTURE])
@@ -430,27 +430,27 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     search = Search(CAMERA, TRACKED, jax.random.key(0))
     aware = BodyAware(search, search)
     blank = aware.blank_state()
-    part = np.zeros(aware.retina.size, bool)
+    part = np.zeros(aware.segmenter.size, bool)
     part[10:30, 10:30] = True
-    before = associate(part.astype(np.int32), Roll.empty(part.shape))
-    state = blank._replace(scene=blank.scene._replace(roll=before))
+    before = associate(part.astype(np.int32), BodyTracks.empty(part.shape))
+    state = blank._replace(scene=blank.scene._replace(tracks=before))
     belief: Any = SimpleNamespace(moving=part.astype(np.float32))
     frame: Any = None
     clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
     nearness = np.ones(part.shape)
-    roll, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
+    tracks, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
     assert seen[0].alignment is found
-    kept = roll.motions[list(roll.numbers).index(seen[0].number)]
+    kept = tracks.motions[list(tracks.numbers).index(seen[0].number)]
     np.testing.assert_array_equal(kept, xi if status is AlignmentStatus.OK else np.zeros(6))
 
 
 def test_bodies_keep_their_numbers() -> None:
     nowhere = np.zeros((60, 80), bool)
     both = body_components(field(BOX, OTHER), field(BOX, OTHER), nowhere)
-    roll = associate(both, Roll.empty((60, 80)))
-    number = roll.labels[20, 20]
+    tracks = associate(both, BodyTracks.empty((60, 80)))
+    number = tracks.labels[20, 20]
     moved = np.s_[12:32, 14:34]
-    alone = associate(body_components(field(moved), field(moved), nowhere), roll)
+    alone = associate(body_components(field(moved), field(moved), nowhere), tracks)
     assert alone.labels[20, 20] == number
     again = associate(both, alone)
     assert set(again.numbers[again.numbers > 0]) == {1, 2} and again.labels[20, 20] == number

@@ -21,7 +21,7 @@ from gavo_jax.objective import error as error_module
 from gavo_jax.objective.error import Objective, Scales
 from gavo_jax.objective.estimates import Brightness, depth_trust, estimate_brightness, estimate_scales, explained_share
 from gavo_jax.objective.losses import LOSSES, Loss, huber, l2, student_t
-from gavo_jax.objective.points import Reference, central_gradient, make_references, move_reference, settle_reference
+from gavo_jax.objective.points import Reference, central_gradient, make_references, move_reference, undo_rolling_shutter
 from gavo_jax.objective.preconditioning import preconditioner, reference_curvature, unconditioner
 from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import exp
@@ -109,7 +109,7 @@ def jit_brightness(objective: Objective, motion: jax.Array) -> Brightness:
 
 jit_exp = jax.jit(exp)
 jit_move = jax.jit(move_reference)
-jit_settle = jax.jit(settle_reference)
+jit_undo = jax.jit(undo_rolling_shutter)
 jit_counted = jax.jit(lambda objective, motions, counted: objective.score(motions, counted))
 jit_explained = jax.jit(lambda objective, motion: explained_share(objective.residuals(motion)))
 jit_linearize = jax.jit(lambda problem, x: problem.linearize(x))
@@ -408,7 +408,7 @@ def test_settled_points_are_where_they_were_in_the_middle_of_the_readout() -> No
     pair = smooth_pair(rim=1)
     reference = make_reference(PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in pair[1:3])), CAMERA)
     twist = np.array([0.02, -0.01, 0.015, 0.01, -0.02, 0.015])
-    settled = jit_settle(reference, twist.astype(np.float32))
+    settled = jit_undo(reference, twist.astype(np.float32))
     assert not np.any(settled.row_time)
     before, after = (np.stack(points, dtype=float) for points in (reference.points, settled.points))
     for i in (70, 1000, 2900):
