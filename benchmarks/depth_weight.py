@@ -27,7 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment.visits import Level, fit_objective, levels_of, stack_levels
+from gavo_jax.alignment.fitting import fit_objective
+from gavo_jax.alignment.visits import Level, levels_of, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.error import Objective

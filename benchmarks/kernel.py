@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment.visits import objectives_of
+from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence

@@ -59,7 +59,7 @@ class Winner(NamedTuple):
 
     motion: Float[Array, "4 4"]
     rival: Float[Array, ""]
-    """See `Search`."""
+    """See `search.SearchState`."""
     centre: Float[Array, "4 4"]
     """Motion that the search was held about."""
     history: Float[Array, " iterations"]

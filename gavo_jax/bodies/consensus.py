@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import image_plane
-from gavo_jax.image.shutter import Slopes
+from gavo_jax.image.warp import Slopes
 from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp
 

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
+from gavo_jax.alignment.fitting import fit_objective
 from gavo_jax.alignment.search import align_views
-from gavo_jax.alignment.visits import fit_objective, levels_of, prepare_target, stack_levels
+from gavo_jax.alignment.visits import levels_of, prepare_target, stack_levels
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
@@ -223,8 +224,8 @@ ONE_SURFACE = 0.03
 def depth_moved(
     inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
 ) -> Float[Array, "h w"]:
-    """As `image.warp.synchronise_depth`, interpolated: what is looked up at the nearest pixel does not change for moves
-    of less than half a pixel, and here it is the small changes that count.
+    """Interpolate what `synchronise_depth` looks up at the nearest pixel: that does not change for moves of less than
+    half a pixel, and here it is the small changes that count.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, seen by the camera where it stood when depth was read.

@@ -28,12 +28,12 @@ from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import finish_run
-from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops

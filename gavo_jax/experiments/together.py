@@ -25,10 +25,10 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part
+from gavo_jax.odometry.composition import with_recovery
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.second_thoughts import with_recovery
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.precision import in_32_bits

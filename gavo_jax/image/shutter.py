@@ -9,15 +9,7 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.levels import ImagePlane
-from gavo_jax.image.warp import Points, Warped
-
-
-class Slopes(NamedTuple):
-    """Derivatives of what is sampled at warped points."""
-
-    along_u: Float[Array, "*n"]
-    along_v: Float[Array, "*n"]
-    along_inverse_depth: Float[Array, "*n"]
+from gavo_jax.image.warp import Points, Slopes, Warped
 
 
 class Shutter(NamedTuple):

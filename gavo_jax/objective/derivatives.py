@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import ImagePlane
-from gavo_jax.image.shutter import Slopes, delayed_slopes
-from gavo_jax.image.warp import Warped
+from gavo_jax.image.shutter import delayed_slopes
+from gavo_jax.image.warp import Slopes, Warped
 from gavo_jax.objective.error import LINEARIZED_CHUNK, Objective, Residuals
 from gavo_jax.objective.points import Reference
 

@@ -21,11 +21,12 @@ from gavo_jax.errors import GavoError
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
+from gavo_jax.odometry.composition import make_aligner
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.second_thoughts import Recovering, make_aligner, without_depth
+from gavo_jax.odometry.second_thoughts import Recovering, without_depth
 from gavo_jax.odometry.way import Way
 from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings

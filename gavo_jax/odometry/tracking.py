@@ -18,40 +18,15 @@ from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.image.sampling import Target
-from gavo_jax.image.warp import Points, synchronise_depth, warp
+from gavo_jax.image.synchronisation import synchronise_depth
+from gavo_jax.image.warp import Points, warp
 from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
+from gavo_jax.odometry.exposure import Exposure, relight
 from gavo_jax.odometry.plausibility import Usual, judge_by_history
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
-
-
-class Exposure(NamedTuple):
-    """How bright an image is, and how rich in contrast: mean and standard deviation, grey levels."""
-
-    mean: Float[Array, ""]
-    spread: Float[Array, ""]
-
-    @classmethod
-    def of(cls, pyramid: Pyramid) -> "Exposure":
-        """Of the coarsest level, where noise adds nothing to the contrast."""
-        grey = pyramid[-1].grey
-        return cls(jnp.mean(grey), jnp.maximum(jnp.std(grey), 0.1))
-
-
-LARGEST_GAIN = 1.6
-"""Ratio of two images' contrasts beyond which the camera must have changed its gain; below, views may differ by that
-much, and the search estimates the gain itself."""
-
-
-def relight(reference: Reference, before: Exposure, after: Exposure) -> Reference:
-    """Points as they would be with another exposure, where it differs so much that a search would not find it."""
-    gain = after.spread / jnp.maximum(before.spread, 0.1)
-    differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
-    gain = jnp.where(differs, gain, 1.0)
-    grey = jnp.where(differs, gain * (reference.grey - before.mean) + after.mean, reference.grey)
-    return reference._replace(grey=grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v)
 
 
 class TrackerState(NamedTuple):

@@ -29,8 +29,8 @@ from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.aligners import Attempt, Search
+from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock, blank_state
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows

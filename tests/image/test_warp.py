@@ -30,8 +30,9 @@ from gavo_jax.image.sampling import (
     sample_depth,
     sample_grey,
 )
-from gavo_jax.image.shutter import Shutter, Slopes, delay, delayed_slopes, row_time
-from gavo_jax.image.warp import Points, Warped, synchronise_depth, warp
+from gavo_jax.image.shutter import Shutter, delay, delayed_slopes, row_time
+from gavo_jax.image.synchronisation import synchronise_depth
+from gavo_jax.image.warp import Points, Slopes, Warped, warp
 from gavo_jax.se3 import GENERATORS, adjoint, exp, log, right_jacobian
 
 CAMERA = Camera(60.0, 58.0, 31.2, 24.1, 64, 48)

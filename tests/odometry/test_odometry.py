@@ -31,10 +31,11 @@ from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.warp import Points
 from gavo_jax.objective.points import make_references, move_reference
 from gavo_jax.odometry.aligners import BEGINNING, Attempt, Search
+from gavo_jax.odometry.composition import blank_of, wide_search
 from gavo_jax.odometry.driver import Odometry, Step, rectified
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import OdometryRun, run_odometry, trajectory_of
-from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering, blank_of, wide_search
+from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock, blank_state, first_state, renew_keyframe
 from gavo_jax.se3 import exp
