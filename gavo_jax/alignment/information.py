@@ -81,7 +81,7 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term]) -> In
 
 
 def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[Slopes, Slopes]]:
-    """Of each channel the slopes of the reference and those of the target."""
+    """Return each channel's slopes, of the reference and of the target."""
     facing = reference.facing
     flat = jnp.zeros_like(facing)
     grey = Slopes(reference.grey_u, reference.grey_v, flat), Slopes(r.grey_sample.along_u, r.grey_sample.along_v, flat)

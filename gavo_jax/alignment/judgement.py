@@ -75,7 +75,7 @@ def conclude(
     swaying: Swaying | None = None,
     share: Float[Array, ""] | float = 1.0,
 ) -> Alignment:
-    """From what the search ended with to the result: estimate, refine, judge. Points of a share of the image take
+    """Make the result of what the search ended with: estimate, refine, judge. Points of a share of the image take
     part.
     """
     residuals = objective.residuals(winner.motion)

@@ -141,8 +141,8 @@ def _nearest(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray
 def _errors(
     frames: list[_Side], points: list[_Points], motion: np.ndarray, twists: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each frame's corners land in the other one, less where they are seen there: pixels [2n, 2]; the derivatives
-    by (δ, both twists) [2n, 2, 18]; and which are known.
+    """Return where each frame's corners land in the other one, less where they are seen there: pixels [2n, 2]; the
+    derivatives by (δ, both twists) [2n, 2, 18]; and which are known.
     """
     residuals, slopes, known = [], [], []
     for here in (0, 1):
@@ -186,7 +186,7 @@ def _by_twist(points: np.ndarray) -> np.ndarray:
 
 
 def _weights(distances: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Of Geman and McClure's loss, by how far off corners are, pixels."""
+    """Weigh corners by Geman and McClure's loss of how far off they are, pixels."""
     scale = 2.0 * max(NOISE, float(np.median(distances[known])))
     return 1.0 / (1.0 + (distances / scale) ** 2) ** 2
 

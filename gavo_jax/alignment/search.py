@@ -352,8 +352,8 @@ def _search_island(
 
 
 def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray) -> Float[Array, "i 4 4"]:
-    """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
-    about it.
+    """Return where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions
+    drawn about it.
     """
     target, options, exchanged = frames
     places = max(options.islands)

@@ -128,7 +128,7 @@ class BodyAware:
         return AwareState(tracker, self.segmenter.first(tracker), tracker.previous)
 
     def predict(self, state: AwareState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Of the search."""
+        """Predict by the search."""
         return self.search.predict(state.tracker, elapsed)
 
     def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:

@@ -115,7 +115,7 @@ class RivalledState(NamedTuple):
 
     @property
     def tracker(self) -> TrackerState:
-        """Of the first search."""
+        """State of the first search."""
         return self.first.tracker
 
 
@@ -151,7 +151,7 @@ class WithRival:
         return RivalledState(state, rival, BEGUN)
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
+        """Predict by the first one."""
         return self.first.predict(state.first, elapsed)
 
     def align(self, state: RivalledState, frame: Frame, clock: Clock) -> Attempt:
@@ -282,7 +282,7 @@ def _open(attempt: Attempt, open_for: Span) -> Attempt:
 
 
 def _view(state: AwareState) -> View:
-    """Of the last frame, on the host: to slice a device's array takes a program."""
+    """Return the last frame's view, on the host: to slice a device's array takes a program."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 

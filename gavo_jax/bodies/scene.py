@@ -107,7 +107,7 @@ class MotionSegmenter:
         return self.camera.height, self.camera.width
 
     def view(self, tracker: TrackerState) -> View:
-        """Of a tracker's last frame, on the host: to slice a device's array takes a program."""
+        """Return a tracker's last frame, on the host: to slice a device's array takes a program."""
         sweep = np.asarray(tracker.instant_motion) * (self.full.readout / np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
@@ -171,7 +171,7 @@ class MotionSegmenter:
 
 
 def _age_after(scene: Scene, elapsed: float) -> float:
-    """Of the view between the last frame and the older one; 0 where that has become the older one."""
+    """Return the view's age, seconds, between the last frame and the older one; 0 where it became the older one."""
     age = float(scene.age) + elapsed
     return age if age < OLD else 0.0
 

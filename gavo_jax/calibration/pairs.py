@@ -128,7 +128,7 @@ class Kinematics(NamedTuple):
 
     @classmethod
     def of(cls, stamps: np.ndarray, matched: "Matched") -> "Kinematics":
-        """From the motions between the frames: central differences of fourth order, of second order near the ends."""
+        """Derive them from the motions between frames: central differences of fourth order, of second near the ends."""
         seconds = np.diff(stamps)[:, None]
         between = np.nan_to_num(np.asarray(matched.xi)) / seconds
         velocity = np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
@@ -144,7 +144,7 @@ class Kinematics(NamedTuple):
         )
 
     def some(self, frames: Integer[np.ndarray, " n"], stamps: np.ndarray) -> "Kinematics":
-        """Of some of the frames: what the camera does at their moments, and what it has done from one to the next."""
+        """Select some frames: what the camera does at their moments, and what it has done from one to the next."""
         steps, guesses = np.asarray(self.guesses, np.float64), np.tile(np.eye(4), (len(frames), 1, 1))
         for place, (first, last) in enumerate(pairwise(frames)):
             for step in steps[first:last]:

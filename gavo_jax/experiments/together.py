@@ -175,7 +175,7 @@ class _Stacked:
         return 0.0
 
     def start(self, frame: Frame) -> TrackerState:
-        """As of a single run, whose program the stack has no other use for."""
+        """Start as a single run does, whose program the stack has no other use for."""
         settings = self.search.settings
         return first_state(frame.grey, frame.depth, self.search.camera, settings.solver, settings.alignment)
 
@@ -186,7 +186,7 @@ class _Stacked:
         return self.search.judged(state, self.made.after(), self.made.result, frame, clock)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """As of a single run."""
+        """Predict as a single run does."""
         return self.search.predict(state, elapsed)
 
 

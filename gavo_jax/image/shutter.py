@@ -32,7 +32,7 @@ def row_time(v: Float[Array | np.ndarray, "*n"] | float, camera: Camera | ImageP
 
 
 def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane) -> Warped:
-    """Where warped points really are when the row on which they land is read.
+    """Return where warped points really are when the row on which they land is read.
 
     The camera moves on along ξ meanwhile, so each point goes on along its own way from the reference, by the share of
     the motion that falls into its delay; and by its sway on top of that. To first order in that share, a few hundredths

@@ -49,7 +49,7 @@ class Recogniser:
         self.camera, self.verifier = camera, verifier
 
     def find(self, frame: Keyframe, keyframes: list[Keyframe]) -> Place | None:
-        """Where a frame is, as a keyframe of its own; None where none of the others shows that.
+        """Return where a frame is, as a keyframe of its own; None where none of the others shows that.
 
         Args:
             frame: Its poses say nothing.

@@ -62,8 +62,8 @@ def linearization(
 
 
 def weighted_terms(objective: Objective, reference: Reference, r: Residuals) -> list[Term]:
-    """For each channel J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is Σ J w r
-    over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
+    """Return each channel's J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is
+    Σ J w r over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
     """
     scales, facing, shutter = objective.scales, reference.facing, objective.shutter(reference)
     grey, depth = r.grey_sample, r.depth_sample

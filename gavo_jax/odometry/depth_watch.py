@@ -25,13 +25,13 @@ class DepthWatch(NamedTuple):
         return self.change.is_unexplained or bool(self.edges.fault)
 
     def pairs_covered(self, pairs: int) -> int:
-        """Of so many pairs so far, how many of the last are spoken against."""
+        """Return how many of the last pairs are spoken against, of so many so far."""
         by_change = self.change.pairs_covered(pairs) if self.change.is_unexplained else 0
         return max(by_change, self.edges.pairs_covered(pairs) if self.edges.fault else 0)
 
 
 def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
-    """With another reference, or a run's first one."""
+    """Watch with another reference, or a run's first one."""
     if before is None:
         change = DepthChange(depth_on_grid(frame, camera), frame.depth_delay)
         return DepthWatch(change, DepthEdges.none().after(frame, camera))

@@ -94,7 +94,7 @@ class Relocaliser(Protocol):
     """Finds frames in a map of the run so far."""
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Where a frame was taken, seen from another segment than its own; None where the map does not show that."""
+        """Return where a frame was taken, seen from another segment than its own; None where the map does not say."""
         ...
 
 
@@ -270,19 +270,19 @@ class Odometry:
         return frame
 
     def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
-        """Of a frame of which nothing can be used."""
+        """Pass over a frame of which nothing can be used."""
         revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         after = self._lose(before, None, timestamp)
         return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
     def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
-        """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
+        """Begin with a frame before which nothing could be a reference: it is the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
             return FrameOutcome(before, no_alignment(finding.status), lost=True)
         return FrameOutcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
     def _align(self, before: Progress, frame: Frame, finding: Finding) -> FrameOutcome:
-        """Of a frame that is aligned."""
+        """Align a frame and judge what comes of it."""
         clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
         attempt, leap = align_leaping(self.aligner, state, frame, clock, before.leap)

@@ -28,15 +28,15 @@ class SecondThought:
     first: Aligner
 
     def warm_up(self) -> float:
-        """That of the first one; what else is asked serves every frame, or compiles when it is needed."""
+        """Warm up the first one; what else is asked serves every frame, or compiles when it is needed."""
         return self.first.warm_up()
 
     def start(self, frame: Frame) -> Any:
-        """By the first one."""
+        """Start the first one."""
         return self.first.start(frame)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
+        """Predict by the first one."""
         return self.first.predict(state, elapsed)
 
 
@@ -56,12 +56,12 @@ class Recovering(SecondThought):
     is_loaded: bool = False
 
     def warm_up(self) -> float:
-        """That of the first one; the second compiles when it is needed."""
+        """Warm up the first one; the second compiles when it is needed."""
         seconds = self.first.warm_up()
         return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
 
     def warm_up_both(self) -> float:
-        """Of both, side by side."""
+        """Warm up both, side by side; the seconds this took."""
         if self.wide is None:
             return self.first.warm_up()
         return side_by_side(self.first.warm_up, self.wide.warm_up)
@@ -131,7 +131,7 @@ class DoubtingDepth(SecondThought):
     alone: Aligner
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        """With depth, or without where it does not agree."""
+        """Align with depth, or without where it does not agree."""
         attempt = self.first.align(state, frame, clock)
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt

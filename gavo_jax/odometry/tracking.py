@@ -121,7 +121,7 @@ class Moved(NamedTuple):
 
     @classmethod
     def by(cls, result: Alignment, is_first: Bool[Array, ""]) -> "Moved":
-        """As a result says."""
+        """Take the motion that a result says."""
         motion, sway = jnp.where(is_first, 0.0, result.xi), jnp.where(is_first, 0.0, result.sway)
         return cls(is_first, jnp.where(is_first, jnp.eye(4), result.target_T_reference), motion, sway, motion + sway)
 
