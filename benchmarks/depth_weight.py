@@ -51,9 +51,9 @@ FIGURES = ("by_scatter", "disagreement", "by_disagreement")
 def own_optima(
     before: TrackerState, after: TrackerState, camera: Camera, solver: Any, options: AlignmentOptions
 ) -> list[tuple[jax.Array, ...]]:
-    """For grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about the
-    motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the covariance
-    of its gradient.
+    """Return for grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about
+    the motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the
+    covariance of its gradient.
     """
     motion = exp(after.motion)
     geometry = levels_of(camera, solver, options)

@@ -88,7 +88,7 @@ class TwoMarks(Objective):
         return jnp.stack([jnp.where(r.inside > 0, super().cost(r), 0.0), r.inside])
 
     def sums(self, cost: jax.Array) -> jax.Array:
-        """Of either array."""
+        """Sum either array."""
         return jnp.stack([lane_sum(cost[0]), lane_sum(cost[1])])
 
 

@@ -432,7 +432,7 @@ def row(summary: Summary) -> list[str]:
 
 
 def below_peers(scores: list[Score], method: str) -> tuple[int, int]:
-    """On how many cases a method's drift is below every peer's, and on how many there are peers."""
+    """Count on how many cases a method's drift is below every peer's, and on how many there are peers."""
     below = total = 0
     for case in groups(scores, "clip", "body", "seed"):
         peers = [score.drift for score in case if score.method in PEERS]
