@@ -35,7 +35,7 @@ def velocities(truth: Trajectory, begin: np.ndarray, end: np.ndarray) -> np.ndar
 
 
 def largest(twists: np.ndarray) -> list[float]:
-    """Of the translations' lengths and of the rotations'."""
+    """Return the largest of the translations' lengths, and of the rotations'."""
     return [float(np.nanmax(np.linalg.norm(twists[:, part], axis=1))) for part in PARTS]
 
 

@@ -220,7 +220,7 @@ def measure_drift(clips: Sequence[str], contenders: Sequence[Contender], seeds: 
                     continue
                 odometry = contender.make(sequence.camera, seed)
                 tracked = track_visibly(f"{clip}, {contender.name}, seed {seed}", sequence, odometry)
-                metrics = tracked.concluded(sequence).figures
+                metrics = tracked.outcome(sequence).figures
                 if metrics[DRIFT] is None:
                     raise GavoError(f"{clip}: no ground truth over a second of it")
                 runs.append({"clip": clip, "name": contender.name, "seed": seed, "random": contender.random, **metrics})

@@ -27,7 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import presets
-from gavo_jax.alignment.visits import Level, fit_objective, levels_of, stack_levels
+from gavo_jax.alignment.fitting import fit_objective
+from gavo_jax.alignment.visits import Level, levels_of, stack_levels
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.error import Objective
@@ -50,9 +51,9 @@ FIGURES = ("by_scatter", "disagreement", "by_disagreement")
 def own_optima(
     before: TrackerState, after: TrackerState, camera: Camera, solver: Any, options: AlignmentOptions
 ) -> list[tuple[jax.Array, ...]]:
-    """For grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about the
-    motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the covariance
-    of its gradient.
+    """Return for grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about
+    the motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the
+    covariance of its gradient.
     """
     motion = exp(after.motion)
     geometry = levels_of(camera, solver, options)

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gavo_jax.alignment.visits import objectives_of
+from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
@@ -88,7 +88,7 @@ class TwoMarks(Objective):
         return jnp.stack([jnp.where(r.inside > 0, super().cost(r), 0.0), r.inside])
 
     def sums(self, cost: jax.Array) -> jax.Array:
-        """Of either array."""
+        """Sum either array."""
         return jnp.stack([lane_sum(cost[0]), lane_sum(cost[1])])
 
 

@@ -44,7 +44,7 @@ def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.nda
 
 
 def points_of(frame: Frame, camera: Camera, world_T_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
-    """Where a frame's depth lies in the world, metres."""
+    """Return where a frame's depth lies in the world, metres."""
     depth = frame.depth / camera.depth_scale
     v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
     points = np.asarray(camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u]))
@@ -71,7 +71,7 @@ def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[
 
 
 def looking_on() -> Float[np.ndarray, "4 4"]:
-    """From behind and above the first camera, along its view."""
+    """Return a pose behind and above the first camera, along its view."""
     tilt = np.arctan2(-ABOVE, 1.5 - BEHIND)
     pose = np.eye(4)
     pose[1:3, 1:3] = [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]

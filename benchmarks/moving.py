@@ -233,7 +233,7 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
                 score.displacements_mm.append(apart)
                 score.rotations_deg += [] if turned is None else [turned]
 
-    steps = track_visibly(label, sequence, odometry, on_step).concluded(sequence).steps
+    steps = track_visibly(label, sequence, odometry, on_step).outcome(sequence).steps
     if score is not None:
         for error, step in zip(errors, steps, strict=True):
             count(score, error, step.alignment.status != 0)
@@ -432,7 +432,7 @@ def row(summary: Summary) -> list[str]:
 
 
 def below_peers(scores: list[Score], method: str) -> tuple[int, int]:
-    """On how many cases a method's drift is below every peer's, and on how many there are peers."""
+    """Count on how many cases a method's drift is below every peer's, and on how many there are peers."""
     below = total = 0
     for case in groups(scores, "clip", "body", "seed"):
         peers = [score.drift for score in case if score.method in PEERS]

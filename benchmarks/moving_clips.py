@@ -159,7 +159,7 @@ class CardClip:
         return np.where(inside, z, 0.0), on
 
     def _seen(self, frame: Frame, timestamp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the card is before everything else at a moment, its depth and the places on it."""
+        """Return where the card is before everything else at a moment, its depth and the places on it."""
         z, on = self._render(timestamp)
         scene = frame.depth / float(self.camera.depth_scale)
         return (z > 0) & ((scene == 0) | (z < scene)), z, on
@@ -187,7 +187,7 @@ class CardClip:
         return replace(frame, grey=grey, depth=np.where(front, raw, frame.depth).astype(np.uint16), color=None)
 
     def check(self) -> None:
-        """As the clip's own."""
+        """Check the clip."""
         self.clip.check()
 
     @property

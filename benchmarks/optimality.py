@@ -23,9 +23,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gavo_jax import presets
-from gavo_jax.alignment.pairs import Images
+from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.alignment.search import align_views
-from gavo_jax.alignment.visits import levels_of, objectives_of, prepare_pair
+from gavo_jax.alignment.stacking import Images
+from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.image.pyramid import build_pyramid

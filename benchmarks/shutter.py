@@ -35,7 +35,7 @@ def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
     for milliseconds in readouts:
         camera = replace(sequence.camera, readout=milliseconds / 1000)
         odometry = Odometry(camera, settings)
-        tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry).concluded(sequence)
+        tracked = track_visibly(f"{clip}, {milliseconds} ms", sequence, odometry).outcome(sequence)
         errors = np.array([float(step.alignment.error) for step in tracked.steps])
         first = errors if first is None else first
         both = np.isfinite(first) & np.isfinite(errors)

@@ -47,7 +47,7 @@ def measure(clip: str, method: str) -> list[dict[str, Any]]:
         raise GavoError(f"{clip}: no ground truth")
     for name, sway in VELOCITIES.items():
         odometry = Odometry(sequence.camera, replace(settings, odometry=replace(settings.odometry, sway=sway)))
-        run = track_visibly(f"{clip}, {name}", sequence, odometry).concluded(sequence)
+        run = track_visibly(f"{clip}, {name}", sequence, odometry).outcome(sequence)
         metres, radians = pair_errors(run.trajectory, sequence.ground_truth)
         rows.append(
             {

@@ -36,7 +36,7 @@ class PeerAligner:
         return self.peer.prepare(frame)
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        """As the peer does it."""
+        """Align as the peer does it."""
         del clock
         prepared = self.peer.prepare(frame)
         found = self.peer.align(state, prepared)

@@ -58,12 +58,12 @@ class DepthEdges(NamedTuple):
         """Before the first frame."""
         return cls(np.zeros((len(FAULTS), 2 * REACH + 1, 2 * REACH + 1), np.float32))
 
-    def spoken_of(self, pairs: int) -> int:
-        """Of so many pairs so far, how many of the last its figures speak of."""
+    def pairs_covered(self, pairs: int) -> int:
+        """Return how many of the last pairs its figures speak of, of so many so far."""
         return pairs if self.references <= EARLY + SELDOM else SELDOM
 
     def after(self, frame: Frame, camera: Camera) -> "DepthEdges":
-        """With one more reference."""
+        """Take one more reference into account."""
         number = self.references
         counted = self._replace(references=number + 1)
         if number % (EVERY if number < EARLY else SELDOM):

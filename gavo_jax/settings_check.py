@@ -66,7 +66,7 @@ def is_whole(value: Any) -> bool:
 
 
 def _fields(settings: Any) -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
-    """Of every setting its dotted name, the part that holds it, and its field."""
+    """Yield every setting's dotted name, the part that holds it, and its field."""
     for room in dataclasses.fields(settings):
         part = getattr(settings, room.name)
         for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():

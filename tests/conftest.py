@@ -38,7 +38,9 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 TRACED = Path(os.environ["GAVO_CACHE_DIR"]) / "traced"
 
 LONGEST = (
-    "alignment/test_alignment.py",
+    "alignment/test_review.py",
+    "alignment/test_pairs.py",
+    "alignment/test_search.py",
     "cli/test_contract.py",
     "cli/test_cli.py",
     "test_benchmarks.py",
@@ -47,8 +49,11 @@ LONGEST = (
     "calibration/test_calibration.py",
     "test_examples.py",
     "bodies/test_rival.py",
-    "odometry/test_odometry.py",
-    "objective/test_objective.py",
+    "odometry/test_driver.py",
+    "odometry/test_tracking.py",
+    "bodies/test_aligner.py",
+    "objective/test_error.py",
+    "objective/test_derivatives.py",
     "datasets/test_forms.py",
     "selfcheck/test_selfcheck.py",
     "experiments/test_sharding.py",

@@ -8,6 +8,7 @@ import pytest
 
 from gavo_jax import presets
 from gavo_jax.errors import GavoError
+from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import load_settings, save_settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -97,3 +98,15 @@ def test_unknown_names_are_refused():
         presets.preset("genetic")
     with pytest.raises(GavoError, match="not one of default"):
         presets.preset("ga", "quick")
+
+
+def test_every_preset_has_a_solver_for_all_levels():
+    for method in presets.METHODS:
+        for name in presets.PRESETS:
+            settings = presets.preset(method, name)
+            assert len(settings.solver.iterations) == len(settings.alignment.islands) == LEVELS
+            assert settings.solver.levels[0] == 4
+    assert presets.preset("ga", "paper").solver.levels[-1] == 0
+    for bad in (("simplex", "default"), ("ga", "best")):
+        with pytest.raises(GavoError, match="unknown"):
+            presets.preset(*bad)

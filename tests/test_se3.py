@@ -1,12 +1,16 @@
-"""Motions that are rigid, and those that are not; `exp` and `log` are tested with the warp and at full size."""
+"""Rigid motions and twists, equation (3), against SciPy; motions that are rigid, and those that are not."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from hypothesis import given
+from twists import hat, twists
 
-from gavo_jax.se3 import departure_from_rigid, rigid
+from gavo_jax.se3 import GENERATORS, adjoint, departure_from_rigid, exp, log, right_jacobian, rigid
 
 TURN = scipy.linalg.expm(np.array([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]]))
+jit_exp, jit_log, jit_jacobian = jax.jit(exp), jax.jit(log), jax.jit(right_jacobian)
 
 
 def motion(rotation: np.ndarray) -> np.ndarray:
@@ -38,3 +42,42 @@ def test_departure_tells_rounding_from_garbage() -> None:
     kinds = [motion(TURN), motion(1.001 * TURN), motion(TURN + 0.5)]
     departures = np.asarray(departure_from_rigid(jnp.asarray(np.stack(kinds), jnp.float32)))
     assert departures[0] < 1e-6 and departures[1] > 1e-3 and departures[2] > 0.1
+
+
+@given(twists(1.7))
+def test_exp_is_the_matrix_exponential_translation_first(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(jit_exp(xi), scipy.linalg.expm(hat(xi)), atol=3e-6)
+
+
+@given(twists(1.7))
+def test_log_undoes_exp(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(jit_log(jit_exp(xi)), xi, atol=2e-5)
+
+
+def test_exp_of_a_batch_is_exp_of_each() -> None:
+    xi = np.random.default_rng(0).normal(0, 0.3, (2, 3, 6)).astype(np.float32)
+    batch = np.asarray(exp(jnp.asarray(xi)))
+    assert batch.shape == (2, 3, 4, 4)
+    np.testing.assert_allclose(batch[1, 2], scipy.linalg.expm(hat(xi[1, 2])), atol=1e-6)
+
+
+def test_generators_are_the_twists_matrix() -> None:
+    xi = np.array([1.0, 2, 3, 4, 5, 6])
+    np.testing.assert_allclose(GENERATORS @ xi, hat(xi))
+
+
+@given(twists(0.3), twists(1.0))
+def test_right_jacobian_to_second_order(xi: np.ndarray, direction: np.ndarray) -> None:
+    h = 1e-5
+    moved = [scipy.linalg.expm(hat(xi.astype(float) + sign * h * direction)) for sign in (1, -1)]
+    base = scipy.linalg.expm(hat(xi))
+    tangent = np.linalg.inv(base) @ (moved[0] - moved[1]) / (2 * h)
+    third_order = np.linalg.norm(xi) ** 3 * np.linalg.norm(direction)
+    assert np.abs(tangent - hat(np.asarray(jit_jacobian(xi)) @ direction)).max() <= 0.1 * third_order + 1e-5
+
+
+@given(twists(1.0), twists(1.0))
+def test_adjoint_takes_a_step_to_the_other_side(xi: np.ndarray, step: np.ndarray) -> None:
+    motion = scipy.linalg.expm(hat(xi))
+    moved = hat(np.asarray(jax.jit(adjoint)(jnp.asarray(motion, jnp.float32))) @ step) @ motion
+    np.testing.assert_allclose(moved, motion @ hat(step), atol=1e-5)

@@ -116,8 +116,8 @@ def _lead(rows: Entry) -> Float[Array, ""]:
     """The winner's evidence over a rival's, of the points that each sees: a motion is no better for a larger overlap
     alone.
     """
-    entries, best = _competing(rows), _best(rows).evidence
-    total, seen = entries.evidence
-    costs = jnp.where(total >= LEAST_RIVAL * best.total, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
-    costs = costs.at[jnp.argmax(total)].set(0.0)
-    return rival_error(entries.motion, costs) * 1e-6 * best.seen
+    motions, (total, seen), _ = _competing(rows)
+    winner = jnp.argmax(total)
+    is_rival = total >= LEAST_RIVAL * total[winner]
+    costs = jnp.where(is_rival, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
+    return seen[winner] * rival_error(motions, costs, winner)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
 
 from gavo_jax.camera import Camera, to_ray
+from gavo_jax.image.motion_compensation import filled_inverse_depth
 from gavo_jax.image.numbers import grey_bytes
-from gavo_jax.image.settling import filled_inverse_depth
 
 MOST = 500
 """Most corners of a frame; the strongest ones count."""

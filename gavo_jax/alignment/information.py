@@ -13,8 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.camera import to_pixels
-from gavo_jax.image.shutter import Slopes
-from gavo_jax.image.warp import Warped
+from gavo_jax.image.warp import Slopes, Warped
 from gavo_jax.objective.derivatives import Term, pixel_jacobian
 from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.points import Reference
@@ -82,7 +81,7 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term]) -> In
 
 
 def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[Slopes, Slopes]]:
-    """Of each channel the slopes of the reference and those of the target."""
+    """Return each channel's slopes, of the reference and of the target."""
     facing = reference.facing
     flat = jnp.zeros_like(facing)
     grey = Slopes(reference.grey_u, reference.grey_v, flat), Slopes(r.grey_sample.along_u, r.grey_sample.along_v, flat)

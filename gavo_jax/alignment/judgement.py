@@ -59,7 +59,7 @@ class Winner(NamedTuple):
 
     motion: Float[Array, "4 4"]
     rival: Float[Array, ""]
-    """See `Search`."""
+    """See `search.SearchState`."""
     centre: Float[Array, "4 4"]
     """Motion that the search was held about."""
     history: Float[Array, " iterations"]
@@ -75,7 +75,7 @@ def conclude(
     swaying: Swaying | None = None,
     share: Float[Array, ""] | float = 1.0,
 ) -> Alignment:
-    """From what the search ended with to the result: estimate, refine, judge. Points of a share of the image take
+    """Make the result of what the search ended with: estimate, refine, judge. Points of a share of the image take
     part.
     """
     residuals = objective.residuals(winner.motion)

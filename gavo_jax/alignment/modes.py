@@ -8,8 +8,8 @@ from gavo_jax.se3 import log
 
 NICHE = (0.08, 0.08)
 """Metres and radians of ξ within which two motions count as one mode."""
-CLEARED = 1e9
-"""Added to the error of a motion whose mode is taken; above any error."""
+NOT_FINITE, PICKED = 10**6, 10**9
+"""How often a mode counts as taken whose motion's error is not finite, and one whose motion has its place already."""
 
 
 def _niches(motions: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
@@ -25,22 +25,23 @@ def _near(places: Float[Array, "n 6"], index: Integer[Array, ""]) -> Bool[Array,
 def best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
     """Indices of the `count` best motions with no two of one mode, best first (clearing, Petrowski 1996).
 
-    Where there are fewer modes than that, the last places go to motions whose modes are taken.
+    Where there are fewer modes than that, the last places go to the best motions of the modes that are taken least
+    often, and only then to motions whose error is not finite.
     """
     if count == 1:
         return jnp.argmin(errors)[None]
-    places = _niches(motions)
+    places, is_finite = _niches(motions), jnp.isfinite(errors)
+    errors = jnp.where(is_finite, errors, jnp.finfo(errors.dtype).max)
 
-    def pick(cleared: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-        best = jnp.argmin(cleared)
-        return jnp.where(_near(places, best), cleared + CLEARED, cleared).at[best].set(jnp.inf), best
+    def pick(taken: Integer[Array, " n"], _: None) -> tuple[Integer[Array, " n"], Integer[Array, ""]]:
+        best = jnp.argmin(jnp.where(taken == jnp.min(taken), errors, jnp.inf))
+        return (taken + _near(places, best)).at[best].set(PICKED), best
 
-    worthless = jnp.where(jnp.isfinite(errors), jnp.minimum(errors, CLEARED / 2), 10 * CLEARED)
-    return jax.lax.scan(pick, worthless, length=count)[1]
+    return jax.lax.scan(pick, jnp.where(is_finite, 0, NOT_FINITE), length=count)[1]
 
 
-def rival_error(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"]) -> Float[Array, ""]:
-    """Error of the best motion outside the winner's mode, over the winner's; +inf where there is none."""
-    best = jnp.argmin(errors)
-    others = jnp.where(_near(_niches(motions), best), jnp.inf, errors)
-    return jnp.min(others) / jnp.maximum(errors[best], 1e-6)
+def rival_error(
+    motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], best: Integer[Array, ""]
+) -> Float[Array, ""]:
+    """Smallest error of a motion outside the mode of the best one, given by its index; +inf where there is none."""
+    return jnp.min(jnp.where(_near(_niches(motions), best), jnp.inf, errors))

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Float64, UInt8, UInt16
 from gavo_jax.alignment.corners import track_corners
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.camera import Camera, to_pixels, to_ray
-from gavo_jax.image.settling import filled_inverse_depth, pixel_flow
+from gavo_jax.image.motion_compensation import filled_inverse_depth, pixel_flow
 from gavo_jax.image.shutter import row_time
 from gavo_jax.se3 import log
-from gavo_jax.status import GRAVITY, AlignmentStatus, bit
+from gavo_jax.status import AlignmentStatus, bit, gravest
 from gavo_jax.trajectory import inverse
 
 USUAL_SPEED = (0.5, 1.0)
@@ -141,8 +141,8 @@ def _nearest(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray
 def _errors(
     frames: list[_Side], points: list[_Points], motion: np.ndarray, twists: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each frame's corners land in the other one, less where they are seen there: pixels [2n, 2]; the derivatives
-    by (δ, both twists) [2n, 2, 18]; and which are known.
+    """Return where each frame's corners land in the other one, less where they are seen there: pixels [2n, 2]; the
+    derivatives by (δ, both twists) [2n, 2, 18]; and which are known.
     """
     residuals, slopes, known = [], [], []
     for here in (0, 1):
@@ -186,7 +186,7 @@ def _by_twist(points: np.ndarray) -> np.ndarray:
 
 
 def _weights(distances: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Of Geman and McClure's loss, by how far off corners are, pixels."""
+    """Weigh corners by Geman and McClure's loss of how far off they are, pixels."""
     scale = 2.0 * max(NOISE, float(np.median(distances[known])))
     return 1.0 / (1.0 + (distances / scale) ** 2) ** 2
 
@@ -206,14 +206,13 @@ def with_own_motion(result: Alignment, found: OwnMotion) -> Alignment:
     motion = found.target_T_reference
     variance = np.diag(found.covariance)
     most = np.repeat(np.square([MAX_TRANSLATION_DEVIATION, MAX_ROTATION_DEVIATION]), 3)
-    is_vague = not np.all((variance >= 0) & (variance <= most))
     findings = int(result.findings) & ~bit(AlignmentStatus.LOW_TEXTURE)
-    findings |= bit(AlignmentStatus.LOW_TEXTURE) if is_vague else 0
-    status = [status for status in GRAVITY if findings & bit(status)]
+    if not np.all((variance >= 0) & (variance <= most)):
+        findings |= bit(AlignmentStatus.LOW_TEXTURE)
     return result._replace(
         target_T_reference=motion,
         xi=np.asarray(log(jnp.asarray(motion, jnp.float32))),
         covariance=found.covariance.astype(np.float32),
         findings=np.int32(findings),
-        status=np.int32(status[-1] if status else AlignmentStatus.OK),
+        status=np.int32(gravest(findings)),
     )

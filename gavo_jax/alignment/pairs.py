@@ -1,37 +1,28 @@
 """`align` and `align_batch`: from images to `Alignment` in one compiled program."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
-from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach
-from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.review import review
 from gavo_jax.alignment.search import align_views
+from gavo_jax.alignment.stacking import Images, stacked_pairs, stacked_sides
 from gavo_jax.alignment.visits import levels_of, prepare_pair
-from gavo_jax.camera import Camera, require_camera
-from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
-from gavo_jax.frame_checks import check_images
-from gavo_jax.image.numbers import as_array, with_zeros
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.precision import in_32_bits
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
-from gavo_jax.status import AlignmentStatus, bit
-
-
-class Images(NamedTuple):
-    """Grey [H, W] and depth [H, W] of one frame, or of a batch with a leading axis."""
-
-    grey: Any
-    depth: Any
+from gavo_jax.status import AlignmentStatus
 
 
 def _align_images(
@@ -118,89 +109,6 @@ def starts_of(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
-def depth_delays(side: Any, count: int) -> list[float]:
-    """Seconds from each frame's colour image to its depth image; 0 where that is not known."""
-    frames = list(side) if len(side) == count else [None] * count  # else both kinds of images, each of all frames
-    return [frame.depth_delay if isinstance(frame, Frame) else 0.0 for frame in frames]
-
-
-def moving_rows(
-    result: Alignment, sides: Any, camera: Camera, settings: Settings, delays: list[tuple[float, float]]
-) -> Alignment:
-    """A batch's results on the host, with what each frame's own motion did to it taken into account."""
-    options = settings.alignment
-    if not options.refine or options.features == "off":
-        return result
-    rows = [jax.tree.map(lambda leaf, k=k: leaf[k], result) for k in range(len(result.status))]
-    for k, row in enumerate(rows):
-        if not (camera.readout or any(delays[k])) or not np.isfinite(row.covariance).all():
-            continue
-        before, after = (Images(np.asarray(side.grey[k]), np.asarray(side.depth[k])) for side in sides)
-        found = refine_moving(before, after, camera.rectified(), row.target_T_reference, delays[k])
-        if found is not None:
-            rows[k] = with_own_motion(row, found)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-
-
-def with_image_findings(result: Alignment, sides: Any, camera: Camera) -> Alignment:
-    """A batch's results on the host, with what speaks against each image by itself: depth may tell of a motion to a
-    black image, or numbers that are no metres agree with each other. Of a target the grey image is enough.
-    """
-    status, findings = np.array(result.status), np.array(result.findings)
-    pairs = zip(*(np.asarray(images) for side in sides for images in side), strict=True)
-    for k, (grey0, depth0, grey1, depth1) in enumerate(pairs):
-        found = set(check_images(grey1, depth1, camera.depth_scale)) - {AlignmentStatus.NO_DEPTH}
-        for finding in sorted(found.union(check_images(grey0, depth0, camera.depth_scale))):
-            status[k] = status[k] or finding
-            findings[k] |= bit(finding)
-    return result._replace(status=status, findings=findings)
-
-
-def with_repetitions(
-    result: Alignment, references: Images, camera: Camera, expected: Float[Array | np.ndarray, "b 4 4"] | None
-) -> Alignment:
-    """A batch's results on the host, those ambiguous whose image repeats itself, so that another motion explains it as
-    well; where motions were expected, those of them that are no nearer to that than another repetition.
-    """
-    status, findings = np.array(result.status), np.array(result.findings)
-    greys, depths = map(np.asarray, references)
-    guesses = None if expected is None else np.asarray(expected, np.float64)
-    for k in np.flatnonzero((status == AlignmentStatus.OK) | (status == AlignmentStatus.LOW_TEXTURE)):
-        motion, images = np.asarray(result.target_T_reference[k]), (greys[k], depths[k], camera)
-        if guesses is None:
-            is_open = another_period_is_in_reach(motion, result.error[k], np.inf, *images)
-        else:
-            is_open = another_period_fits_expected(motion, result.error[k], guesses[k], *images)
-        if is_open:
-            status[k] = status[k] or AlignmentStatus.AMBIGUOUS
-            findings[k] |= bit(AlignmentStatus.AMBIGUOUS)
-    return result._replace(status=status, findings=findings)
-
-
-def concluded(
-    result: Alignment,
-    frames: tuple[Any, Any],
-    sides: Any,
-    camera: Camera,
-    settings: Settings,
-    expected: Float[Array | np.ndarray, "b 4 4"] | None,
-) -> Alignment:
-    """A batch's results on the host, with all that is looked at there.
-
-    Args:
-        result: The result of `align_rows`.
-        frames: References and targets as they were given, whose stamps tell the delays of depth.
-        sides: The same images as `stacked_images` gives them.
-        camera: Camera of both frames.
-        settings: What searched.
-        expected: Motions to start from, where any were given.
-    """
-    count = len(sides[0].grey)
-    delays = list(zip(*(depth_delays(side, count) for side in frames), strict=True))
-    result = with_image_findings(moving_rows(on_host(result), sides, camera, settings, delays), sides, camera)
-    return with_repetitions(result, sides[0], camera, expected)
-
-
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
     """`align_batch` of images that are stacked already, from the guesses of `starts_of`, its results on the device; of
     the first `count` rows alone, where that is given.
@@ -264,7 +172,7 @@ def align(
         raise GavoError(f"a key is needed, jax.random.key(seed), not {type(key).__name__}")
     expected = None if guess is None else np.asarray(guess, np.float32)[None]
     found = align_rows(sides, camera, settings, key[None], starts_of(expected, sides, camera, settings))
-    result = concluded(found, ([reference], [target]), sides, camera, settings, expected)
+    result = review(found, ([reference], [target]), sides, camera, settings, expected)
     row = jax.tree.map(lambda leaf: leaf[0], result)
     return row._replace(status=AlignmentStatus(int(row.status)))
 
@@ -303,75 +211,4 @@ def align_batch(
     settings = as_settings(settings, solver, alignment=options)
     sides, keys = stacked_pairs(references, targets, camera, keys)
     found = align_rows(sides, camera, settings, keys, starts_of(guesses, sides, camera, settings))
-    return concluded(found, (references, targets), sides, camera, settings, guesses)
-
-
-def stacked_pairs(
-    references: Any, targets: Any, camera: Camera, keys: PRNGKeyArray | None
-) -> tuple[list[Images], PRNGKeyArray]:
-    """Both sides of B pairs as of `stacked_sides`, and their keys.
-
-    Raises:
-        GavoError: As of `stacked_images`, or there are not as many of one as of the other.
-    """
-    sides = stacked_sides(references, targets, camera)
-    count, others = (len(side.grey) for side in sides)
-    if others != count:
-        raise GavoError(f"{count} references but {others} targets")
-    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    if np.shape(keys)[:1] != (count,):
-        raise GavoError(f"keys are of shape {np.shape(keys)}: one per pair is needed, jax.random.split(key, {count})")
-    return sides, keys
-
-
-def _plain(image: Any) -> Any:
-    """An array that a program takes; one that is on a device stays there."""
-    return image if isinstance(image, jax.Array) else as_array(image)
-
-
-def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
-    if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
-        raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
-    grey, depth = map(_plain, (frame.grey, frame.depth) if isinstance(frame, Frame) else frame)
-    expected = (camera.height, camera.width)
-    for name, image in (("grey", grey), ("depth", depth)):
-        if np.shape(image) != expected:
-            fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
-            raise GavoError(fault + what_helps(name, image))
-    require_grey_levels(grey)
-    depth = with_zeros(depth)
-    if camera.is_distorted:
-        grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
-    return Images(grey, depth)
-
-
-def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
-    """Both sides as of `stacked_images`: bytes and 16 bits, or float32 throughout. For each other combination of types
-    the search would be compiled anew.
-    """
-    sides = [stacked_images(side, camera) for side in (references, targets)]
-    if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):
-        return sides
-    return [Images(*(jnp.asarray(image, jnp.float32) for image in side)) for side in sides]
-
-
-def stacked_images(side: Any, camera: Camera) -> Images:
-    """B frames as `align_batch` takes them, stacked and free of lens distortion.
-
-    Raises:
-        GavoError: They are none, too small, or not of the camera's size.
-    """
-    require_camera(camera)
-    is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
-    if not len(side[0] if is_stacked else side):
-        raise GavoError("a batch of no frames: at least one pair is needed")
-    if is_stacked:
-        side = tuple(map(_plain, side))
-        if camera.is_distorted:
-            return stacked_images(list(zip(*side, strict=True)), camera)
-        if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
-            raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
-        require_grey_levels(side[0])
-        return Images(jnp.asarray(side[0]), jnp.asarray(with_zeros(side[1])))
-    images = [_rectified_images(frame, camera) for frame in side]
-    return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))
+    return review(found, (references, targets), sides, camera, settings, guesses)

@@ -119,7 +119,7 @@ def _peaks(likeness: Float[np.ndarray, "n m"], least: float) -> Integer[np.ndarr
 def _between_pixels(
     likeness: Float[np.ndarray, "n m"], shifts: Integer[np.ndarray, "k 2"]
 ) -> Float64[np.ndarray, "k 2"]:
-    """Where parabolas through the likeness at peaks and beside them are highest."""
+    """Return where parabolas through the likeness at peaks and beside them are highest."""
     padded = np.pad(likeness, 1, mode="edge")
     column, row = shifts.T + np.array(likeness.shape[::-1])[:, None] // 2 + 1
     here = padded[row, column]

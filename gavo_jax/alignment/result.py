@@ -57,8 +57,8 @@ class Alignment(NamedTuple):
 
     @property
     def undetermined(self) -> str:
-        """Of a pair that is `LOW_TEXTURE` the directions of motion that the images leave open, in the axes of the
-        reference camera: some of ξ's six, as words, joined by "with" where only their mixture is open. Else empty.
+        """The directions of motion that the images of a `LOW_TEXTURE` pair leave open, in the axes of the reference
+        camera: some of ξ's six, as words, joined by "with" where only their mixture is open. Else empty.
         An axis is named for its share of what is open, or where that share alone exceeds the tolerable deviation.
         """
         covariance = np.asarray(self.covariance, np.float64)

@@ -18,22 +18,12 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
 from gavo_jax.alignment.evidence import evidence
+from gavo_jax.alignment.fitting import comparable_objective, fit_objective, level_objective, unchanged_brightness
 from gavo_jax.alignment.judgement import Winner, conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import Swaying
-from gavo_jax.alignment.visits import (
-    Exchanged,
-    Level,
-    Search,
-    comparable_objective,
-    fit_objective,
-    level_objective,
-    reach_of,
-    stack_levels,
-    unchanged_brightness,
-    visited_levels,
-)
+from gavo_jax.alignment.visits import Exchanged, Level, reach_of, stack_levels, visited_levels
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.sampling import Target
@@ -58,6 +48,8 @@ SCOUT_RANGE = (0.5, 2.0)
 """Factors on the scouts' translations, from the first one to the last."""
 SCOUTED_POINTS = 480
 """Points of a frame that a scout's evidence is taken on."""
+LEAST_ERROR = 1e-6
+"""Squared grey levels that the best error counts as at least, where a rival's is compared with it."""
 SCOUTS_AT_ONCE = 32
 """Motions whose evidence is taken side by side."""
 
@@ -101,10 +93,23 @@ class Frames(NamedTuple):
     exchanged: Exchanged | None
 
 
+class SearchState(NamedTuple):
+    """What one level hands on to the next."""
+
+    islands: Float[Array, "i 4 4"]
+    """Motions, the best one first."""
+    box: Float[Array, " 6"]
+    """Half-widths of the search box, metres and radians."""
+    brightness: Brightness
+    rival: Float[Array, ""]
+    """How far the second-best mode is behind, where several competed: the best one's evidence over its, or its error
+    over the best one's; +inf without one."""
+
+
 class Ended(NamedTuple):
     """What the searches of a pair ended with."""
 
-    search: Search
+    search: SearchState
     centre: Float[Array, "4 4"]
     """Motion that it was held about."""
     histories: Float[Array, "l iterations"]
@@ -167,7 +172,7 @@ def align_views(
 
     def search_alone() -> Ended:
         origins = _origins(frames, first, guesses, keys[-1, 0])
-        start = Search(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
+        start = SearchState(origins, box, unchanged_brightness(first), jnp.float32(jnp.inf))
         search, histories, populations = _search_levels(
             frames, solver, start, rows, keys[:-1], centre=origins[0], record=record
         )
@@ -218,7 +223,7 @@ def _search_in_contest(
         itself = comparable_objective(second, target, options, None)
         aliases = self_motions(itself, exchanged.target)
     winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine, record)
-    search = Search(winner.motion[None], box, winner.brightness, lead)
+    search = SearchState(winner.motion[None], box, winner.brightness, lead)
     return Ended(search, winner.motion, histories, populations, judge)
 
 
@@ -228,7 +233,7 @@ def _refine(
     motion: Float[Array, "4 4"],
     box: Float[Array, " 6"],
     is_last: Bool[Array, ""],
-) -> Search:
+) -> SearchState:
     """Take one motion by Gauss-Newton through all levels but the finest one, or through that alone. Nothing else
     competes, so that the brightness can be told from the first level on.
     """
@@ -238,7 +243,7 @@ def _refine(
     visits = visits._replace(is_first=jnp.zeros(count, bool), islands=visited.astype(jnp.int32))
     options = replace(frames.options, min_overlap=jnp.minimum(frames.options.min_overlap, REFINED_OVERLAP))
     views = visits.reference.grey.shape[1]
-    start = Search(motion[None], box, Brightness.unchanged(views), jnp.float32(jnp.inf))
+    start = SearchState(motion[None], box, Brightness.unchanged(views), jnp.float32(jnp.inf))
     keys = jax.random.split(jax.random.key(0), (count, 1))
     frames = frames._replace(options=options)
     search, _, _ = _search_levels(frames, REFINER, start, visits, keys, centre=motion, record=False, skips_empty=True)
@@ -248,22 +253,22 @@ def _refine(
 def _search_levels(
     frames: Frames,
     solver: Solver,
-    start: Search,
+    start: SearchState,
     visits: Level,
     keys: PRNGKeyArray,
     *,
     centre: Float[Array, "4 4"],
     record: bool,
     skips_empty: bool = False,
-) -> tuple[Search, Float[Array, "l iterations"], Population | None]:
-    """Search some levels, one after the other, each from the islands of the last; held about a centre.
+) -> tuple[SearchState, Float[Array, "l iterations"], Population | None]:
+    """SearchState some levels, one after the other, each from the islands of the last; held about a centre.
 
     Whether a level without islands is left out is static: where every level has some, the test would cost time.
     """
     # traced once, where its shapes are asked for first
     search_level = jax.jit(partial(_search_level, frames, solver, centre, record))
 
-    def visit_level(search: Search, visit: tuple[Level, PRNGKeyArray]) -> Any:
+    def visit_level(search: SearchState, visit: tuple[Level, PRNGKeyArray]) -> Any:
         blank = jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(search_level, search, visit)[1]
         )
@@ -279,10 +284,10 @@ def _search_level(
     solver: Solver,
     centre: Float[Array, "4 4"],
     record: bool,
-    search: Search,
+    search: SearchState,
     visit: tuple[Level, PRNGKeyArray],
-) -> tuple[Search, tuple[Float[Array, " iterations"], Population | None]]:
-    """Search one level, from the islands of the last one, in the paper's five steps.
+) -> tuple[SearchState, tuple[Float[Array, " iterations"], Population | None]]:
+    """SearchState one level, from the islands of the last one, in the paper's five steps.
 
     Take the reference's points (the visit has them), estimate brightness and noise, choose search coordinates, have
     the solver minimise E on every island, and hand the best distinct motions on to the next level.
@@ -311,8 +316,11 @@ def _search_level(
         total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
         errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
     order = best_distinct(found, errors, places)
-    rival = search.rival if places == 1 else jnp.where(level.islands > 1, rival_error(found, errors), search.rival)
-    search = Search(found[order], search.box * options.bounds_factor, brightness, rival)
+    rival = search.rival
+    if places > 1:
+        ratio = rival_error(found, errors, order[0]) / jnp.maximum(errors[order[0]], LEAST_ERROR)
+        rival = jnp.where(level.islands > 1, ratio, rival)
+    search = SearchState(found[order], search.box * options.bounds_factor, brightness, rival)
     return search, (history[order[0]], population)
 
 
@@ -326,7 +334,7 @@ def _search_island(
     origin: Float[Array, "4 4"],
     inhabited: Bool[Array, ""],
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
-    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
+    """SearchState one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=reach_of(options), searched=inhabited)
         reach = jnp.abs(unconditioner(problem.basis)) @ box
@@ -344,8 +352,8 @@ def _search_island(
 
 
 def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray) -> Float[Array, "i 4 4"]:
-    """Where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions drawn
-    about it.
+    """Return where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions
+    drawn about it.
     """
     target, options, exchanged = frames
     places = max(options.islands)

@@ -60,7 +60,7 @@ class VelocityChange(NamedTuple):
         return cls(still, changes)
 
     def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "VelocityChange":
-        """With one more pair: its sway and its mean velocity's change, m/s and rad/s."""
+        """Add one more pair: its sway and its mean velocity's change, m/s and rad/s."""
         squares = jnp.mean(jnp.square(change.reshape(2, 3)), axis=1)
         return VelocityChange(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
 

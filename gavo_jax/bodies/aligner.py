@@ -18,9 +18,9 @@ from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
 from gavo_jax.bodies.evidence import inverse_depth_of
-from gavo_jax.bodies.identity import LEAST, Roll, body_components
+from gavo_jax.bodies.identity import LEAST, BodyTracks, body_components
 from gavo_jax.bodies.motions import find_motions
-from gavo_jax.bodies.scene import AwareState, FrameView, Retina
+from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
@@ -99,9 +99,9 @@ class BodyAware:
     is_eager: bool = False
 
     @cached_property
-    def retina(self) -> Retina:
+    def segmenter(self) -> MotionSegmenter:
         """What sees bodies."""
-        return Retina(self.search.camera, self.search.settings)
+        return MotionSegmenter(self.search.camera, self.search.settings)
 
     @property
     def tracks(self) -> bool:
@@ -113,28 +113,28 @@ class BodyAware:
         state = self.blank_state()
 
         def look() -> None:
-            jax.block_until_ready(self.retina.look(state.scene, state.tracker, np.eye(4)))
+            jax.block_until_ready(self.segmenter.look(state.scene, state.tracker, np.eye(4)))
 
         return side_by_side(self.first.warm_up, look)
 
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
         tracker = self.search.blank_state()
-        return AwareState(tracker, self.retina.blank(), tracker.previous)
+        return AwareState(tracker, self.segmenter.blank(), tracker.previous)
 
     def start(self, frame: Frame) -> AwareState:
         """A scene in which nothing is known to move."""
         tracker = self.first.start(frame)
-        return AwareState(tracker, self.retina.first(tracker), tracker.previous)
+        return AwareState(tracker, self.segmenter.first(tracker), tracker.previous)
 
     def predict(self, state: AwareState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Of the search."""
+        """Predict by the search."""
         return self.search.predict(state.tracker, elapsed)
 
     def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:
         """Align, and look what moves."""
         scene = state.scene
-        before = np.asarray(scene.roll.labels) > 0
+        before = np.asarray(scene.tracks.labels) > 0
         known, covered = bool(np.any(before)), float(np.mean(before))
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
@@ -169,22 +169,22 @@ class BodyAware:
         carried: float,
     ) -> Attempt:
         """An attempt with its bodies and all that is known after it; from a motion in doubt nothing is learnt."""
-        scene, retina = state.scene, self.retina
+        scene, segmenter = state.scene, self.segmenter
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
         if dissent > MISTRUSTED:
             attempt = mistrusted(attempt)
         limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
-        roll, bodies, seen = Roll(*map(np.asarray, scene.roll)), found, ()
-        if np.any(found) or np.any(roll.numbers):
-            inverse_depth = inverse_depth_of(retina.view(attempt.state))
+        tracks, bodies, seen = BodyTracks(*map(np.asarray, scene.tracks)), found, ()
+        if np.any(found) or np.any(tracks.numbers):
+            inverse_depth = inverse_depth_of(segmenter.view(attempt.state))
             bodies = whole_surfaces(found, np.asarray(look.belief.suspected) > SUSPECTED, inverse_depth)
-            roll, seen = find_motions(self, state, frame, clock, bodies, look.belief, inverse_depth)
+            tracks, seen = find_motions(self, state, frame, clock, bodies, look.belief, inverse_depth)
         tracker: TrackerState = attempt.state
         whole, elapsed = tracker.previous, float(clock.elapsed)
         suspected = suspect(look.belief, bodies > 0, elapsed, trusted=not is_doubted)
-        after = retina.renewed(scene, look, elapsed)._replace(
-            roll=roll, carried=np.asarray(carried, np.float32), suspected=suspected
+        after = segmenter.renewed(scene, look, elapsed)._replace(
+            tracks=tracks, carried=np.asarray(carried, np.float32), suspected=suspected
         )
         if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
             after = after._replace(known=look.belief.carried)
@@ -193,7 +193,7 @@ class BodyAware:
             after = after._replace(known=np.where(bodies != found, np.maximum(known, 0.0), known))
         aside = suspected > SUSPECTED  # without what was just found, where the motion is in doubt
         if np.any(aside):
-            tracker = retina.without(tracker, aside if np.mean(aside) < MOST_ASIDE else bodies > 0)
+            tracker = segmenter.without(tracker, aside if np.mean(aside) < MOST_ASIDE else bodies > 0)
         return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, FrameView]:
@@ -215,13 +215,13 @@ class BodyAware:
         return attempt, look
 
     def _look(self, state: AwareState, attempt: Attempt) -> FrameView:
-        return self.retina.look(state.scene, attempt.state, attempt.result.target_T_reference)
+        return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
         """A tracker without the points that dissent, whose search begins from the motion that the others ask for."""
         motion = np.asarray(opinion.target_T_reference, np.float64)
         guess = np.float32(log(motion) * (float(tracker.seconds) / float(clock.elapsed)))
-        return self.retina.without(tracker, opinion.dissenting)._replace(guess=guess)
+        return self.segmenter.without(tracker, opinion.dissenting)._replace(guess=guess)
 
     def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
         """The motion that most of what was at rest agrees with.
@@ -230,20 +230,22 @@ class BodyAware:
         the last motion, gone on with, explains; where nothing was known to move, what was found may be a wrong one, and
         the search that begins from rest is another. The best is searched for again without what moves by it.
         """
-        scene, tracker, retina = state.scene, state.tracker, self.retina
-        known = bool(np.any(np.asarray(scene.roll.labels)))
+        scene, tracker, segmenter = state.scene, state.tracker, self.segmenter
+        known = bool(np.any(np.asarray(scene.tracks.labels)))
 
         def candidate(attempt: Attempt) -> MotionCandidate:
-            return MotionCandidate(attempt, retina.look_back(scene, attempt.state, attempt.result.target_T_reference))
+            return MotionCandidate(
+                attempt, segmenter.look_back(scene, attempt.state, attempt.result.target_T_reference)
+            )
 
         def search_from(tracker: TrackerState) -> MotionCandidate:
             return candidate(self.search.align(tracker, frame, clock))
 
         def search_without(mask: Any) -> MotionCandidate:
-            return search_from(retina.without(tracker, mask))
+            return search_from(segmenter.without(tracker, mask))
 
         found = candidate(first)
-        predicted = retina.look_back(scene, first.state, self.predict(state, float(clock.elapsed)))
+        predicted = segmenter.look_back(scene, first.state, self.predict(state, float(clock.elapsed)))
         tried = [found]
         if found.belief.contradicted > DOUBTFUL or predicted.support > found.belief.support + DOUBTFUL:
             tried += [search_without(found.belief.moving < 0), search_without(predicted.moving > 0)]

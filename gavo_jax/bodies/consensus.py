@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import image_plane
-from gavo_jax.image.shutter import Slopes
+from gavo_jax.image.warp import Slopes
 from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp
 
@@ -105,7 +105,7 @@ def ask_area(
 
 
 def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
-    """By how much each block's squared residuals, in variances, fall if it moves as it likes instead of by δ."""
+    """Return by how much each block's squared residuals, in variances, fall if it moves as it likes, not by δ."""
     pull = blocks.hessian @ delta + blocks.gradient
     return jnp.einsum("bi,bij,bj->b", pull, blocks.inverse, pull)
 
@@ -171,7 +171,7 @@ def surface_area(inverse_depth: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
-    """Of values at all pixels asked; what is left over at the right and below is left out."""
+    """Sum values at all pixels asked by blocks; what is left over at the right and below is left out."""
     height, width = (-(-size // STRIDE) for size in (camera.height, camera.width))
     rows, columns = _grid(camera)
     image = values.reshape(-1, height, width)[:, : rows * CELL, : columns * CELL]
@@ -179,7 +179,7 @@ def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b
 
 
 def _inverses(matrices: Float[Array, "b 6 6"]) -> Float[Array, "b 6 6"]:
-    """Of positive definite matrices, by Gauss-Jordan elimination: LAPACK's call takes ten times as long."""
+    """Invert positive definite matrices by Gauss-Jordan elimination: LAPACK's call takes ten times as long."""
     identity = jnp.broadcast_to(jnp.eye(6), matrices.shape)
     rows = jnp.moveaxis(jnp.concatenate([matrices, identity], axis=-1), 0, -1)
     for k in range(6):

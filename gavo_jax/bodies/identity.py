@@ -22,7 +22,7 @@ UNSEEN = 15
 """Frames after which a body that is not seen is forgotten."""
 
 
-class Roll(NamedTuple):
+class BodyTracks(NamedTuple):
     """The bodies that are known, and where they were seen last."""
 
     labels: Integer[np.ndarray, "h w"]
@@ -38,7 +38,7 @@ class Roll(NamedTuple):
     """The largest number given so far."""
 
     @classmethod
-    def empty(cls, size: tuple[int, int]) -> "Roll":
+    def empty(cls, size: tuple[int, int]) -> "BodyTracks":
         """Nothing is known, of an image of some height and width."""
         return cls(
             np.zeros(size, np.int32),
@@ -88,35 +88,35 @@ def body_components(
     return labels
 
 
-def associate(found: Integer[np.ndarray, "h w"], roll: Roll) -> Roll:
+def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTracks:
     """Give each part of a mask the number of the known body that it overlaps most, or a new one.
 
     Args:
         found: Of `body_components`, in the new frame.
-        roll: Of the frame before, its labels moved to where they are expected in the new one.
+        tracks: Of the frame before, its labels moved to where they are expected in the new one.
     """
     overlaps = sorted(
-        (-int(np.sum((found == part) & (roll.labels == number))), part, number)
+        (-int(np.sum((found == part) & (tracks.labels == number))), part, number)
         for part in range(1, int(found.max(initial=0)) + 1)
-        for number in roll.numbers[roll.numbers > 0]
+        for number in tracks.numbers[tracks.numbers > 0]
     )
     given: dict[int, int] = {}
     for overlap, part, number in overlaps:
         if overlap < 0 and part not in given and number not in given.values():
             given[part] = int(number)
-    last = int(roll.last)
+    last = int(tracks.last)
     for part in range(1, int(found.max(initial=0)) + 1):
         if part not in given:
             last += 1
             given[part] = last
     labels = np.array([0, *(given[part] for part in range(1, len(given) + 1))], np.int32)[found]
-    lasting = [i for i, n in enumerate(roll.numbers) if n > 0 and n not in given.values() and roll.ages[i] < UNSEEN]
+    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in given.values() and tracks.ages[i] < UNSEEN]
     for i in lasting:  # hidden, or at rest for a moment: where it was seen it is expected
-        labels = np.where((labels == 0) & (roll.labels == roll.numbers[i]), roll.numbers[i], labels)
-    after = Roll.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels)
-    entries = [(n, 0) for n in given.values()] + [(int(roll.numbers[i]), int(roll.ages[i]) + 1) for i in lasting]
+        labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
+    after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels)
+    entries = [(n, 0) for n in given.values()] + [(int(tracks.numbers[i]), int(tracks.ages[i]) + 1) for i in lasting]
     for place, (number, age) in enumerate(entries[:MOST]):
         after.numbers[place], after.ages[place] = number, age
-        for old in np.flatnonzero(roll.numbers == number):
-            after.motions[place], after.seconds[place] = roll.motions[old], roll.seconds[old]
+        for old in np.flatnonzero(tracks.numbers == number):
+            after.motions[place], after.seconds[place] = tracks.motions[old], tracks.seconds[old]
     return after._replace(last=np.int32(last))  # pyright: ignore[reportArgumentType]

@@ -8,12 +8,12 @@ from jaxtyping import Float64, Integer
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import VelocityChange
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.identity import Roll, associate
+from gavo_jax.bodies.identity import BodyTracks, associate
 from gavo_jax.bodies.records import Seen
-from gavo_jax.bodies.scene import AwareState, Retina
+from gavo_jax.bodies.scene import AwareState, MotionSegmenter
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
-from gavo_jax.objective.points import Reference, unsettle_reference
+from gavo_jax.objective.points import Reference, apply_rolling_shutter
 from gavo_jax.odometry.plausibility import Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.status import AlignmentStatus
@@ -30,7 +30,7 @@ def find_motions(
     found: Integer[np.ndarray, "h w"],
     belief: Belief,
     inverse_depth: Float64[np.ndarray, "h w"],
-) -> tuple[Roll, tuple[Seen, ...]]:
+) -> tuple[BodyTracks, tuple[Seen, ...]]:
     """The bodies of a new frame by their numbers, with their motions where these are asked for.
 
     Args:
@@ -42,31 +42,33 @@ def find_motions(
         belief: Of its pixels.
         inverse_depth: Of them, 1/m; 0 where there is no reading.
     """
-    before = Roll(*map(np.asarray, state.scene.roll))
-    roll = associate(found, before)
+    before = BodyTracks(*map(np.asarray, state.scene.tracks))
+    tracks = associate(found, before)
     moving = np.asarray(belief.moving)
     seen = []
-    for place, (number, age) in enumerate(zip(roll.numbers, roll.ages, strict=True)):
-        part = (roll.labels == number) & (found > 0)
+    for place, (number, age) in enumerate(zip(tracks.numbers, tracks.ages, strict=True)):
+        part = (tracks.labels == number) & (found > 0)
         if number == 0 or age > 0 or not np.any(part):
             continue
         alignment = None
         if aware.tracks and np.any(before.labels == number):
             alignment = _align(aware, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
-            roll.motions[place], roll.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
+            tracks.motions[place], tracks.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
-        centroid = _centroid(part, inverse_depth, aware.retina)
+        centroid = _centroid(part, inverse_depth, aware.segmenter)
         seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))
-    return roll, tuple(seen)
+    return tracks, tuple(seen)
 
 
-def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: Roll, number: int) -> Alignment:
+def _align(
+    aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: BodyTracks, number: int
+) -> Alignment:
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
     whole = state.whole
     if np.any(state.tracker.instant_motion):
-        whole = _unsettled(whole, state.tracker, aware.retina)
+        whole = _with_rolling_shutter(whole, state.tracker, aware.segmenter)
     motion: Any = np.float32(before.motions[place])
     tracker = state.tracker._replace(
         previous=whole,
@@ -77,19 +79,21 @@ def _align(aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, be
         seconds=np.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )
-    return aware.search.align(aware.retina.without(tracker, before.labels != number), frame, clock).result
+    return aware.search.align(aware.segmenter.without(tracker, before.labels != number), frame, clock).result
 
 
-def _unsettled(whole: Reference, tracker: TrackerState, retina: Retina) -> Reference:
+def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
     """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
-    twist = tracker.instant_motion * (retina.full.readout / tracker.seconds)
-    return unsettle_reference(whole, twist, retina.planes)
+    twist = tracker.instant_motion * (segmenter.full.readout / tracker.seconds)
+    return apply_rolling_shutter(whole, twist, segmenter.planes)
 
 
-def _centroid(part: np.ndarray, inverse_depth: Float64[np.ndarray, "h w"], retina: Retina) -> Float64[np.ndarray, " 3"]:
+def _centroid(
+    part: np.ndarray, inverse_depth: Float64[np.ndarray, "h w"], segmenter: MotionSegmenter
+) -> Float64[np.ndarray, " 3"]:
     """Mean of the points that the pixels of a mask show, in the camera; not-a-number without any reading."""
     v, u = np.nonzero(part & (inverse_depth > 0))
     if len(u) == 0:
         return np.full(3, np.nan)
-    x, y = to_ray(retina.camera, u, v)
+    x, y = to_ray(segmenter.camera, u, v)
     return np.mean(np.stack([x, y, np.ones_like(x)]) / inverse_depth[v, u], axis=1)

@@ -74,7 +74,7 @@ class Body:
 
     @property
     def status(self) -> str:
-        """In a word: that of its motion; `seen` where there is none."""
+        """The status of its motion in a word; `seen` where there is none."""
         return "seen" if self.alignment is None else str(self.alignment.status)
 
 

@@ -19,7 +19,7 @@ from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.aligner import BodyAware, deviation, mistrusted
 from gavo_jax.bodies.evidence import View, inverse_depth_of
-from gavo_jax.bodies.identity import Roll
+from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
@@ -115,7 +115,7 @@ class RivalledState(NamedTuple):
 
     @property
     def tracker(self) -> TrackerState:
-        """Of the first search."""
+        """State of the first search."""
         return self.first.tracker
 
 
@@ -151,7 +151,7 @@ class WithRival:
         return RivalledState(state, rival, BEGUN)
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
+        """Predict by the first one."""
         return self.first.predict(state.first, elapsed)
 
     def align(self, state: RivalledState, frame: Frame, clock: Clock) -> Attempt:
@@ -184,7 +184,8 @@ class WithRival:
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         age = float(rival.age.seconds)
         onward = np.asarray(other.result.target_T_reference, np.float64)
-        covariance = _in_target(other.result) + transport_covariance(onward, np.float64(rival.covariance))
+        before_it = transport_covariance(onward, np.asarray(rival.covariance, np.float64))
+        covariance = before_it + _in_target(other.result)
         contradiction = _distance(first, second, _in_target(attempt.result) + covariance)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
@@ -196,7 +197,7 @@ class WithRival:
         far, ahead, is_asked = 0.0, 0, _exceeds(apart, APART)
         if is_asked:
             motions = np.stack([first, second]).astype(np.float32)
-            margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.retina.camera)
+            margin = vote(rival.anchor, _view(attempt.state), motions, rival.near, self.first.segmenter.camera)
             whole, far = float(margin.whole), float(margin.far)
             ahead = int(rival.ahead) + 1 if whole > MAJORITY and far > FAR_MAJORITY else 0
             if uncertainty < EXACT and far > 0.0 and (ahead >= FRAMES or whole > LANDSLIDE):
@@ -244,7 +245,7 @@ class WithRival:
     def _nobody(self) -> Rival:
         """No rival, in the shapes and types of every one."""
         blank, still = self.first.blank_state(), np.eye(4, dtype=np.float32)
-        nothing = np.zeros(self.first.retina.size, bool)
+        nothing = np.zeros(self.first.segmenter.size, bool)
         exact = np.zeros((6, 6), np.float32)
         return Rival(blank, _view(blank), nothing, np.bool_(False), still, still, exact, OVER, np.int32(0))
 
@@ -256,21 +257,21 @@ class WithRival:
         """The motion of what the last frame shows behind all that stands before other surfaces, from here on; nobody if
         only such surfaces are asked for, and there are none.
         """
-        retina, anchor = self.first.retina, _view(state)
+        segmenter, anchor = self.first.segmenter, _view(state)
         near, stands_before = nearer_part(inverse_depth_of(anchor))
         if not np.any(near) or (standing_before and not stands_before):
             return self._nobody
-        number = np.int32(state.scene.roll.last + 1)
-        roll = Roll.empty(retina.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
-        roll.numbers[0] = number
+        number = np.int32(state.scene.tracks.last + 1)
+        tracks = BodyTracks.empty(segmenter.size)._replace(labels=number * near.astype(np.int32), last=number)  # pyright: ignore[reportArgumentType]
+        tracks.numbers[0] = number
         scene = state.scene._replace(
             known=np.asarray(near, np.float32),  # pyright: ignore[reportArgumentType]
             suspected=np.asarray(near, np.float32),
-            roll=roll,
+            tracks=tracks,
             carried=np.zeros((), np.float32),
         )
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
-        seen = state._replace(tracker=retina.without(tracker, near), scene=scene)
+        seen = state._replace(tracker=segmenter.without(tracker, near), scene=scene)
         return self._nobody._replace(
             state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=BEGUN
         )
@@ -283,7 +284,7 @@ def _open(attempt: Attempt, open_for: Span) -> Attempt:
 
 
 def _view(state: AwareState) -> View:
-    """Of the last frame, on the host: to slice a device's array takes a program."""
+    """Return the last frame's view, on the host: to slice a device's array takes a program."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 

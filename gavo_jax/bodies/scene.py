@@ -13,7 +13,7 @@ from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.belief import Belief, form_belief
 from gavo_jax.bodies.consensus import Opinion, ask_area, has_blocks
 from gavo_jax.bodies.evidence import View, seen_level, view_of
-from gavo_jax.bodies.identity import Roll
+from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.masking import without_points
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import ImagePlane, Levels
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
     """What is known of the last frame's pixels; see `Belief.known`."""
     suspected: Float[Array, "h w"]
     """Which of these pixels are suspected; see `belief.suspect`."""
-    roll: Roll
+    tracks: BodyTracks
     """The bodies that it shows."""
     views: View
     """Views of the last frame, an older one and one between them, [3]: what moves slowly shows in the older one."""
@@ -75,7 +75,7 @@ class FrameView(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Retina:
+class MotionSegmenter:
     """The level of the pyramid that bodies are seen on, and how beliefs are formed there.
 
     Attributes:
@@ -107,7 +107,7 @@ class Retina:
         return self.camera.height, self.camera.width
 
     def view(self, tracker: TrackerState) -> View:
-        """Of a tracker's last frame, on the host: to slice a device's array takes a program."""
+        """Return a tracker's last frame, on the host: to slice a device's array takes a program."""
         sweep = np.asarray(tracker.instant_motion) * (self.full.readout / np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
@@ -119,7 +119,7 @@ class Retina:
         still: Any = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
         nothing: Any = np.zeros((), np.float32)
         views = View(Target(words, words), sweeps)
-        return Scene(unknown, unknown, Roll.empty(self.size), views, still, nothing, nothing)
+        return Scene(unknown, unknown, BodyTracks.empty(self.size), views, still, nothing, nothing)
 
     def first(self, tracker: TrackerState) -> Scene:
         """A scene of which one frame is known."""
@@ -171,7 +171,7 @@ class Retina:
 
 
 def _age_after(scene: Scene, elapsed: float) -> float:
-    """Of the view between the last frame and the older one; 0 where that has become the older one."""
+    """Return the view's age, seconds, between the last frame and the older one; 0 where it became the older one."""
     age = float(scene.age) + elapsed
     return age if age < OLD else 0.0
 

@@ -300,7 +300,7 @@ def _judged(leasts: dict[str, Least], trial: _Trial, interval: float, guessed: s
 
 
 def _depth_scale(sequence: Sequence) -> Found:
-    """By the steps between depths, where the sensor is one of those."""
+    """Find the unit of depth by the steps between depths, where the sensor is one of those."""
     sample, _ = sample_sequence(sequence)
     camera, unit = sequence.camera, "units per metre"
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]

@@ -14,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
+from gavo_jax.alignment.fitting import fit_objective
 from gavo_jax.alignment.search import align_views
-from gavo_jax.alignment.visits import fit_objective, levels_of, prepare_target, stack_levels
+from gavo_jax.alignment.visits import levels_of, prepare_target, stack_levels
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, moved
 from gavo_jax.objective.estimates import estimate_scales
-from gavo_jax.objective.points import Reference, make_references, settle_reference
+from gavo_jax.objective.points import Reference, make_references, undo_rolling_shutter
 from gavo_jax.se3 import exp, log, rigid_inverse
 from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -127,7 +128,7 @@ class Kinematics(NamedTuple):
 
     @classmethod
     def of(cls, stamps: np.ndarray, matched: "Matched") -> "Kinematics":
-        """From the motions between the frames: central differences of fourth order, of second order near the ends."""
+        """Derive them from the motions between frames: central differences of fourth order, of second near the ends."""
         seconds = np.diff(stamps)[:, None]
         between = np.nan_to_num(np.asarray(matched.xi)) / seconds
         velocity = np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
@@ -143,7 +144,7 @@ class Kinematics(NamedTuple):
         )
 
     def some(self, frames: Integer[np.ndarray, " n"], stamps: np.ndarray) -> "Kinematics":
-        """Of some of the frames: what the camera does at their moments, and what it has done from one to the next."""
+        """Select some frames: what the camera does at their moments, and what it has done from one to the next."""
         steps, guesses = np.asarray(self.guesses, np.float64), np.tile(np.eye(4), (len(frames), 1, 1))
         for place, (first, last) in enumerate(pairwise(frames)):
             for step in steps[first:last]:
@@ -202,7 +203,7 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         # the target's rows are taken as moving on by the mean velocity; so the reference's move by as much less as the
         # camera really gained between the two
         gained = kinematics.velocity[first + 1] - kinematics.velocity[first]
-        reference = settle_reference(reference, (kinematics.between[first] - gained) * unknowns.readout)
+        reference = undo_rolling_shutter(reference, (kinematics.between[first] - gained) * unknowns.readout)
         share = unknowns.readout / (stretch.stamps[first + 1] - stretch.stamps[first])
         key, guess = jax.random.key(0), kinematics.guesses[first][None]
         found, _ = align_views((reference,), target, seen, levels, SOLVER, OPTIONS, key, guess, readout=share)
@@ -223,8 +224,8 @@ ONE_SURFACE = 0.03
 def depth_moved(
     inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
 ) -> Float[Array, "h w"]:
-    """As `image.warp.synchronise_depth`, interpolated: what is looked up at the nearest pixel does not change for moves
-    of less than half a pixel, and here it is the small changes that count.
+    """Interpolate what `synchronise_depth` looks up at the nearest pixel: that does not change for moves of less than
+    half a pixel, and here it is the small changes that count.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, seen by the camera where it stood when depth was read.

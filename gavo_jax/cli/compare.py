@@ -230,7 +230,7 @@ def _run_method(sequence: Sequence, method: str, preset_name: str, seed: int | N
     tracked = track_visibly(label, sequence, odometry)
     if tracked.interrupted:
         raise KeyboardInterrupt
-    outcome = tracked.concluded(sequence)
+    outcome = tracked.outcome(sequence)
     metrics = {
         **run_identity(sequence.name, method, None if peer else preset_name, seed),
         **outcome.figures,

@@ -21,7 +21,7 @@ from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import run_identity
-from gavo_jax.odometry.run import conclude
+from gavo_jax.odometry.run import finish_run
 from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
@@ -68,7 +68,7 @@ def run_live(options: Run) -> int:
         metrics: dict[str, Any] = {
             **run_identity(device.name, method, preset, options.seed),
             "complete": end.fault is None,
-            **conclude(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
+            **finish_run(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             **{"frames_received": newest.received, "frames_dropped": newest.dropped},
         }
         folder.finish(metrics)

@@ -54,7 +54,7 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class SearchOptions:
     """How."""
 
     method: Annotated[
@@ -78,7 +78,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Run(Search, Source):
+class Run(SearchOptions, Source):
     """Estimate the trajectory of a sequence."""
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}. {LIVE}.")] = "synthetic"
@@ -163,7 +163,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Align(Search):
+class Align(SearchOptions):
     """Align one pair of RGB-D images and print the motion as JSON."""
 
     rgb0: Annotated[Positional[Path], arg(metavar="RGB0")]

@@ -28,12 +28,12 @@ from gavo_jax.inspection import left_out, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.run import conclude
-from gavo_jax.odometry.second_thoughts import blank_of
+from gavo_jax.odometry.run import finish_run
 from gavo_jax.output.drawing import draw, draw_search
 from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
@@ -182,7 +182,7 @@ def _track(
     if tracked.interrupted:
         folder.save_checkpoint()
     outcome = interruptible(
-        lambda: conclude(
+        lambda: finish_run(
             float(sequence.timestamps[0]),
             folder.steps(),
             sequence.ground_truth,
@@ -195,7 +195,7 @@ def _track(
     if outcome.loops is not None:
         outcome.trajectory.write_tum(folder.path / TRAJECTORY)
         write_loops(folder.path, outcome.loops)
-        viewer.conclude(outcome.trajectory, outcome.loops)
+        viewer.show_corrected(outcome.trajectory, outcome.loops)
     metrics = {
         **run_identity(sequence.name, options.method, options.preset, options.seed),
         "complete": len(outcome.steps) == len(sequence) - 1,

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax import presets
-from gavo_jax.cli.options import Run, Search, Source
+from gavo_jax.cli.options import Run, SearchOptions, Source
 from gavo_jax.datasets.actors import MOST_BODIES
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live
@@ -66,7 +66,7 @@ def reading_of(source: Source) -> Reading:
     )
 
 
-def choose_settings(search: Search) -> NamedSettings:
+def choose_settings(search: SearchOptions) -> NamedSettings:
     """Return the settings that the options say: a preset's or a file's, with single ones replaced.
 
     Raises:
@@ -80,7 +80,7 @@ def choose_settings(search: Search) -> NamedSettings:
         named = load_settings(search.settings, search.method, search.preset)
         for name in ("method", "preset"):
             asked, said = getattr(search, name), getattr(named, name)
-            if asked not in (said, getattr(Search, name)):
+            if asked not in (said, getattr(SearchOptions, name)):
                 raise GavoError(f"--{name} {asked}: {search.settings} says {said}: leave one of the two out")
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 

@@ -156,7 +156,7 @@ class FrameAssembler:
 
     @property
     def camera(self) -> Camera:
-        """Of the frames as they come."""
+        """Camera of the frames as they come."""
         return self.recorded.rectified() if self.undistort else self.recorded
 
     def frame(
@@ -234,7 +234,7 @@ class FrameAssembler:
 
     @cached_property
     def _with_grey(self) -> np.ndarray:
-        """Where an undistorted image holds what was recorded, and not a border that was drawn on."""
+        """Pixels of an undistorted image that hold what was recorded, and not a border that was drawn on."""
         everywhere = np.ones((self.recorded.height, self.recorded.width), np.uint16)
         return self.recorded.undistort_depth(everywhere) > 0
 

@@ -80,7 +80,7 @@ class BagSequence:
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the file's ending, or the folder's metadata."""
+        """Recognise a recording by the file's ending, or the folder's metadata."""
         return (path / METADATA).is_file() if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
     @classmethod
@@ -101,12 +101,12 @@ class BagSequence:
 
     @property
     def camera(self) -> Camera:
-        """Of the frames as they come."""
+        """Camera of the frames as they come."""
         return self._shared.assembler.camera
 
     @property
     def depth_unit(self) -> DepthUnit:
-        """Of the messages, and of frames."""
+        """Units of depth in the messages, and in frames."""
         return self._shared.assembler.unit
 
     def __len__(self) -> int:

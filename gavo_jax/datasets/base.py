@@ -81,7 +81,7 @@ class Frame:
 
     @property
     def depth_delay(self) -> float:
-        """From the colour image to the depth image, seconds; 0 where that is not known, or beyond `MOST_DELAY`."""
+        """Seconds from the colour image to the depth image; 0 where that is not known, or beyond `MOST_DELAY`."""
         delay = 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
         return delay if abs(delay) <= MOST_DELAY else 0.0
 

@@ -157,12 +157,12 @@ class FileSequence:
 
     @property
     def camera(self) -> Camera:
-        """Of the frames as they come: without distortion when they are undistorted, else as recorded."""
+        """Camera of the frames as they come: without distortion when they are undistorted, else as recorded."""
         return self._images.assembler.camera
 
     @property
     def depth_unit(self) -> DepthUnit:
-        """Of the files, and of frames."""
+        """Units of depth in the files, and in frames."""
         return self._images.assembler.unit
 
     @property

@@ -145,7 +145,7 @@ class SevenScenes(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the names of the images."""
+        """Recognise a folder by the names of the images."""
         return bool(_any(path, "frame-*.color.*")) and bool(_any(path, "frame-*.depth.*"))
 
     @classmethod
@@ -179,7 +179,7 @@ class ScanNet(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the file of the colour camera, beside images and, unless it has a folder, poses."""
+        """Recognise a folder by the file of the colour camera, beside images and, unless it has a folder, poses."""
         file = cls._intrinsics(path, "color")
         if file is None or not all((path / name).is_dir() for name in ("color", "depth")):
             return False
@@ -226,7 +226,7 @@ class Replica(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the names of the images."""
+        """Recognise a folder by the names of the images."""
         results = path / "results"
         return results.is_dir() and all(_any(results, f"{kind}[0-9]*") for kind in ("frame", "depth"))
 
@@ -268,7 +268,7 @@ class PlainFolder(FileSequence):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the folders' names, or the files'."""
+        """Recognise a folder by its folders' names, or the files'."""
         color, depth = plain_files(path)
         return bool(color and depth)
 
@@ -330,7 +330,7 @@ class Open3DFolder(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the intrinsics' file beside the images."""
+        """Recognise a folder by the intrinsics' file beside the images."""
         return cls._intrinsics(path) is not None and super().recognises(path)
 
     @classmethod

@@ -127,7 +127,7 @@ def _unpacked(image: np.ndarray) -> np.ndarray:
 
 
 def to_float32(image: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """In single precision; what is too large for it is infinite."""
+    """Convert to single precision; what is too large for it is infinite."""
     with np.errstate(over="ignore"):
         return image.astype(np.float32)
 
@@ -289,7 +289,7 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
 
 
 def _decode_npz(data: bytes, name: str) -> np.ndarray:
-    """Of an archive of NumPy arrays the one named depth, else the only one."""
+    """Decode an archive of NumPy arrays: the one named depth, else the only one."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         named = [entry for entry in archive.infolist() if entry.filename == "depth.npy"]
@@ -333,7 +333,7 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
 
 
 def _depth_channel(channels: Mapping[str, Any], name: str) -> np.ndarray:
-    """Of an OpenEXR image: the channel that its name says is depth, else the only one; colour may be grey."""
+    """Return the channel of an OpenEXR image that its name says is depth, else the only one; colour may be grey."""
     parts = {key: key.lower().split(".") for key in channels}
     named = [key for key in channels if parts[key][-1] in ("z", "d") or any("depth" in part for part in parts[key])]
     chosen = named or list(channels)

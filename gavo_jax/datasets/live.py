@@ -39,7 +39,7 @@ class LiveDevice(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """As it records: with its distortion."""
+        """The camera as it records: with its distortion."""
         ...
 
     def read(self) -> LiveImages | None:

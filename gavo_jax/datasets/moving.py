@@ -40,7 +40,7 @@ class MovingPart:
     path: Path | Trajectory
 
     def world_T_part(self, seconds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-        """Where the part is, seconds after the sequence's first frame.
+        """Return the pose of the part, seconds after the sequence's first frame.
 
         Raises:
             GavoError: the path gives something else than rigid transforms.

@@ -38,7 +38,7 @@ class OpenLoris(TumSequence):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the list of colour beside that of registered depth, or the sensors, where there is no list of TUM's."""
+        """Recognise a folder by its lists of colour and registered depth, or its sensors, without TUM's list."""
         color, *others = (path / name for name in (*cls.LISTS, cls.SENSORS))
         return color.exists() and any(file.exists() for file in others) and not (path / TumSequence.LISTS[0]).exists()
 
@@ -72,7 +72,7 @@ class OpenLoris(TumSequence):
 
 
 def _base_T_color(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Where the colour camera lies on the robot; None where no file or no chain of its transforms says it.
+    """Return where the colour camera lies on the robot; None where no file or no chain of its transforms says it.
 
     Raises:
         GavoError: the file is malformed.

@@ -43,7 +43,7 @@ class StrayScan(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By its own files, beside images."""
+        """Recognise a folder by the recorder's own files, beside images."""
         return all((path / name).is_file() for name in (cls.STAMPS, cls.MATRIX)) and all(plain_files(path))
 
     @classmethod
@@ -100,7 +100,7 @@ class ArkitScenes(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the cameras beside the images."""
+        """Recognise a folder by the cameras beside the images."""
         return (path / cls.CAMERAS).is_dir() and (path / "lowres_wide").is_dir() and super().recognises(path)
 
     @classmethod
@@ -132,13 +132,13 @@ class Record3D(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the camera in its file, beside images."""
+        """Recognise a folder by the camera in its file, beside images."""
         file = path / cls.FILE
         return file.is_file() and '"K"' in read_text(file, MAX_JSON_BYTES) and super().recognises(path)
 
     @classmethod
     def clock(cls, path: Path, reading: Reading) -> Seconds:
-        """As its file says, unless a rate is said."""
+        """Take the rate that its file says, unless one is said."""
         try:
             told = json.loads(read_text(path / cls.FILE, MAX_JSON_BYTES))
         except (ValueError, RecursionError):  # with a camera file in the folder it need not be one

@@ -80,7 +80,7 @@ def _notes() -> int:
 
 
 def _renew() -> None:
-    """In a process that was forked: a file of its own."""
+    """Give a process that was forked a file of its own."""
     if _notes.cache_info().currsize:
         os.close(_notes())
     _notes.cache_clear()

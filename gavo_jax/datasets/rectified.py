@@ -48,7 +48,7 @@ class Rectified:
 
     @property
     def name(self) -> str:
-        """As recorded."""
+        """Name of the recording."""
         return self._recorded.name
 
     @property
@@ -58,16 +58,16 @@ class Rectified:
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """As recorded."""
+        """Truth of the recording."""
         return self._recorded.ground_truth
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"]:
-        """As recorded."""
+        """Stamps of the recording, seconds."""
         return self._recorded.timestamps
 
     def __len__(self) -> int:
-        """As recorded."""
+        """Number of frames."""
         return len(self._recorded)
 
     @overload
@@ -85,5 +85,5 @@ class Rectified:
         return (self[index] for index in range(len(self)))
 
     def check(self) -> None:
-        """As recorded."""
+        """Check the recording."""
         self._recorded.check()

@@ -57,7 +57,7 @@ class Registration:
         return self._splat(u, v, moved, [size[seen] for size in self._footprints])
 
     def _points(self, seen: np.ndarray, metres: np.ndarray) -> list[np.ndarray]:
-        """Where readings lie in the colour camera: x, y, z."""
+        """Return where readings lie in the colour camera: x, y, z."""
         shift = self.color_T_depth[:3, 3].astype(np.float32)
         return [axis[seen] * metres + shift[i] for i, axis in enumerate(self._rays)]
 
@@ -104,7 +104,7 @@ class Registration:
 
     @cached_property
     def _rays(self) -> Float[np.ndarray, "3 pixels"]:
-        """Where each pixel of the depth camera looks, at 1 m along its axis, in the axes of the colour camera."""
+        """Points that the pixels of the depth camera see at 1 m along its axis, in the axes of the colour camera."""
         camera = self.depth
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         pixels, distortion = np.stack([u.ravel(), v.ravel()], -1)[:, None], np.array(camera.distortion)

@@ -170,7 +170,7 @@ def _supersample(room: Room, view: _View, camera: Camera, columns: np.ndarray, r
     x, y = (c.astype(np.float32)[:, None] + _SUPERSAMPLES[:, i] for i, c in enumerate((columns, rows)))
 
     def listed_rays(face: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the pixels in the face's rows (they come row by row) those that the face reaches into."""
+        """Return the pixels of the face's rows (they come row by row) that the face reaches into."""
         start, stop = np.searchsorted(rows, view.box[face, 2:] + [-1, 2])
         centre = np.stack([columns[start:stop], rows[start:stop], np.ones(stop - start)]).astype(np.float32)
         q, s, t = view.forms[face] @ centre

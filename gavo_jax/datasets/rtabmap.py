@@ -26,7 +26,7 @@ class RtabMap(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the cameras beside the images."""
+        """Recognise a folder by the cameras beside the images."""
         return bool(_cameras(path)) and super().recognises(path)
 
     @classmethod

@@ -32,14 +32,14 @@ class Topic(NamedTuple):
 
     @property
     def span(self) -> str:
-        """From when to when it goes, in words."""
+        """The first and the last stamp, in words."""
         if not len(self.stamps):
             return f"{self.name} has no message"
         return f"{self.name} goes from {np.nanmin(self.stamps):.3f} to {np.nanmax(self.stamps):.3f}"
 
 
 def in_one_time(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
-    """By the headers' stamps, without which a message has no partner; where a topic has none, all by their arrival.
+    """Stamp both by the headers, without which a message has no partner; where a topic has none, by arrival.
 
     Stamps that stand still are none.
     """

@@ -47,7 +47,7 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """By the folders of the second version, or the names of the first one's images: others have such folders."""
+        """Recognise the second version by its folders, the first one by its images' names: others have such folders."""
         color, depth = (path / f"{kind}_{FIRST}" for kind in ("image", "depth"))
         is_first = any(color.glob(f"*_{FIRST}.*")) and any(depth.glob(f"*_{FIRST}_depth.*"))
         return is_first or _is_second(path)
@@ -80,7 +80,7 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """By the rate of the second version."""
+        """Count by the rate of the second version."""
         return {number: number / RATE_OF_SECOND for number in cls.find(path).color} if _is_second(path) else {}
 
     @classmethod

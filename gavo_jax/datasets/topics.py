@@ -43,7 +43,7 @@ class Images(NamedTuple):
 
     @classmethod
     def of(cls, kind: str, message: Any, topic: str) -> "Images":
-        """Of a message of type `kind`."""
+        """Describe a topic by a message of type `kind`."""
         return cls(is_depth(kind, message, topic), encoding_of(kind, message), message.header.frame_id)
 
 

@@ -92,7 +92,7 @@ def _timed(truth: Trajectory, place: Path, frames: list[float], seconds: Seconds
 
 
 def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seconds) -> int:
-    """By how much the numbers of a truth are behind those of the images.
+    """Return by how much the numbers of a truth are behind those of the images.
 
     As many poses as images, each without a gap, are those of the images in their order.
 

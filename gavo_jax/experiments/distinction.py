@@ -43,7 +43,7 @@ def _part(configuration: Any, keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _names(entries: Sequence[tuple[str, str, dict[str, Any]]]) -> dict[str, str]:
-    """From (run, name, configuration), a name for each run: equal ones only where configurations are equal."""
+    """Name each run of (run, name, configuration): equal names only where configurations are equal."""
     plain: dict[str, dict[str, Any]] = {}
     given: dict[tuple[str, str], str] = {}
     found = {}

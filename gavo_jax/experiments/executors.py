@@ -98,7 +98,7 @@ class RayExecutor:
                 raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
 
     def slots(self) -> int:
-        """As many as the cluster's processors and GPUs allow now."""
+        """Count how many runs the cluster's processors and GPUs allow now."""
         resources = self._ray.cluster_resources()
         return max(1, int(min(resources.get(name, 0.0) // n for name, n in self._wanted.items() if n)))
 

@@ -8,8 +8,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
 
-from gavo_jax.alignment.pairs import Images, align_rows, concluded, stacked_pairs, starts_of
+from gavo_jax.alignment.pairs import align_rows, starts_of
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.review import review
+from gavo_jax.alignment.stacking import Images, stacked_pairs
 from gavo_jax.camera import Camera
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -59,7 +61,7 @@ def align_batch_sharded(
     rows = (*(tuple(side) for side in sides), jax.random.key_data(keys), starts)
     found = align_all(*jax.tree.map(lambda leaf: _laid_out(leaf, mesh), rows))
     found = jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True)[:count], found)
-    return concluded(found, (references, targets), sides, camera, settings, guesses)
+    return review(found, (references, targets), sides, camera, settings, guesses)
 
 
 def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:

@@ -25,10 +25,10 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.odometry.aligners import Attempt, Search, traced_part
+from gavo_jax.odometry.composition import with_recovery
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.second_thoughts import with_recovery
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
 from gavo_jax.precision import in_32_bits
@@ -175,7 +175,7 @@ class _Stacked:
         return 0.0
 
     def start(self, frame: Frame) -> TrackerState:
-        """As of a single run, whose program the stack has no other use for."""
+        """Start as a single run does, whose program the stack has no other use for."""
         settings = self.search.settings
         return first_state(frame.grey, frame.depth, self.search.camera, settings.solver, settings.alignment)
 
@@ -186,7 +186,7 @@ class _Stacked:
         return self.search.judged(state, self.made.after(), self.made.result, frame, clock)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """As of a single run."""
+        """Predict as a single run does."""
         return self.search.predict(state, elapsed)
 
 

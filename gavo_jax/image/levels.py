@@ -75,7 +75,7 @@ class Levels:
 
     @cached_property
     def layout(self) -> AtlasLayout:
-        """Where each lies in an atlas."""
+        """Places of the levels in an atlas."""
         return atlas_layout(self.sizes)
 
     @cached_property

@@ -9,15 +9,7 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.levels import ImagePlane
-from gavo_jax.image.warp import Points, Warped
-
-
-class Slopes(NamedTuple):
-    """Derivatives of what is sampled at warped points."""
-
-    along_u: Float[Array, "*n"]
-    along_v: Float[Array, "*n"]
-    along_inverse_depth: Float[Array, "*n"]
+from gavo_jax.image.warp import Points, Slopes, Warped
 
 
 class Shutter(NamedTuple):
@@ -40,7 +32,7 @@ def row_time(v: Float[Array | np.ndarray, "*n"] | float, camera: Camera | ImageP
 
 
 def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane) -> Warped:
-    """Where warped points really are when the row on which they land is read.
+    """Return where warped points really are when the row on which they land is read.
 
     The camera moves on along ξ meanwhile, so each point goes on along its own way from the reference, by the share of
     the motion that falls into its delay; and by its sway on top of that. To first order in that share, a few hundredths

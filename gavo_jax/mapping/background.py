@@ -45,7 +45,7 @@ class BackgroundMapper:
         self._ahead.append(self._worker.submit(in_32_bits(self.mapper.watch), frame, step))
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
+        """Return where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
         return self._after_all(self.mapper.find, frame, segment)
 
     def replay(self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
-from gavo_jax.image.settling import Still, still
+from gavo_jax.image.motion_compensation import CompensatedImages, compensate_motion
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
@@ -44,7 +44,7 @@ class Thumbnail(NamedTuple):
     """Grey of these pixels."""
 
     @classmethod
-    def of(cls, images: Still, camera: Camera) -> Self:
+    def of(cls, images: CompensatedImages, camera: Camera) -> Self:
         """That of a keyframe's images, and their camera."""
         level = level_of_thumbnail(camera)
         tiny, side = camera.level(level), 2**level
@@ -127,7 +127,7 @@ class Keyframe:
     world_T_odometry: Float64[np.ndarray, "4 4"]
     world_T_camera: Float64[np.ndarray, "4 4"]
     step: Float64[np.ndarray, "6 6"] | None
-    images: Still | None
+    images: CompensatedImages | None
     thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Earlier keyframes that it was aligned with, by number, with the guess of that."""
@@ -196,7 +196,7 @@ class Keyframes:
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """
         delay = frame.depth_delay
-        images = still(frame.grey, frame.depth, self.full, twist, delay)
+        images = compensate_motion(frame.grey, frame.depth, self.full, twist, delay)
         return Keyframe(
             number=len(self.all),
             index=index,
@@ -225,7 +225,7 @@ class Keyframes:
         return [keyframe for keyframe in self.all if keyframe.images is not None]
 
     def _thin(self) -> None:
-        """Where there are too many images, give up those of the later one of the two keyframes that are nearest to each
+        """Give up images where there are too many: those of the later one of the two keyframes that are nearest to each
         other: the older a keyframe, the more a loop to it tells.
         """
         kept = self.searchable()

@@ -127,7 +127,7 @@ class Mapper:
             self._newest = frame, step, twist
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
+        """Return where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
         self._place = place = self._find(frame, [k for k in self.keyframes.searchable() if k.segment != segment])
         if place is None or place.edge.alignment is None:
             return None
@@ -135,7 +135,7 @@ class Mapper:
         return Found(place.edge.alignment, place.keyframe.timestamp, world_T_camera, place.keyframe.segment)
 
     def _find(self, frame: Frame, keyframes: list[Keyframe]) -> Place | None:
-        """Where a frame was taken, among some keyframes."""
+        """Return where a frame was taken, among some keyframes."""
         lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
         return self.recogniser.find(lost, keyframes)
 
@@ -289,7 +289,7 @@ def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6
 
 
 def tied_segments(keyframes: list[Keyframe], edges: Iterable[Edge]) -> dict[int, int]:
-    """Of each segment the first one that edges tie it to, over others or not; itself where nothing does."""
+    """Return, of each segment, the first one that edges tie it to, over others or not; itself where nothing does."""
     first = {keyframe.segment: keyframe.segment for keyframe in keyframes}
     for edge in edges:
         a, b = (first[keyframes[number].segment] for number in (edge.earlier, edge.later))

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 
 from gavo_jax.camera import Camera
 from gavo_jax.features import Features, detect, solve_motion
-from gavo_jax.image.settling import Still
+from gavo_jax.image.motion_compensation import CompensatedImages
 from gavo_jax.mapping.candidates import LoopCandidate
 from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.verification import Edge, Verifier
@@ -49,7 +49,7 @@ class Recogniser:
         self.camera, self.verifier = camera, verifier
 
     def find(self, frame: Keyframe, keyframes: list[Keyframe]) -> Place | None:
-        """Where a frame is, as a keyframe of its own; None where none of the others shows that.
+        """Return where a frame is, as a keyframe of its own; None where none of the others shows that.
 
         Args:
             frame: Its poses say nothing.
@@ -84,7 +84,7 @@ class Recogniser:
         return keyframe.features._replace(descriptors=keyframe.features.descriptors.astype(np.float32))
 
     def _detect(self, keyframe: Keyframe) -> Features:
-        images: Still | None = keyframe.images
+        images: CompensatedImages | None = keyframe.images
         assert images is not None
         return detect(images.grey, images.depth, self.camera)
 

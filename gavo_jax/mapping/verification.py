@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.alignment.pairs import Images, align_rows
+from gavo_jax.alignment.pairs import align_rows
 from gavo_jax.alignment.repetition import another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
+from gavo_jax.alignment.stacking import Images
 from gavo_jax.camera import Camera
-from gavo_jax.image.settling import Still
+from gavo_jax.image.motion_compensation import CompensatedImages
 from gavo_jax.mapping.candidates import MOST, LoopCandidate
 from gavo_jax.precision import in_32_bits
 from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
@@ -115,13 +116,16 @@ class Verifier:
         return not another_period_is_in_reach(motion, there.error, np.inf, images.grey, images.depth, self.camera)
 
     def _one_way(
-        self, references: list[Still | None], targets: list[Still | None], guesses: list[np.ndarray]
+        self,
+        references: list[CompensatedImages | None],
+        targets: list[CompensatedImages | None],
+        guesses: list[np.ndarray],
     ) -> list[Alignment]:
         if not guesses:
             return []
         padding = [(0, MOST - len(guesses)), (0, 0), (0, 0)]
 
-        def stacked(side: list[Still | None]) -> Images:
+        def stacked(side: list[CompensatedImages | None]) -> Images:
             known = [images for images in side if images is not None]
             return Images(
                 np.pad(np.stack([images.grey for images in known]), padding),

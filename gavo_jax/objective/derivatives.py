@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import ImagePlane
-from gavo_jax.image.shutter import Slopes, delayed_slopes
-from gavo_jax.image.warp import Warped
+from gavo_jax.image.shutter import delayed_slopes
+from gavo_jax.image.warp import Slopes, Warped
 from gavo_jax.objective.error import LINEARIZED_CHUNK, Objective, Residuals
 from gavo_jax.objective.points import Reference
 
@@ -56,14 +56,14 @@ def linearization(
     objective: Objective, tangent: Float[Array, "6 6"], sums: jax.Array, gradient: jax.Array, hessian: jax.Array
 ) -> Linearization:
     """E and its derivatives from sums over the points: of costs and points inside, and of the normal equations."""
-    error, overlap = objective.conclude(sums)
+    error, overlap = objective.error_and_overlap(sums)
     factor = 2.0 / objective.divisor(sums[1])
     return Linearization(error, overlap, factor * tangent.T @ gradient, factor * tangent.T @ hessian @ tangent)
 
 
 def weighted_terms(objective: Objective, reference: Reference, r: Residuals) -> list[Term]:
-    """For each channel J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is Σ J w r
-    over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
+    """Return each channel's J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is
+    Σ J w r over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
     """
     scales, facing, shutter = objective.scales, reference.facing, objective.shutter(reference)
     grey, depth = r.grey_sample, r.depth_sample

@@ -202,7 +202,7 @@ class Objective:
         inside = lane_sum((cost >= 0).astype(jnp.float32))
         return jnp.stack([lane_sum(cost) + (cost.size - inside), inside])
 
-    def conclude(self, sums: Float[Array, "2 ..."]) -> tuple[Float[Array, "*p"], Float[Array, "*p"]]:
+    def error_and_overlap(self, sums: Float[Array, "2 ..."]) -> tuple[Float[Array, "*p"], Float[Array, "*p"]]:
         """Errors and overlaps from the sums over all points."""
         total, inside = sums
         valid = jnp.maximum(self.readings(), 1.0)
@@ -237,7 +237,7 @@ class Objective:
 
     def error_of(self, r: Residuals) -> tuple[jax.Array, jax.Array]:
         """E and overlap of the motion of which these are the residuals, in this direction alone."""
-        return self.conclude(self.sums(self.cost(r)))
+        return self.error_and_overlap(self.sums(self.cost(r)))
 
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
@@ -268,7 +268,7 @@ def lane_sum(values: Float[Array, "*n"]) -> Float[Array, ""]:
 def _score_side_by_side(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
     """All candidates and points at once: what a GPU wants."""
     sums = jax.vmap(lambda motion: objective.sums(objective.cost(objective.residuals(motion))), out_axes=1)(motions)
-    error, overlap = objective.conclude(sums)
+    error, overlap = objective.error_and_overlap(sums)
     return jnp.where(counted, error, jnp.inf), overlap
 
 
@@ -296,7 +296,7 @@ def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Arra
 
     busy = -(-jnp.sum(counted) // group)
     sums = jax.lax.fori_loop(0, busy, score_group, jnp.zeros((2, candidates)))
-    error, overlap = objective.conclude(sums)
+    error, overlap = objective.error_and_overlap(sums)
     return jnp.where(counted, error, jnp.inf), overlap
 
 

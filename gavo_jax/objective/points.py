@@ -92,8 +92,8 @@ def move_reference(reference: Reference, camera_T_reference: Float[Array, "4 4"]
     return reference._replace(points=_rays(moved(reference.points, camera_T_reference), reference.points.q))
 
 
-def settle_reference(reference: Reference, twist: Float[Array, " 6"]) -> Reference:
-    """The points where they were at their frame's moment instead of when their rows were exposed.
+def undo_rolling_shutter(reference: Reference, twist: Float[Array, " 6"]) -> Reference:
+    """Return the points where they were at their frame's moment instead of when their rows were exposed.
 
     Args:
         reference: As the camera's rolling shutter saw it.
@@ -115,19 +115,19 @@ def swept(points: Points, twist: Float[Array, " 6"], share: Float[Array, "*n"]) 
 
 
 @jax.jit
-def unsettle_reference(reference: Reference, twist: Float[Array, " 6"], planes: ImagePlane) -> Reference:
-    """The points where their rows saw them, after `settle_reference` by a twist.
+def apply_rolling_shutter(reference: Reference, twist: Float[Array, " 6"], planes: ImagePlane) -> Reference:
+    """Return the points where their rows saw them: what `undo_rolling_shutter` by the same twist was given.
 
     Args:
-        reference: Settled, [L, N].
-        twist: That it was settled by.
+        reference: With the rolling shutter undone, [L, N].
+        twist: The same twist.
         planes: Of its levels, [L].
     """
     plane = jax.tree.map(lambda leaf: leaf[:, None], planes)
     seen = reference
     for _ in range(2):  # the row that a point was seen in is only known from where it was seen
         row = row_time(to_pixels(plane, seen.points.x, seen.points.y)[1], plane)
-        seen = settle_reference(reference._replace(row_time=row), -twist)._replace(row_time=row)
+        seen = undo_rolling_shutter(reference._replace(row_time=row), -twist)._replace(row_time=row)
     return seen
 
 

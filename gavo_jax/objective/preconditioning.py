@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gavo_jax.camera import to_pixels
-from gavo_jax.image.shutter import Slopes
-from gavo_jax.image.warp import Warped
+from gavo_jax.image.warp import Slopes, Warped
 from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.objective.error import Objective
 

@@ -122,7 +122,7 @@ class Search:
         return Frame(np.zeros(size, np.uint8), np.zeros(size, np.uint16), timestamp=0.0)
 
     def _inputs(self, state: TrackerState, frame: Frame, clock: Clock) -> tuple[Any, ...]:
-        """Of the program."""
+        """Return the inputs of the program."""
         settings, odometry = self.settings, traced_part(self.settings.odometry)
         images = (frame.grey, frame.depth)
         return state, *images, clock, self.key, self.camera, settings.solver, settings.alignment, odometry
@@ -169,7 +169,7 @@ class Search:
         return attempt if is_known else attempt._replace(state=at_rest(after))
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the twist of the last motion."""
+        """Predict by the twist of the last motion."""
         return exp(np.asarray(state.motion, np.float64) * (elapsed / float(state.seconds)))
 
 

@@ -25,12 +25,12 @@ class Beginning(NamedTuple):
 
 
 def begun(before: Beginning | None, stamp: float) -> Beginning:
-    """With a frame that begins a segment: what was not known before it is not known yet."""
+    """Begin a segment with a frame: what was not known before it is not known yet."""
     return Beginning(stamp) if before is None else before._replace(references=before.references + 1, is_broken=True)
 
 
 def followed(before: Beginning | None, stamp: float, share: float, *, is_reference: bool) -> Beginning | None:
-    """With a frame whose motion was found.
+    """Add a frame whose motion was found.
 
     Args:
         before: The track up to it; None if that is known to have followed the scene.

@@ -60,14 +60,14 @@ class DepthChange(NamedTuple):
         """Whether the motions explain the change of depth hardly better than rest."""
         return self.usually_left > MOST_LEFT
 
-    def spoken_of(self, pairs: int) -> int:
-        """Of so many pairs so far, how many of the last its figures speak of: all, until one has been forgotten."""
+    def pairs_covered(self, pairs: int) -> int:
+        """Return how many of the last pairs its figures speak of, of so many so far: all, until one was forgotten."""
         return len(self.left) if len(self.left) == REMEMBERED else pairs
 
     def after(
         self, frame: Frame, elapsed: float, target_T_reference: Any, explained: float, camera: Camera
     ) -> "DepthChange":
-        """With one more pair, of the same reference.
+        """Add one more pair, of the same reference.
 
         Depth that is one number in both frames is that of a wall, along which the camera slides. Turns then come out as
         slides, and depth agrees. So the image has to be that of a wall.
@@ -83,7 +83,7 @@ class DepthChange(NamedTuple):
         earlier = np.array(self.velocity or twist)
 
         def moved_by(seconds: float) -> Float64[np.ndarray, "4 4"]:
-            """From the reference's image on, before it as the camera came there."""
+            """Return the motion from the reference's image on; before it, as the camera came there."""
             return exp(seconds * (twist if seconds > 0 else earlier))
 
         motion = moved_by(elapsed + frame.depth_delay) @ inverse(moved_by(self.delay))
@@ -94,7 +94,7 @@ class DepthChange(NamedTuple):
         return self._replace(velocity=tuple(twist.tolist()), left=figures)
 
     def seen_from(self, frame: Frame, camera: Camera) -> "DepthChange":
-        """With another reference."""
+        """Go on with another reference."""
         return self._replace(inverse=depth_on_grid(frame, camera), delay=frame.depth_delay)
 
 

@@ -16,22 +16,22 @@ class DepthWatch(NamedTuple):
 
     change: DepthChange
     edges: DepthEdges
-    told: bool = False
-    """Whether the last pair was told to have wrong depth."""
+    found_wrong: bool = False
+    """Whether the depth was found to be wrong at the last pair."""
 
     @property
     def is_wrong(self) -> bool:
         """Whether one of the two speaks against it."""
         return self.change.is_unexplained or bool(self.edges.fault)
 
-    def spoken_of(self, pairs: int) -> int:
-        """Of so many pairs so far, how many of the last are spoken against."""
-        by_change = self.change.spoken_of(pairs) if self.change.is_unexplained else 0
-        return max(by_change, self.edges.spoken_of(pairs) if self.edges.fault else 0)
+    def pairs_covered(self, pairs: int) -> int:
+        """Return how many of the last pairs are spoken against, of so many so far."""
+        by_change = self.change.pairs_covered(pairs) if self.change.is_unexplained else 0
+        return max(by_change, self.edges.pairs_covered(pairs) if self.edges.fault else 0)
 
 
 def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
-    """With another reference, or a run's first one."""
+    """Watch with another reference, or a run's first one."""
     if before is None:
         change = DepthChange(depth_on_grid(frame, camera), frame.depth_delay)
         return DepthWatch(change, DepthEdges.none().after(frame, camera))
@@ -59,5 +59,5 @@ def judge_by_depth(
     at_rest = without_moving(frame, covered(bodies), border=0.0)
     change = watch.change.after(at_rest, elapsed, result.target_T_reference, explained, camera)
     watch = watch._replace(change=change)
-    watch = watch._replace(told=watch.is_wrong)
-    return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.told else result, watch
+    watch = watch._replace(found_wrong=watch.is_wrong)
+    return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.found_wrong else result, watch

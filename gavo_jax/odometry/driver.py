@@ -22,11 +22,12 @@ from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
+from gavo_jax.odometry.composition import make_aligner
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.second_thoughts import Recovering, make_aligner, without_depth
+from gavo_jax.odometry.second_thoughts import Recovering, without_depth
 from gavo_jax.odometry.way import Way
 from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
@@ -94,7 +95,7 @@ class Relocaliser(Protocol):
     """Finds frames in a map of the run so far."""
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Where a frame was taken, seen from another segment than its own; None where the map does not show that."""
+        """Return where a frame was taken, seen from another segment than its own; None where the map does not say."""
         ...
 
 
@@ -275,19 +276,19 @@ class Odometry:
         return frame
 
     def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
-        """Of a frame of which nothing can be used."""
+        """Pass over a frame of which nothing can be used."""
         revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         after = self._lose(before, None, timestamp)
         return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
     def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
-        """Of a frame before which nothing could be a reference: it is the first one if it is fit for that."""
+        """Begin with a frame before which nothing could be a reference: it is the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
             return FrameOutcome(before, no_alignment(finding.status), lost=True)
         return FrameOutcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
     def _align(self, before: Progress, frame: Frame, finding: Finding) -> FrameOutcome:
-        """Of a frame that is aligned."""
+        """Align a frame and judge what comes of it."""
         clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
         attempt, leap = align_leaping(self.aligner, state, frame, clock, before.leap)
@@ -307,8 +308,8 @@ class Odometry:
         if not lost and before.depth is not None:
             result, watch = judge_by_depth(before.depth, frame, bodies, float(clock.elapsed), result, self.camera)
             after = after._replace(depth=watch)
-            if watch.told and not before.depth.told:
-                revises = max(revises, watch.spoken_of(before.last_index))
+            if watch.found_wrong and not before.depth.found_wrong:
+                revises = max(revises, watch.pairs_covered(before.last_index))
         return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:

@@ -135,7 +135,7 @@ def _misplaced(poses: Sequence[np.ndarray], stamps: Float64[np.ndarray, " n"]) -
 
 
 def _jerks(poses: Sequence[np.ndarray], stamps: np.ndarray) -> float:
-    """By how much the changes of motion along a path move the image, in sum, radians."""
+    """Return by how much the changes of motion along a path move the image, in sum, radians."""
     seconds = np.diff(stamps)
     speeds = np.array([log(inverse(a) @ b) for a, b in pairwise(poses)]) / seconds[:, None]
     changes = np.diff(speeds, axis=0) * np.median(seconds)

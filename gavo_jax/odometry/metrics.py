@@ -70,7 +70,7 @@ ERRORS: Final = (DRIFT, ROTATION_DRIFT, DRIFT_PER_FRAME, ABSOLUTE_ERROR, FINAL_D
 
 
 def run_identity(sequence: str, method: str | None, preset: str | None, seed: int | None) -> dict[str, Any]:
-    """Of which run the metrics are: what they begin with."""
+    """Name the run that metrics are of: what they begin with."""
     return {"sequence": sequence, "method": method, "preset": preset, "seed": seed}
 
 

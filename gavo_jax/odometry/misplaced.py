@@ -85,5 +85,5 @@ def _is_possible(motion: np.ndarray, expected: np.ndarray, seconds: float) -> bo
 
 
 def _off(motion: np.ndarray, expected: np.ndarray) -> float:
-    """By how much a motion moves the image otherwise than expected, about, in radians."""
+    """Return by how much a motion moves the image otherwise than expected, about, in radians."""
     return float(image_shift(*length_and_angle(motion @ inverse(expected))))

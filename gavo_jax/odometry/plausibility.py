@@ -77,7 +77,7 @@ class Usual(NamedTuple):
         return cls(*(nothing for _ in cls._fields))
 
     def after(self, result: Alignment, contrast: Float[Array, ""]) -> "Usual":
-        """With one more pair."""
+        """Add one more pair."""
         figures = (result.error / contrast**2, _shift(result), result.explained.depth, result.depth_scale)
         return Usual(*(jnp.append(old[1:], new) for old, new in zip(self, figures, strict=True)))
 
@@ -154,7 +154,7 @@ def _shift(result: Alignment) -> Float[Array, ""]:
 
 
 def _lengths(twist: Float[Array, " 6"]) -> Float[Array, " 2"]:
-    """Of the translation and of the rotation."""
+    """Return the lengths of the translation and of the rotation, metres and radians."""
     return jnp.linalg.norm(twist.reshape(2, 3), axis=1)
 
 

@@ -58,7 +58,7 @@ class Progress(NamedTuple):
         return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
 
     def in_new_segment(self) -> Self:
-        """In a segment that nothing ties to those before; its number was given to no other one."""
+        """Begin a segment that nothing ties to those before; its number was given to no other one."""
         number = self.last_segment + 1
         return self._replace(segment=number, last_segment=number, adrift=1)
 

@@ -113,7 +113,7 @@ def run_odometry(
         if on_step is not None:
             on_step(step)
     seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
-    outcome = conclude(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
+    outcome = finish_run(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)
     metrics: Any = {
         **run_identity(sequence.name, method, preset, seed),
@@ -136,7 +136,7 @@ class RunOutcome(NamedTuple):
     loops: Loops | None = None
 
 
-def conclude(
+def finish_run(
     first_timestamp: float,
     steps: list[Step],
     ground_truth: Trajectory | None,

@@ -1,25 +1,19 @@
-"""Second thoughts about a frame: the wide search behind the first one, an image without its depth, bodies that move.
+"""Second thoughts about a frame: the wide search behind the first one, an image without its depth.
 
-Each is an aligner around another one, as settings ask for it.
+Each is an aligner around another one; `composition` puts them together as settings ask for it.
 """
 
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 
-from gavo_jax import presets
 from gavo_jax.alignment.judgement import MIN_EXPLAINED_GREY
 from gavo_jax.alignment.result import with_finding
-from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.rival import WithRival
-from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
 
 
@@ -34,15 +28,15 @@ class SecondThought:
     first: Aligner
 
     def warm_up(self) -> float:
-        """That of the first one; what else is asked serves every frame, or compiles when it is needed."""
+        """Warm up the first one; what else is asked serves every frame, or compiles when it is needed."""
         return self.first.warm_up()
 
     def start(self, frame: Frame) -> Any:
-        """By the first one."""
+        """Start the first one."""
         return self.first.start(frame)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """By the first one."""
+        """Predict by the first one."""
         return self.first.predict(state, elapsed)
 
 
@@ -62,12 +56,12 @@ class Recovering(SecondThought):
     is_loaded: bool = False
 
     def warm_up(self) -> float:
-        """That of the first one; the second compiles when it is needed."""
+        """Warm up the first one; the second compiles when it is needed."""
         seconds = self.first.warm_up()
         return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
 
     def warm_up_both(self) -> float:
-        """Of both, side by side."""
+        """Warm up both, side by side; the seconds this took."""
         if self.wide is None:
             return self.first.warm_up()
         return side_by_side(self.first.warm_up, self.wide.warm_up)
@@ -137,7 +131,7 @@ class DoubtingDepth(SecondThought):
     alone: Aligner
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        """With depth, or without where it does not agree."""
+        """Align with depth, or without where it does not agree."""
         attempt = self.first.align(state, frame, clock)
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt
@@ -151,51 +145,3 @@ class DoubtingDepth(SecondThought):
 def without_depth(frame: Frame) -> Frame:
     """A frame of which only the image counts."""
     return replace(frame, depth=np.zeros_like(frame.depth))
-
-
-def wide_search(search: Search) -> Search:
-    """The wide search on the points that a search's references hold, against the previous frame alone."""
-    settings, wide = search.settings, presets.preset("ga", "wide")
-    genetic: Any = wide.solver
-    places = [max(level, genetic.levels[-1]) for level in range(LEVELS)]  # of a level that it leaves out the next one's
-    iterations, population = ([schedule[k] for k in places] for schedule in (genetic.iterations, genetic.population))
-    iterations = tuple(count if k in settings.solver.levels else 0 for k, count in enumerate(iterations))
-    wide = Settings(
-        replace(genetic, iterations=iterations, population=tuple(population)),
-        replace(wide.alignment, points=settings.alignment.points),
-        replace(settings.odometry, reference="previous"),
-    )
-    return replace(search, settings=wide)
-
-
-def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: bool = False) -> Aligner:
-    """The aligner that settings describe."""
-    search = Search(camera, settings, key, record)
-    return with_recovery(search, search)
-
-
-def with_recovery(aligner: Aligner, search: Search) -> Aligner:
-    """An aligner with second thoughts, where the search's settings ask for that: of bodies that move, without a depth
-    that does not agree, and with the wide search behind it.
-    """
-    if not search.settings.odometry.recover:
-        return with_bodies(aligner, search)
-    careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
-    wide = wide_search(search)
-    behind = with_bodies(Polished(wide, search), wide)
-    # loading it takes seconds, which a short run had better spare and a long one had better not stop for
-    return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
-
-
-def blank_of(aligner: Any) -> Any:
-    """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
-    while not hasattr(aligner, "blank_state"):
-        aligner = aligner.first
-    return aligner.blank_state()
-
-
-def with_bodies(aligner: Aligner, search: Search) -> Aligner:
-    """An aligner that leaves out what moves on its own, where the search's settings ask for that."""
-    if search.settings.odometry.bodies == "off":
-        return aligner
-    return WithRival(BodyAware(aligner, search))

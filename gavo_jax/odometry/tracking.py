@@ -18,40 +18,15 @@ from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.image.sampling import Target
-from gavo_jax.image.warp import Points, synchronise_depth, warp
-from gavo_jax.objective.points import Reference, make_references, move_reference, settle_reference
+from gavo_jax.image.synchronisation import synchronise_depth
+from gavo_jax.image.warp import Points, warp
+from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
+from gavo_jax.odometry.exposure import Exposure, relight
 from gavo_jax.odometry.plausibility import Usual, judge_by_history
 from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
-
-
-class Exposure(NamedTuple):
-    """How bright an image is, and how rich in contrast: mean and standard deviation, grey levels."""
-
-    mean: Float[Array, ""]
-    spread: Float[Array, ""]
-
-    @classmethod
-    def of(cls, pyramid: Pyramid) -> "Exposure":
-        """Of the coarsest level, where noise adds nothing to the contrast."""
-        grey = pyramid[-1].grey
-        return cls(jnp.mean(grey), jnp.maximum(jnp.std(grey), 0.1))
-
-
-LARGEST_GAIN = 1.6
-"""Ratio of two images' contrasts beyond which the camera must have changed its gain; below, views may differ by that
-much, and the search estimates the gain itself."""
-
-
-def relight(reference: Reference, before: Exposure, after: Exposure) -> Reference:
-    """Points as they would be with another exposure, where it differs so much that a search would not find it."""
-    gain = after.spread / jnp.maximum(before.spread, 0.1)
-    differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
-    gain = jnp.where(differs, gain, 1.0)
-    grey = jnp.where(differs, gain * (reference.grey - before.mean) + after.mean, reference.grey)
-    return reference._replace(grey=grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v)
 
 
 class TrackerState(NamedTuple):
@@ -146,7 +121,7 @@ class Moved(NamedTuple):
 
     @classmethod
     def by(cls, result: Alignment, is_first: Bool[Array, ""]) -> "Moved":
-        """As a result says."""
+        """Take the motion that a result says."""
         motion, sway = jnp.where(is_first, 0.0, result.xi), jnp.where(is_first, 0.0, result.sway)
         return cls(is_first, jnp.where(is_first, jnp.eye(4), result.target_T_reference), motion, sway, motion + sway)
 
@@ -156,15 +131,15 @@ def _readout(camera: Camera, clock: Clock) -> Float[Array, ""]:
     return jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
 
 
-def _settle(
+def _undo_rolling_shutter(
     newest: Reference, keyframe: Reference, moved: Moved, readout: Float[Array, ""]
 ) -> tuple[Reference, Reference]:
     """Points of both references where they were at their image's moment, by the motion that is known now; those of a
     first frame are still where their rows' moments left them.
     """
     unsettled = newest.row_time
-    newest = settle_reference(newest, moved.instant_motion * readout)
-    keyframe = settle_reference(keyframe, moved.motion * readout)
+    newest = undo_rolling_shutter(newest, moved.instant_motion * readout)
+    keyframe = undo_rolling_shutter(keyframe, moved.motion * readout)
     return newest._replace(row_time=jnp.where(moved.is_first, unsettled, newest.row_time)), keyframe
 
 
@@ -239,7 +214,7 @@ def track_frame(
         target = _synchronised(raw, camera, delay * moved.instant_motion, finest)
     newest = make_references(target, camera, levels)
     if readout is not None:
-        newest, keyframe = _settle(newest, keyframe, moved, readout)
+        newest, keyframe = _undo_rolling_shutter(newest, keyframe, moved, readout)
     keyframe = move_reference(keyframe, moved.target_T_reference)
     after_it = TrackerState(
         previous=newest,

@@ -28,7 +28,7 @@ class Way(NamedTuple):
     fixes: tuple[Fix, ...] = ()
 
     def after(self, seconds: float, xi: Float64[np.ndarray, " 6"]) -> Self:
-        """With one frame more."""
+        """Add one more frame."""
         return self._replace(fixes=(*self.fixes, Fix(seconds, tuple(map(float, xi))))[-REMEMBERED:])
 
     def at(self, seconds: float) -> Float64[np.ndarray, " 6"] | None:

@@ -72,7 +72,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
         "beginning": progress.beginning,
-        "depth": watch and [watch.change[1:], watch.edges[1:], watch.told],
+        "depth": watch and [watch.change[1:], watch.edges[1:], watch.found_wrong],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
         "images": checkpoint.images,

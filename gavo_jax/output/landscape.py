@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.alignment.visits import objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.pyramid import LEVELS, build_pyramid

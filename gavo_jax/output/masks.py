@@ -44,7 +44,7 @@ def write_masks(folder: Path, step: Step) -> None:
 
 
 def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width"] | None:
-    """Where any body was in a frame; see `read_labels`."""
+    """Return where any body was in a frame; see `read_labels`."""
     labels = read_labels(folder, timestamp)
     return None if labels is None else labels > 0
 
@@ -96,7 +96,7 @@ def _path(folder: Path, timestamp: float) -> Path:
 
 
 def _stamp(path: Path) -> float:
-    """Of the frame; not-a-number where the file is not of a run."""
+    """Return the stamp of the frame, seconds; not-a-number where the file is not of a run."""
     try:
         return float(path.stem)
     except ValueError:

@@ -90,7 +90,7 @@ class _GrowingFile:
         self.size += len(data)
 
     def mark(self) -> Mark:
-        """Where it ends, and a digest of all before."""
+        """Return where it ends, and a digest of all before."""
         return Mark(self.size, self._sha256.hexdigest())
 
     def cut(self, size: int) -> None:

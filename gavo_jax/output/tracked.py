@@ -8,7 +8,7 @@ from gavo_jax.errors import tell
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.run import RunOutcome, conclude
+from gavo_jax.odometry.run import RunOutcome, finish_run
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import pair_progress
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
@@ -25,10 +25,10 @@ class Tracked(NamedTuple):
     """Wall time, decoding included, compilation left out."""
     compile_seconds: float
 
-    def concluded(self, sequence: Sequence) -> RunOutcome:
+    def outcome(self, sequence: Sequence) -> RunOutcome:
         """What a run over a sequence comes to, which was tracked from its first frame on."""
         first, truth = float(sequence.timestamps[0]), sequence.ground_truth
-        return conclude(first, self.steps, truth, None, self.seconds, self.compile_seconds)
+        return finish_run(first, self.steps, truth, None, self.seconds, self.compile_seconds)
 
 
 def track_visibly(

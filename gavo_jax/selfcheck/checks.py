@@ -141,25 +141,25 @@ best_distinct = jax.jit(modes.best_distinct, static_argnames="count")
 
 @jax.jit
 def examine(problem: Problem) -> Any:
-    """As a search ends: the points of all views in one row."""
+    """Examine as a search ends: the points of all views in one row."""
     problem = replace(problem, objective=problem.objective.merged())
     return problem.examine(problem.objective.residuals(problem.origin))[:2]
 
 
 def exp_deviation(rows: int) -> float:
-    """Of `se3.exp`: metres, and entries of a rotation."""
+    """Return the deviation of `se3.exp`: metres, and entries of a rotation."""
     twists = _random_twists(rows, 1.5)
     return largest_deviation(exp(twists), equations.exp(twists))
 
 
 def log_deviation(rows: int) -> float:
-    """Of `se3.log` of motions that are `equations.exp` of twists: metres, radians."""
+    """Return the deviation of `se3.log` of motions that are `equations.exp` of twists: metres, radians."""
     twists = _random_twists(rows, 1.5)
     return largest_deviation(log(equations.exp(twists).astype(np.float32)), twists)
 
 
 def inverse_deviation(rows: int) -> float:
-    """Of `se3.rigid_inverse`: metres, and entries of a rotation."""
+    """Return the deviation of `se3.rigid_inverse`: metres, and entries of a rotation."""
     motions = equations.exp(_random_twists(rows, 1.5)).astype(np.float32)
     return largest_deviation(rigid_inverse(motions), np.linalg.inv(motions.astype(np.float64)))
 
@@ -175,7 +175,7 @@ def _origin() -> np.ndarray:
 
 
 def transform_deviation(rows: int) -> float:
-    """Of `Problem.transform`: metres, and entries of a rotation."""
+    """Return the deviation of `Problem.transform`: metres, and entries of a rotation."""
     x = _random_twists(rows, 20.0)
     problem = Problem(_objective(_scene(9)), _given(_origin()), _given(BASIS))
     return largest_deviation(
@@ -234,7 +234,7 @@ def _objective(scene: equations.Scene) -> Objective:
 
 
 def warp_deviation(points: int) -> float:
-    """Of `warp`, pixels; of inverse depth, 1/m, a hundred times as much."""
+    """Return the deviation of `warp`, pixels; of inverse depth, 1/m, a hundred times as much."""
     scene, motion = _scene(points), _origin()
     found = jax.device_get(warp_points(_points(scene), motion, LEVEL))
     expected = equations.warp(scene, motion.astype(np.float64))
@@ -252,7 +252,7 @@ REFERENCE_EVALUATIONS = 1_000_000
 
 
 def spread_rows(rows: int, most: int) -> np.ndarray:
-    """At most so many indices of rows, evenly spread and, as far as they fit, next to powers of two."""
+    """Return at most so many indices of rows, evenly spread and, as far as they fit, next to powers of two."""
     powers = 2 ** np.arange(3, 31)[::-1]
     near = (powers[:, None] + np.array([0, -1])).ravel()
     near = near[near < rows][: most // 2]
@@ -260,7 +260,7 @@ def spread_rows(rows: int, most: int) -> np.ndarray:
 
 
 def score_deviation(candidates: int, points: int) -> float:
-    """Of `Objective.score`: errors as a share of E, and overlaps."""
+    """Return the deviation of `Objective.score`: errors as a share of E, and overlaps."""
     scene = _scene(points)
     motions = _scored_motions(candidates)
     found = np.stack(score(_objective(scene), motions), axis=1)
@@ -269,7 +269,7 @@ def score_deviation(candidates: int, points: int) -> float:
 
 
 def _deviation_of_row(scene: equations.Scene, motion: np.ndarray, error: float, overlap: float) -> float:
-    """Of one motion's error as a share of E, and of its overlap, beyond what points on the image's border change."""
+    """Compare one motion's error as a share of E, and its overlap, beyond what points on the image's border change."""
     r = equations.residuals(scene, motion)
     true_error, true_overlap = equations.error(scene, r, WEIGHING)
     on_border = int(np.count_nonzero(r.warped.on_border))
@@ -311,20 +311,20 @@ def _derivatives(points: int) -> tuple[Problem, equations.Slope, tuple[float, fl
 
 
 def _deviation_of_model(model: Any, expected: equations.Slope, error: tuple[float, float]) -> float:
-    """As a share of the largest entry."""
+    """Compare each part with what is expected, as a share of its largest entry."""
     pairs = ((model.error, error[0]), (model.gradient, expected.gradient), (model.hessian, expected.hessian))
     shares = [largest_deviation(found, truth, float(np.max(np.abs(truth)))) for found, truth in pairs]
     return max(*shares, largest_deviation(model.overlap, error[1]))
 
 
 def linearize_deviation(points: int) -> float:
-    """Of error, gradient and Hessian of `Problem.linearize`, each as a share of its largest entry."""
+    """Return the deviation of `Problem.linearize`: error, gradient and Hessian, as shares of their largest entries."""
     problem, expected, error = _derivatives(points)
     return _deviation_of_model(jax.device_get(linearize(problem)), expected, error)
 
 
 def examine_deviation(points: int) -> float:
-    """Of what `Problem.examine` returns, each as a share of its largest entry."""
+    """Return the deviation of what `Problem.examine` returns, each as a share of its largest entry."""
     problem, expected, error = _derivatives(points)
     model, scatter = jax.device_get(examine(problem))
     return max(
@@ -339,7 +339,7 @@ class Table(NamedTuple):
     error: jax.Array
 
     def score(self, x: jax.Array, counted: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
-        """As `Problem.score`."""
+        """Score as `Problem.score` does."""
         del x, counted
         return self.error, jnp.ones_like(self.error)
 
@@ -362,7 +362,7 @@ HALF_WIDTH = 4.0
 
 
 def generation_deviation(islands: int, population: int) -> float:
-    """Of `GeneticAlgorithm.step`, search units; populations are about 1 wide."""
+    """Return the deviation of `GeneticAlgorithm.step`, search units; populations are about 1 wide."""
     rng = np.random.default_rng(islands)
     x = rng.normal(size=(islands, 2 * population, 6)).astype(np.float32)
     errors = _distinct(1.0 + np.einsum("ipk,kl,ipl->ip", x, np.eye(6) + 0.2, x - 0.3) / 8 + 1.0)
@@ -395,7 +395,7 @@ def _distinct(errors: np.ndarray) -> np.ndarray:
 
 
 def distinct_deviation(rows: int) -> float:
-    """Of the errors of those that `modes.best_distinct` chooses: 0 where they are the right ones.
+    """Return the deviation of the errors of those that `modes.best_distinct` chooses: 0 where they are the right ones.
 
     Motions lie in clusters that are clearly narrower than a mode and clearly further apart.
     """

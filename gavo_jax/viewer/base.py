@@ -42,7 +42,7 @@ class Viewer:
             populations: candidates of its search, coarsest level first.
         """
 
-    def conclude(self, trajectory: Trajectory, loops: Loops) -> None:
+    def show_corrected(self, trajectory: Trajectory, loops: Loops) -> None:
         """Show what a map of the whole run says.
 
         Args:

@@ -126,7 +126,7 @@ class RerunViewer(Viewer):
         self._raise_fault()
         self._queue.put(lambda scene: scene.add(frame, step, populations))
 
-    def conclude(self, trajectory: Trajectory, loops: Loops) -> None:
+    def show_corrected(self, trajectory: Trajectory, loops: Loops) -> None:
         """Queue what is known in the end."""
         self._raise_fault()
         self._queue.put(lambda scene: scene.add_loops(trajectory, loops))

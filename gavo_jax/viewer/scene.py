@@ -336,7 +336,7 @@ class Truth:
         return self._world_T_truth[segment] @ self._truth_T_camera[index]
 
     def _is_known(self, index: int) -> bool:
-        """Of a live source, and of a run whose sequence is not there, nothing is known of the later frames."""
+        """Whether a later frame is known: of a live source, or a run whose sequence is not there, none is."""
         return index < len(self._known) and bool(self._known[index])
 
     def motion(self, step: Step) -> Float64[np.ndarray, "4 4"] | None:

@@ -9,7 +9,7 @@ import pytest
 
 from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.evidence import evidence, is_held
-from gavo_jax.alignment.visits import objectives_of
+from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions

@@ -14,7 +14,7 @@ from small import NEWTON
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.consensus import ask_area
 from gavo_jax.bodies.evidence import View, view_of
-from gavo_jax.bodies.scene import Retina
+from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
@@ -45,29 +45,29 @@ def seen(grey: jax.Array, depth: jax.Array, levels: Levels) -> View:
     return view_of(prepare_target(build_pyramid(grey, depth, CAMERA.depth_scale), levels), levels, jnp.zeros(6))
 
 
-def views(room: SyntheticSequence, retina: Retina) -> tuple[list[View], np.ndarray]:
+def views(room: SyntheticSequence, segmenter: MotionSegmenter) -> tuple[list[View], np.ndarray]:
     """Of the first two frames, and the true motion between them."""
     poses = room.ground_truth.interpolate(room.timestamps)[0]
     true = (inverse(poses[1]) @ poses[0]).astype(np.float32)
-    return [seen(frame.grey, frame.depth, retina.levels) for frame in room[:2]], true
+    return [seen(frame.grey, frame.depth, segmenter.levels) for frame in room[:2]], true
 
 
 def test_the_area_asks_for_the_scene_and_names_what_dissents(room: SyntheticSequence) -> None:
-    retina = Retina(CAMERA, MASKED)
-    (last, new), true = views(room, retina)
+    segmenter = MotionSegmenter(CAMERA, MASKED)
+    (last, new), true = views(room, segmenter)
     turn = np.eye(4)
     turn[:3, :3] = cv2.Rodrigues(BETWEEN[3:])[0]
     turn[0, 3] = -2.5 * np.sin(BETWEEN[4])  # what is 2.5 m away stays where it is in the image
     wrong = (turn @ true).astype(np.float32)
-    everywhere = np.ones(retina.size, np.float32)
-    ask = jax.jit(partial(ask_area, camera=retina.camera))
+    everywhere = np.ones(segmenter.size, np.float32)
+    ask = jax.jit(partial(ask_area, camera=segmenter.camera))
     right, misled = (ask(last, new, motion, everywhere) for motion in (true, wrong))
     assert float(right.dissent) < 1.3 * float(right.least)
     assert float(misled.dissent) > 2.0 * float(misled.least)
     asked = np.asarray(misled.target_T_reference)
     assert np.linalg.norm((asked - true)[:3, 3]) < 0.4 * np.linalg.norm((wrong - true)[:3, 3])
     assert float(right.dissent) < 0.5 * float(misled.dissent)
-    factor = CAMERA.height // retina.size[0]
+    factor = CAMERA.height // segmenter.size[0]
     body = room.body_labels(0)[::factor, ::factor] > 0
     dissenting = np.asarray(right.dissenting)
     assert dissenting[body].mean() > 3 * dissenting[~body].mean()

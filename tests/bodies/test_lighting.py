@@ -28,7 +28,7 @@ def texture() -> np.ndarray:
 
 def left(residual: np.ndarray, grey: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Size of what local light does not explain of residuals."""
-    stacked = [np.float32(one)[None] for one in (residual, grey, np.ones_like(grey) if weight is None else weight)]
+    stacked = [one[None].astype(np.float32) for one in (residual, grey, np.ones_like(grey) if weight is None else weight)]
     return np.abs(residual - np.asarray(light_residual(*stacked))[0])
 
 

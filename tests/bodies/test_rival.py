@@ -14,7 +14,7 @@ import pytest
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival, _distance, _in_target
-from gavo_jax.bodies.scene import Retina
+from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
@@ -40,29 +40,29 @@ FAST = preset("gauss-newton", "fast")
 
 def test_blocks_vote_for_the_true_motion() -> None:
     sequence, search = SyntheticSequence(frames=2, camera=CAMERA), Search(CAMERA, SETTINGS, jax.random.key(0))
-    retina = Retina(CAMERA, SETTINGS)
-    views = [retina.view(search.start(frame)) for frame in sequence]
+    segmenter = MotionSegmenter(CAMERA, SETTINGS)
+    views = [segmenter.view(search.start(frame)) for frame in sequence]
     poses, _ = sequence.ground_truth.interpolate(sequence.timestamps)
     true = inverse(poses[1]) @ poses[0]
     wrong = exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0])) @ true
-    nothing = np.zeros(retina.size, bool)
+    nothing = np.zeros(segmenter.size, bool)
     for motions, sign in (((wrong, true), 1.0), ((true, wrong), -1.0)):
-        margin = vote(*views, np.stack(motions).astype(np.float32), nothing, retina.camera)
+        margin = vote(*views, np.stack(motions).astype(np.float32), nothing, segmenter.camera)
         assert sign * float(margin.whole) > 0.3 and margin.far == pytest.approx(float(margin.whole), abs=1e-5)
-    assert float(vote(*views, np.stack([true, true]).astype(np.float32), nothing, retina.camera).whole) == 0.0
+    assert float(vote(*views, np.stack([true, true]).astype(np.float32), nothing, segmenter.camera).whole) == 0.0
 
 
 def test_blocks_that_are_out_of_view_do_not_vote() -> None:
     """Where the camera has turned away from the anchor a few blocks at the edge had the say of all."""
-    search, retina = Search(CAMERA, SETTINGS, jax.random.key(0)), Retina(CAMERA, SETTINGS)
-    view = retina.view(search.start(SyntheticSequence(frames=1, camera=CAMERA)[0]))
-    nothing = np.zeros(retina.size, bool)
+    search, segmenter = Search(CAMERA, SETTINGS, jax.random.key(0)), MotionSegmenter(CAMERA, SETTINGS)
+    view = segmenter.view(search.start(SyntheticSequence(frames=1, camera=CAMERA)[0]))
+    nothing = np.zeros(segmenter.size, bool)
     half_view = np.arctan(CAMERA.width / 2 / float(CAMERA.fx))
     margins = []
     for turned in (0.0, 1.8 * half_view):
         away = exp(np.array([0.0, 0.0, 0.0, 0.0, turned, 0.0]))
         aside = exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])) @ away
-        margins.append(vote(view, view, np.stack([aside, away]).astype(np.float32), nothing, retina.camera))
+        margins.append(vote(view, view, np.stack([aside, away]).astype(np.float32), nothing, segmenter.camera))
     assert float(margins[0].whole) > 0.5
     assert abs(float(margins[1].whole)) < 0.3 and abs(float(margins[1].far)) < 0.3
 

@@ -19,6 +19,8 @@ WRITTEN = [
 ]
 SMALL_WORD = re.compile(r"[a-z]+[,.:;]?(\s|$)")
 """A word that goes on a sentence; symbols, units, files' and other names have more than small letters."""
+PREPOSITIONS = {"Of", "By", "As", "From", "With", "In", "At", "On", "Where", "For"}
+"""What a function's docstring doesn't begin with: it would go on the name."""
 FILES = (".json", ".csv", ".toml")
 """Endings of what is a file's name."""
 VALUES = {"camera": Camera, "alignment": AlignmentOptions, "odometry": OdometryOptions}
@@ -46,6 +48,13 @@ def docstrings(source: str) -> list[tuple[int, str]]:
     nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
     texts = [(node.lineno, node.value.value) for node in nodes if isinstance(node.value, ast.Constant)]
     return [(line, text.strip()) for line, text in texts if isinstance(text, str)]
+
+
+def functions(source: str) -> list[tuple[int, str]]:
+    """Line and docstring of all functions of a file that have one."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    texts = [(node.body[0].lineno, ast.get_docstring(node)) for node in nodes]
+    return [(line, text) for line, text in texts if text]
 
 
 def stands_alone(docstring: str) -> bool:
@@ -107,6 +116,17 @@ def test_docstrings_stand_alone() -> None:
         for path in WRITTEN
         for line, text in docstrings(path.read_text(encoding="utf-8"))
         if not stands_alone(text)
+    ]
+    assert not wrong
+
+
+def test_functions_say_what_they_do() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {text}"
+        for path in WRITTEN
+        if "tests" not in path.relative_to(ROOT).parts
+        for line, text in functions(path.read_text(encoding="utf-8"))
+        if text.split()[0] in PREPOSITIONS
     ]
     assert not wrong
 

@@ -13,7 +13,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.sensor_noise import NONE
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.image.settling import still
+from gavo_jax.image.motion_compensation import compensate_motion
 from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import NOTHING_SEEN, Keyframe, Keyframes, shift, shifts
@@ -98,7 +98,7 @@ def test_a_settled_frame_is_that_of_a_global_shutter():
     back = inverse(truth[7]) @ truth[5]
     twist = log(back) * RATE / 2
     plain, settled, wanted = (
-        still(frame.grey, frame.depth, rolling, motion)
+        compensate_motion(frame.grey, frame.depth, rolling, motion)
         for frame, motion in ((skewed, np.zeros(6)), (skewed, twist), (straight, np.zeros(6)))
     )
 

@@ -153,4 +153,4 @@ def test_no_more_is_remembered_than_tells_and_it_survives_a_checkpoint(tmp_path:
     for part, kept in zip(found[:2], watch[:2], strict=True):
         np.testing.assert_array_equal(part[0], kept[0])
         assert part[1:] == kept[1:]
-    assert found.told == watch.told
+    assert found.found_wrong == watch.found_wrong

@@ -41,7 +41,7 @@ def told(results: list[Alignment]) -> list[bool]:
 def test_depth_of_one_number_is_told_where_the_image_is_no_walls() -> None:
     results, watch = judged(FLAT, 0.87)
     assert told(results) == [False] * (MIN_REMEMBERED - 1) + [True]
-    assert watch.spoken_of(len(results)) == len(results)
+    assert watch.pairs_covered(len(results)) == len(results)
 
 
 @pytest.mark.parametrize(("depth", "explained"), [(FLAT, 0.99), (TILTED, 0.5), (0 * FLAT, 0.5)])

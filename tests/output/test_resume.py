@@ -20,11 +20,11 @@ from small import CAMERA, GENETIC
 from gavo_jax.cli import main, run
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import run_odometry
-from gavo_jax.odometry.second_thoughts import blank_of
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint

@@ -64,7 +64,7 @@ def test_what_is_compiled_on_the_way_is_said_and_does_not_slow_the_run(monkeypat
     tracked = track_visibly("clip", sequence, Odometry(CAMERA, aligner=CompilesLate()), steps.append)
     assert said == [1]
     assert tracked.compile_seconds >= SECONDS
-    assert tracked.concluded(sequence).figures[COMPILE_SECONDS] == tracked.compile_seconds
+    assert tracked.outcome(sequence).figures[COMPILE_SECONDS] == tracked.compile_seconds
     others = time.perf_counter() - start - SECONDS
     assert tracked.seconds < others
     assert sum(step.milliseconds for step in steps) < 1e3 * others

@@ -181,7 +181,7 @@ def test_loops_and_the_corrected_path_are_shown_in_the_end(run, tmp_path):
     with shown:
         shown.open("loops", sequence.camera, sequence.timestamps, None)
         shown.watch(sequence[0], None)
-        shown.conclude(Trajectory(sequence.timestamps[1:], poses), loops)
+        shown.show_corrected(Trajectory(sequence.timestamps[1:], poses), loops)
     found = read_recording(tmp_path / "loops.rrd")
     [row] = found["/world/loops"]
     assert component(row, "labels") == ["3 mm left", "400 mm left"]

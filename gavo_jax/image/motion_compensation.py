@@ -21,7 +21,7 @@ UNKNOWN_DEPTH = 2.0
 """Metres that a pixel is taken to be away where the whole image has no reading."""
 
 
-class Still(NamedTuple):
+class CompensatedImages(NamedTuple):
     """What a keyframe keeps of its images: a camera of half the size, `Camera.level(1)`."""
 
     grey: UInt8[np.ndarray, "h w"]
@@ -29,13 +29,13 @@ class Still(NamedTuple):
     """In the camera's units, 0 = no reading."""
 
 
-def still(
+def compensate_motion(
     grey: Shaped[np.ndarray, "height width"],
     depth: Shaped[np.ndarray, "height width"],
     camera: Camera,
     twist: Float[np.ndarray, " 6"],
     depth_delay: float = 0.0,
-) -> Still:
+) -> CompensatedImages:
     """Images of one moment from those that a moving camera took.
 
     A point P of the frame's moment is seen in row v at exp(t ξ̂) P, t = `row_time`(v) readouts; its depth is read a
@@ -51,7 +51,7 @@ def still(
     grey, depth, camera = halve_grey(grey_bytes(grey)), halve_depth(depth), camera.level(1)
     twist = np.asarray(twist, np.float32)
     if not np.any(twist):
-        return Still(grey, depth)
+        return CompensatedImages(grey, depth)
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     flow = pixel_flow(camera, u, v, filled_inverse_depth(depth, camera), twist)
     seconds = np.float32(camera.readout) * row_time(v, camera)
@@ -63,7 +63,7 @@ def still(
     column, row = u + seconds * flow[0], v + seconds * flow[1]
     read = cv2.remap(depth, column, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     moved = read - seconds * (read * flow[2] + np.float32(twist[2] * camera.depth_scale))
-    return Still(grey, readings_like(depth, np.where((read > 0) & (moved > 0), moved, 0.0)))
+    return CompensatedImages(grey, readings_like(depth, np.where((read > 0) & (moved > 0), moved, 0.0)))
 
 
 def pixel_flow(

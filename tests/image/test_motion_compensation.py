@@ -6,7 +6,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.image.settling import filled_inverse_depth, halve_depth, still
+from gavo_jax.image.motion_compensation import compensate_motion, filled_inverse_depth, halve_depth
 
 CAMERA = replace(Camera.preset("icl").level(2), readout=0.03)
 METRES = replace(CAMERA, depth_scale=1.0)
@@ -22,7 +22,8 @@ def test_depth_in_metres_is_that_of_raw_numbers() -> None:
     np.testing.assert_allclose(filled_inverse_depth(metres, METRES), filled_inverse_depth(depth, CAMERA), rtol=1e-6)
     step = 0.6 / CAMERA.depth_scale
     np.testing.assert_allclose(halve_depth(metres), halve_depth(depth) / CAMERA.depth_scale, atol=step)
-    raw, metric = still(frame.grey, depth, CAMERA, TWIST, 0.01), still(frame.grey, metres, METRES, TWIST, 0.01)
+    raw = compensate_motion(frame.grey, depth, CAMERA, TWIST, 0.01)
+    metric = compensate_motion(frame.grey, metres, METRES, TWIST, 0.01)
     np.testing.assert_array_equal(metric.grey, raw.grey)
     both = (metric.depth > 0) & (raw.depth > 0)
     assert both.mean() > 0.95 * (raw.depth > 0).mean()
@@ -31,7 +32,7 @@ def test_depth_in_metres_is_that_of_raw_numbers() -> None:
 
 def test_depth_of_any_whole_numbers_can_be_looked_up() -> None:
     frame = SyntheticSequence(3, camera=CAMERA)[1]
-    raw = still(frame.grey, frame.depth, CAMERA, TWIST)
+    raw = compensate_motion(frame.grey, frame.depth, CAMERA, TWIST)
     for kind in (np.int32, np.float64):
-        other = still(frame.grey, frame.depth.astype(kind), CAMERA, TWIST)
+        other = compensate_motion(frame.grey, frame.depth.astype(kind), CAMERA, TWIST)
         np.testing.assert_allclose(other.depth, raw.depth, atol=2.0)

@@ -1,0 +1,91 @@
+"""Frames as they are given, of many kinds, stacked into arrays without lens distortion, as the program takes them."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from gavo_jax.camera import Camera, require_camera
+from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
+from gavo_jax.errors import GavoError
+from gavo_jax.image.numbers import as_array, with_zeros
+
+
+class Images(NamedTuple):
+    """Grey [H, W] and depth [H, W] of one frame, or of a batch with a leading axis."""
+
+    grey: Any
+    depth: Any
+
+
+def stacked_pairs(
+    references: Any, targets: Any, camera: Camera, keys: PRNGKeyArray | None
+) -> tuple[list[Images], PRNGKeyArray]:
+    """Both sides of B pairs as `stacked_sides` gives them, and their keys.
+
+    Raises:
+        GavoError: As `stacked_images`, or there are not as many of one as of the other.
+    """
+    sides = stacked_sides(references, targets, camera)
+    count, others = (len(side.grey) for side in sides)
+    if others != count:
+        raise GavoError(f"{count} references but {others} targets")
+    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
+    if np.shape(keys)[:1] != (count,):
+        raise GavoError(f"keys are of shape {np.shape(keys)}: one per pair is needed, jax.random.split(key, {count})")
+    return sides, keys
+
+
+def _plain(image: Any) -> Any:
+    """An array that a program takes; one that is on a device stays there."""
+    return image if isinstance(image, jax.Array) else as_array(image)
+
+
+def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
+    if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
+        raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
+    grey, depth = map(_plain, (frame.grey, frame.depth) if isinstance(frame, Frame) else frame)
+    expected = (camera.height, camera.width)
+    for name, image in (("grey", grey), ("depth", depth)):
+        if np.shape(image) != expected:
+            fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
+            raise GavoError(fault + what_helps(name, image))
+    require_grey_levels(grey)
+    depth = with_zeros(depth)
+    if camera.is_distorted:
+        grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
+    return Images(grey, depth)
+
+
+def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
+    """Both sides as of `stacked_images`: bytes and 16 bits, or float32 throughout. For each other combination of types
+    the search would be compiled anew.
+    """
+    sides = [stacked_images(side, camera) for side in (references, targets)]
+    if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):
+        return sides
+    return [Images(*(jnp.asarray(image, jnp.float32) for image in side)) for side in sides]
+
+
+def stacked_images(side: Any, camera: Camera) -> Images:
+    """B frames as `align_batch` takes them, stacked and free of lens distortion.
+
+    Raises:
+        GavoError: They are none, too small, or not of the camera's size.
+    """
+    require_camera(camera)
+    is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
+    if not len(side[0] if is_stacked else side):
+        raise GavoError("a batch of no frames: at least one pair is needed")
+    if is_stacked:
+        side = tuple(map(_plain, side))
+        if camera.is_distorted:
+            return stacked_images(list(zip(*side, strict=True)), camera)
+        if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
+            raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
+        require_grey_levels(side[0])
+        return Images(jnp.asarray(side[0]), jnp.asarray(with_zeros(side[1])))
+    images = [_rectified_images(frame, camera) for frame in side]
+    return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

@@ -1,0 +1,63 @@
+"""The aligner that settings ask for: the search, and which second thoughts stand around it."""
+
+from dataclasses import replace
+from typing import Any
+
+from jaxtyping import PRNGKeyArray
+
+from gavo_jax import presets
+from gavo_jax.bodies.aligner import BodyAware
+from gavo_jax.bodies.rival import WithRival
+from gavo_jax.camera import Camera
+from gavo_jax.image.pyramid import LEVELS
+from gavo_jax.odometry.aligners import Aligner, Search
+from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering
+from gavo_jax.settings import Settings
+
+
+def wide_search(search: Search) -> Search:
+    """The wide search on the points that a search's references hold, against the previous frame alone."""
+    settings, wide = search.settings, presets.preset("ga", "wide")
+    genetic: Any = wide.solver
+    places = [max(level, genetic.levels[-1]) for level in range(LEVELS)]  # of a level that it leaves out the next one's
+    iterations, population = ([schedule[k] for k in places] for schedule in (genetic.iterations, genetic.population))
+    iterations = tuple(count if k in settings.solver.levels else 0 for k, count in enumerate(iterations))
+    wide = Settings(
+        replace(genetic, iterations=iterations, population=tuple(population)),
+        replace(wide.alignment, points=settings.alignment.points),
+        replace(settings.odometry, reference="previous"),
+    )
+    return replace(search, settings=wide)
+
+
+def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: bool = False) -> Aligner:
+    """The aligner that settings describe."""
+    search = Search(camera, settings, key, record)
+    return with_recovery(search, search)
+
+
+def with_recovery(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner with second thoughts, where the search's settings ask for that: of bodies that move, without a depth
+    that does not agree, and with the wide search behind it.
+    """
+    if not search.settings.odometry.recover:
+        return with_bodies(aligner, search)
+    careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
+    wide = wide_search(search)
+    behind = with_bodies(Polished(wide, search), wide)
+    # loading it takes seconds, which a short run had better spare and a long one had better not stop for
+    return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
+
+
+def blank_of(aligner: Any) -> Any:
+    """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
+    while not hasattr(aligner, "blank_state"):
+        aligner = aligner.first
+    return aligner.blank_state()
+
+
+def with_bodies(aligner: Aligner, search: Search) -> Aligner:
+    """An aligner that leaves out what moves on its own, where the search's settings ask for that."""
+    if search.settings.odometry.bodies == "off":
+        return aligner
+    return WithRival(BodyAware(aligner, search))

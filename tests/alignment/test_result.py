@@ -1,0 +1,19 @@
+"""What a result says in words."""
+
+import numpy as np
+from aligning import run
+
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.status import AlignmentStatus
+
+
+def test_an_undetermined_direction_is_named(sequence: SyntheticSequence) -> None:
+    height, width = sequence.camera.height, sequence.camera.width
+    stripes = 128 + 100 * np.sin(np.arange(width) / 7.0 + 3 * np.sin(np.arange(width) / 40.0))
+    depth = np.full((height, width), 2 * sequence.camera.depth_scale).astype(np.uint16)
+    upright = np.tile(stripes.astype(np.uint8), (height, 1))
+    result = run("gauss-newton", (upright, depth), (upright, depth), sequence.camera)
+    assert result.status is AlignmentStatus.LOW_TEXTURE
+    assert result.undetermined.startswith("translation along y") and result.undetermined in result.sentence
+    textured = run("gauss-newton", sequence[0], sequence[1], sequence.camera)
+    assert textured.undetermined == "" and textured.sentence == textured.status.sentence

@@ -1,0 +1,87 @@
+"""Bodies' motions: in the world, under a rolling shutter, and where images do not tell them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from carded import BOX, CAMERA, TRACKED, field
+
+from gavo_jax.alignment.result import no_alignment
+from gavo_jax.bodies import motions
+from gavo_jax.bodies.aligner import BodyAware
+from gavo_jax.bodies.identity import BodyTracks, associate
+from gavo_jax.bodies.records import Seen, in_world
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.odometry.aligners import Search
+from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.stream import track
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
+from gavo_jax.status import AlignmentStatus
+
+
+def test_a_motion_in_the_camera_is_one_in_the_world() -> None:
+    step = np.eye(4)
+    step[0, 3] = 0.05
+    in_camera = no_alignment(AlignmentStatus.OK)._replace(target_T_reference=step)
+    turned = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    seen = Seen(4, field(BOX), 0.1, np.array([0.0, 0, 2]), in_camera)
+    body = in_world(seen, turned, turned, (120, 160))
+    assert body.displacement == pytest.approx([0, 0.05, 0]) and body.rotation == pytest.approx(np.zeros(3))
+    assert body.centroid == pytest.approx([1, 2, 5])
+    assert body.mask.shape == (120, 160) and body.mask[40, 40] and not body.mask[100, 100]
+    still = in_world(seen._replace(alignment=None), turned, turned, (120, 160))
+    of_lost = in_world(seen, turned, None, (120, 160))
+    assert np.isnan([of_lost.displacement, of_lost.rotation]).all(), "the camera's own part is not known"
+    pose, status = np.eye(4), no_alignment(AlignmentStatus.OK)
+    rows = body_rows(Step(1, 0.0, 0.1, status, pose, 1.0, False, bodies=(body, still)))
+    assert all(len(row) == len(BODY_COLUMNS) for row in rows)
+    assert rows[0][0] == "0.100000" and rows[0][-1] == "ok" and rows[1][-1] == "seen"
+    assert float(rows[0][BODY_COLUMNS.index("dy")]) == 0.05 and np.isnan(float(rows[1][BODY_COLUMNS.index("dx")]))
+
+
+def test_a_bodys_motion_is_its_own_under_a_rolling_shutter() -> None:
+    """Rows see a body go its own way: moved to the frame's moment along the camera's, it was off by 8 mm and 1.3°."""
+    sequence = SyntheticSequence(14, camera=replace(CAMERA, readout=0.03), bodies=1)
+    world_T_first, truth = sequence.ground_truth.world_T_camera[0], sequence.bodies_truth[0].world_T_part[0]
+    apart, turned = [], []
+    for step in track(sequence, TRACKED):
+        for body in step.bodies[:1]:
+            if not np.isfinite(body.displacement).all():
+                continue
+            moved = truth[step.index] @ np.linalg.inv(truth[step.index - 1])
+            moved = np.linalg.inv(world_T_first) @ moved @ world_T_first
+            before = np.linalg.inv(moved) @ np.append(body.centroid, 1.0)
+            apart.append(np.linalg.norm(body.displacement - body.centroid + before[:3]))
+            turned.append(np.linalg.norm(cv2.Rodrigues(moved[:3, :3].T @ cv2.Rodrigues(body.rotation)[0])[0]))
+    assert len(apart) > 3
+    assert np.median(apart) < 0.002 and np.median(turned) < np.radians(0.3)
+
+
+@pytest.mark.parametrize("status", [AlignmentStatus.OK, AlignmentStatus.LOW_TEXTURE])
+def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
+    status: AlignmentStatus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next motion is judged by it, and its search begins there."""
+    xi = np.full(6, 0.01, np.float32)
+    found = no_alignment(status)._replace(xi=xi)
+    monkeypatch.setattr(motions, "_align", lambda *_: found)
+    search = Search(CAMERA, TRACKED, jax.random.key(0))
+    aware = BodyAware(search, search)
+    blank = aware.blank_state()
+    part = np.zeros(aware.segmenter.size, bool)
+    part[10:30, 10:30] = True
+    before = associate(part.astype(np.int32), BodyTracks.empty(part.shape))
+    state = blank._replace(scene=blank.scene._replace(tracks=before))
+    belief: Any = SimpleNamespace(moving=part.astype(np.float32))
+    frame: Any = None
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    nearness = np.ones(part.shape)
+    tracks, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
+    assert seen[0].alignment is found
+    kept = tracks.motions[list(tracks.numbers).index(seen[0].number)]
+    np.testing.assert_array_equal(kept, xi if status is AlignmentStatus.OK else np.zeros(6))

@@ -1,0 +1,80 @@
+"""A sequence streams through the driver: nothing is kept that is not needed."""
+
+import gc
+import threading
+import tracemalloc
+import weakref
+from dataclasses import replace
+
+import jax
+from driving import (
+    CAMERA,
+    FRAMES,
+    PLAIN,
+    SEARCH_ALONE,
+    Altered,
+    run,
+    unreadable,
+)
+
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.stream import track
+
+
+def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
+    result = run(Altered(sequence, unreadable(5)), replace(PLAIN, on_lost="stop"))
+    assert [step.index for step in result.steps] == [1, 2, 3, 4, 5]
+    assert result.steps[-1].lost
+    assert result.metrics["frames"] == 6 and not result.metrics["complete"]
+
+
+def test_streams(sequence: SyntheticSequence) -> None:
+    """Each frame is decoded once, in order, in another thread, and let go soon after."""
+    alive: list[weakref.ref[Frame]] = []
+    most, threads = [0], set()
+
+    def alter(_: int, frame: Frame) -> Frame:
+        copy = replace(frame, grey=frame.grey.copy(), depth=frame.depth.copy())
+        alive.append(weakref.ref(copy))
+        most[0] = max(most[0], sum(reference() is not None for reference in alive))
+        threads.add(threading.get_ident())
+        return copy
+
+    streamed = Altered(sequence, alter)
+    told: list[Step] = []
+    result = run(streamed, on_step=told.append)
+    assert streamed.read == list(range(FRAMES))
+    assert threading.get_ident() not in threads
+    assert most[0] <= 4
+    assert told == result.steps
+
+
+def test_memory_does_not_grow_with_the_frames(sequence: SyntheticSequence) -> None:
+    """From frame to frame the device holds as much as before, and the host less than a hundredth of a frame more."""
+    device: list[int] = []
+    host: list[int] = []
+
+    def weigh(_: Step) -> None:
+        gc.collect()
+        device.append(sum(array.nbytes for array in jax.live_arrays()))
+        host.append(tracemalloc.get_traced_memory()[0])
+
+    run(sequence)
+    tracemalloc.start()
+    try:
+        run(Altered(sequence, lambda _, frame: replace(frame, grey=frame.grey.copy())), on_step=weigh)
+    finally:
+        tracemalloc.stop()
+    assert len(set(device[3:])) == 1
+    assert (host[-1] - host[3]) / len(host[4:]) < 0.01 * CAMERA.width * CAMERA.height * 3
+
+
+def test_track_yields_steps_as_they_are_done(sequence: SyntheticSequence) -> None:
+    altered = Altered(sequence, lambda _, frame: frame)
+    steps = track(altered, SEARCH_ALONE)
+    assert altered.read == []
+    first = next(steps)
+    assert first.index == 1 and max(altered.read) <= 3
+    steps.close()  # pyright: ignore[reportAttributeAccessIssue]
