@@ -28,8 +28,9 @@ def texture() -> np.ndarray:
 
 def left(residual: np.ndarray, grey: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Size of what local light does not explain of residuals."""
-    stacked = [one[None].astype(np.float32) for one in (residual, grey, np.ones_like(grey) if weight is None else weight)]
-    return np.abs(residual - np.asarray(light_residual(*stacked))[0])
+    counted = np.ones_like(grey) if weight is None else weight
+    light = light_residual(*(one[None].astype(np.float32) for one in (residual, grey, counted)))
+    return np.abs(residual - np.asarray(light)[0])
 
 
 @pytest.mark.parametrize(
