@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,7 +30,7 @@ def texture() -> np.ndarray:
 def left(residual: np.ndarray, grey: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Size of what local light does not explain of residuals."""
     counted = np.ones_like(grey) if weight is None else weight
-    light = light_residual(*(one[None].astype(np.float32) for one in (residual, grey, counted)))
+    light = light_residual(*(jnp.asarray(one[None], jnp.float32) for one in (residual, grey, counted)))
     return np.abs(residual - np.asarray(light)[0])
 
 
