@@ -38,13 +38,13 @@ APART = (0.025, np.radians(1.0))
 AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
 """Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
 away, however many frames are taken meanwhile."""
-DROPPED_EARLY, LEAST_DOUBT = 0.15, 12.0
+DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
 """Seconds after which it is dropped if the first one's motion is within its covariance as often as not."""
 FORGOTTEN = 1.0
 """Seconds after which it counts as clear whose motion the first one's is."""
-LARGEST = 60.0
+LARGEST = 100.0
 """Squared Mahalanobis distance of the two motions since the anchor that leaves no doubt that they differ."""
-CONTRADICTED = 18.0
+CONTRADICTED = 30.0
 """The same distance from which on the far part contradicts the first motion."""
 CLEAR, DOUBTFUL = 0.75, 0.5
 """Certainty (that distance over `LARGEST`, at most 1, plus the far part's margin) above which the rival is taken, and
