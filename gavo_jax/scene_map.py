@@ -330,8 +330,8 @@ def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
 
 def check_voxel(voxel: float) -> None:
     """Raise GavoError for a voxel that no map can have."""
-    if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
-        raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel:g}")
+    if not isinstance(voxel, int | float | np.integer | np.floating) or not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+        raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel!r}")
 
 
 def import_open3d() -> Any:

@@ -43,10 +43,10 @@ def test_other_endings_are_refused(name, shape, words):
         check_map(name, shape)
 
 
-def test_absurd_voxels_are_refused():
-    for voxel in (0.0, -1.0, float("nan"), 2.0):
-        with pytest.raises(GavoError, match="voxel"):
-            check_voxel(voxel)
+@pytest.mark.parametrize("voxel", [0.0, -1.0, float("nan"), 2.0, "1cm", None, [0.01]])
+def test_absurd_voxels_are_refused(voxel: Any) -> None:
+    with pytest.raises(GavoError, match="voxel: must be from"):
+        check_voxel(voxel)
 
 
 def test_without_open3d_one_line_says_what_to_install(monkeypatch):
