@@ -151,6 +151,32 @@ def test_faults_are_counted(load, tmp_path: Path) -> None:
         faults.main(clips=CLIP, faults="nonsense")
 
 
+def test_conditions_are_compared_with_the_clip_as_it_is(load, tmp_path: Path) -> None:
+    conditions: ModuleType = load("conditions")
+    conditions.main(
+        clips=CLIP, method="gauss-newton", conditions="bands of 4 %,every second", json=tmp_path / "conditions.json"
+    )
+    clean, lit, fewer = read(tmp_path / "conditions.json")["conditions"]
+    assert clean["condition"] == "as it is" and clean["ratio"] == 1.0 and 0.3 < fewer["ratio"] < 3.0
+    assert lit["ratio"] == pytest.approx(lit["drift"] / clean["drift"]) and lit["bodies"] == 0.0
+    with pytest.raises(GavoError, match="nonsense"):
+        conditions.main(clips=CLIP, conditions="nonsense")
+
+
+@pytest.mark.parametrize(
+    "name", ["bands of 8 %", "vignette", "shade", "black bars", "JPEG 30", "half size", "middle quarter"]
+)
+def test_a_condition_keeps_images_and_camera_alike(load, name: str) -> None:
+    conditions: ModuleType = load("conditions")
+    changed = conditions.CONDITIONS[name](WALK)
+    for index in (0, len(WALK) - 1):
+        frame = changed[index]
+        size = (changed.camera.height, changed.camera.width)
+        assert frame.grey.dtype == np.uint8 and frame.grey.shape == frame.depth.shape == size
+        assert frame.timestamp == WALK.timestamps[index]
+        assert frame.grey.shape != WALK[index].grey.shape or not np.array_equal(frame.grey, WALK[index].grey)
+
+
 def test_depth_that_is_always_wrong_is_measured(load, tmp_path: Path) -> None:
     wrong_depth: ModuleType = load("wrong_depth")
     quick = Rendered(20, camera=CAMERA, rate=15.0, speed=0.5)

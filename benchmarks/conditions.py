@@ -1,0 +1,245 @@
+"""What other images of the same way do to a run: other light, lenses, sensors, sizes and rates, with nothing wrong.
+
+Every frame of a clip is changed as another camera or room would have it. Nothing moves in the clips but the camera, so
+bodies are false alarms. Prints, for each clip and condition, the share of the pairs that are not ok once the run has
+ended, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, the share of the images that
+show a body, and the drift (RPE over 1 s, RMSE; a dash where no segment is that long), also over that of the clip as it
+is at the same frames.
+
+    python benchmarks/conditions.py
+    python benchmarks/conditions.py --conditions "bands of 4 %,vignette" --method gauss-newton --json conditions.json
+
+On 2 cores the defaults take about 10 minutes.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import common
+import cv2
+import numpy as np
+from faults import Alter, Damaged, drift, follow, is_wrong
+
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.errors import GavoError
+from gavo_jax.output.screen import number
+from gavo_jax.trajectory import Trajectory
+
+AS_IT_IS = "as it is"
+
+Image = np.ndarray
+Grey = Callable[[int, Image], Image]
+"""Makes a frame's grey levels, as floats, from its index and the clip's."""
+Condition = Callable[[FrameSequence], Damaged]
+
+
+def every_frame(alter: Alter) -> Condition:
+    """All frames are altered."""
+
+    def change(clip: FrameSequence) -> Damaged:
+        sequence = Damaged(clip, list(range(len(clip))))
+        sequence.alter = dict.fromkeys(range(len(clip)), alter)
+        return sequence
+
+    return change
+
+
+def grey(make: Grey) -> Condition:
+    """All grey images are changed."""
+
+    def alter(_: FrameSequence, index: int, frame: Frame) -> Frame:
+        levels = make(index, frame.grey.astype(np.float32))
+        return replace(frame, grey=np.clip(np.round(levels), 0, 255).astype(np.uint8))
+
+    return every_frame(alter)
+
+
+def depth(make: Callable[[int, Image], Image]) -> Condition:
+    """All depth images are changed, in the clip's unit; 0 is no reading."""
+    return every_frame(lambda _, index, frame: replace(frame, depth=make(index, frame.depth).astype(np.uint16)))
+
+
+def frames(chosen: Callable[[int], bool]) -> Condition:
+    """Only some of the frames are there."""
+    return lambda clip: Damaged(clip, [index for index in range(len(clip)) if chosen(index)])
+
+
+def gain(of_place: Callable[[int, Image, Image], Image]) -> Condition:
+    """A gain of every place's own, by the frame's index and the place, column and row from -1 to 1."""
+
+    def shone(index: int, levels: Image) -> Image:
+        height, width = levels.shape
+        rows, columns = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+        return levels * of_place(index, columns, rows)
+
+    return grey(shone)
+
+
+def with_camera(camera_of: Callable[[Camera], Camera], grey: Callable, depth: Callable) -> Condition:
+    """Images of another size, and their camera."""
+    images = every_frame(lambda _, index, frame: replace(frame, grey=grey(frame.grey), depth=depth(frame.depth)))
+
+    def change(clip: FrameSequence) -> Damaged:
+        sequence = images(clip)
+        sequence.camera = camera_of(clip.camera)
+        return sequence
+
+    return change
+
+
+def random(index: int) -> np.random.Generator:
+    """A frame's own random numbers."""
+    return np.random.default_rng(index)
+
+
+def jpeg(index: int, levels: Image) -> Image:
+    """What a JPEG of quality 30 keeps."""
+    coded = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, 30])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
+
+
+def blurred(sigma: float, levels: Image) -> Image:
+    """As an image that is out of focus, by some pixels."""
+    return cv2.GaussianBlur(levels, (0, 0), sigma)
+
+
+def bands(amplitude: float) -> Condition:
+    """A lamp that flickers while rows are exposed, at another phase in every frame."""
+    return gain(lambda index, columns, rows: 1.0 + amplitude * np.sin(2.0 * np.pi * rows + 2.1 * index))
+
+
+def without_edges(index: int, raw: Image) -> Image:
+    """Depth that is missing along its edges."""
+    steps = np.abs(cv2.Laplacian(raw.astype(np.float32), cv2.CV_32F)) > 300
+    return np.where(cv2.dilate(steps.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, 0, raw)
+
+
+def halved(camera: Camera) -> Camera:
+    """The camera of images half as large along each side."""
+    fx, fy, cx, cy = camera.scaled(0.5)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=camera.width // 2, height=camera.height // 2)
+
+
+def cropped(camera: Camera) -> Camera:
+    """The camera of the middle quarter of its images; half of the rows take half of the readout."""
+    width, height = camera.width // 2, camera.height // 2
+    cx, cy = camera.cx - width // 2, camera.cy - height // 2
+    return replace(camera, cx=cx, cy=cy, width=width, height=height, readout=camera.readout / 2)
+
+
+def middle(image: Image) -> Image:
+    """The middle quarter of an image."""
+    height, width = (size // 2 for size in image.shape)
+    return image[height // 2 : height // 2 + height, width // 2 : width // 2 + width].copy()
+
+
+def smaller(image: Image) -> Image:
+    """An image half as large along each side."""
+    return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+CONDITIONS: dict[str, Condition] = {
+    AS_IT_IS: every_frame(lambda clip, index, frame: frame),
+    "noise of 10 levels": grey(lambda index, levels: levels + random(index).normal(0.0, 10.0, levels.shape)),
+    "JPEG 30": grey(jpeg),
+    "16 grey levels": grey(lambda index, levels: np.floor(levels / 16) * 16),
+    "blurred by 2 pixels": grey(lambda index, levels: blurred(2.0, levels)),
+    "blurred by 4 pixels": grey(lambda index, levels: blurred(4.0, levels)),
+    "every second blurred": grey(lambda index, levels: blurred(3.0, levels) if index % 2 else levels),
+    "a tenth of the light": grey(lambda index, levels: 0.1 * levels),
+    "twice the light": grey(lambda index, levels: 2.0 * levels),
+    "gamma 0.5": grey(lambda index, levels: 255 * (levels / 255) ** 0.5),
+    "gamma 2": grey(lambda index, levels: 255 * (levels / 255) ** 2),
+    "flicker of 20 %": grey(lambda index, levels: levels * (1.0 + 0.2 * np.sin(2.1 * index))),
+    "bands of 4 %": bands(0.04),
+    "bands of 8 %": bands(0.08),
+    "vignette": gain(lambda index, columns, rows: 1.0 - 0.15 * (columns**2 + rows**2)),
+    "shade": gain(lambda index, columns, rows: 1 - 0.3 / (1 + np.exp(5 * columns + 1.6 * np.sin(0.1 * index)))),
+    "black bars": gain(lambda index, columns, rows: np.abs(rows) < 0.75),
+    "noisy depth": depth(
+        lambda index, raw: np.where(raw > 0, raw + random(index).normal(0, 6e-7, raw.shape) * np.float64(raw) ** 2, 0)
+    ),
+    "a third without depth": depth(lambda index, raw: np.where(random(index).random(raw.shape) < 0.3, 0, raw)),
+    "depth in centimetres": depth(lambda index, raw: raw // 50 * 50),
+    "depth without edges": depth(without_edges),
+    "half size": with_camera(halved, smaller, lambda image: image[::2, ::2].copy()),
+    "middle quarter": with_camera(cropped, middle, middle),
+    "every second": frames(lambda index: index % 2 == 0),
+    "every third": frames(lambda index: index % 3 == 0),
+    "a tenth missing": frames(lambda index: index == 0 or random(index).random() > 0.1),
+}
+
+
+def measure(
+    clip: FrameSequence, truth: Trajectory, condition: str, contender: common.Contender, clean: Trajectory | None
+) -> tuple[dict[str, Any], Trajectory]:
+    """One run, and its trajectory; `clean` is that of the clip as it is."""
+    sequence = CONDITIONS[condition](clip)
+    steps, trajectory = follow(sequence, contender, 0)
+    drift_of = partial(known_drift, stamps=sequence.timestamps, truth=truth)
+    metres, before = drift_of(trajectory), drift_of(trajectory if clean is None else clean)
+    wrong = [step.alignment.status == 0 for step in steps if is_wrong(step, sequence, truth)]
+    row = {
+        "flagged": float(np.mean([step.alignment.status != 0 for step in steps])),
+        "wrong": len(wrong),
+        "silent": sum(wrong),
+        "bodies": float(np.mean([bool(step.bodies) for step in steps])),
+        "drift": metres,
+        "ratio": metres / before if metres and before else None,
+    }
+    return row, trajectory
+
+
+def known_drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float | None:
+    """Drift over the poses of some stamps, m/s; None where it is broken into segments of less than a second."""
+    try:
+        return drift(trajectory, stamps, truth)
+    except GavoError:
+        return None
+
+
+def main(
+    clips: str = common.CLIPS, method: str = "ga:fast", conditions: str = ",".join(CONDITIONS), json: Path | None = None
+) -> dict[str, Any]:
+    """Measure, print and return the figures.
+
+    Args:
+        clips: names with commas between, of clips with ground truth in which nothing moves; see `common.open_clip`.
+        method: METHOD or METHOD:PRESET.
+        conditions: names with commas between; the clip as it is comes first in any case.
+        json: file for the figures.
+    """
+    contender, rows, cells = common.parse_methods(method)[0], [], []
+    chosen = [name for name in common.names(conditions) if name != AS_IT_IS]
+    for name in chosen:
+        if name not in CONDITIONS:
+            raise GavoError(f"unknown condition {name!r}: not one of {', '.join(CONDITIONS)}")
+    for clip in common.names(clips):
+        sequence = common.open_clip(clip)
+        if sequence.ground_truth is None:
+            raise GavoError(f"{clip}: no ground truth")
+        clean = None
+        for name in (AS_IT_IS, *chosen):
+            row, trajectory = measure(sequence, sequence.ground_truth, name, contender, clean)
+            clean = trajectory if name == AS_IT_IS else clean
+            rows.append({"clip": clip, "condition": name, **row})
+            print(f"{clip} {name}: {row['flagged']:.0%} flagged", file=sys.stderr)
+            shares = [f"{row['flagged']:.1%}", f"{row['silent']} of {row['wrong']}", f"{row['bodies']:.0%}"]
+            cells.append([clip, name, *shares, number(row["drift"], 4), number(row["ratio"], 2)])
+    columns = ("clip", "condition", "flagged", "wrong and ok", "bodies", "m/s", "drift / as it is")
+    common.print_table(f"nothing wrong, {contender.name}", columns, cells)
+    wrong, silent = sum(row["wrong"] for row in rows), sum(row["silent"] for row in rows)
+    common.tell(f"{silent} of {wrong} wrong pairs are ok")
+    results = {"method": method, "conditions": rows}
+    common.record(json, "conditions", results)
+    return results
+
+
+if __name__ == "__main__":
+    common.command(main)
