@@ -105,7 +105,7 @@ def jpeg(index: int, levels: Image) -> Image:
 
 
 def blurred(sigma: float, levels: Image) -> Image:
-    """As an image that is out of focus, by some pixels."""
+    """An image that is out of focus, by so many pixels."""
     return cv2.GaussianBlur(levels, (0, 0), sigma)
 
 
