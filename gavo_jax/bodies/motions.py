@@ -83,7 +83,7 @@ def _align(
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
-    """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
+    """A frame's points where its rows saw them: the shutter was undone by the camera's motion, not by a body's."""
     twist = tracker.instant_motion * (segmenter.full.readout / tracker.seconds)
     return apply_rolling_shutter(whole, twist, segmenter.planes)
 
