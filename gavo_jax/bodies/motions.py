@@ -51,7 +51,7 @@ def find_motions(
         if number == 0 or age > 0 or not np.any(part):
             continue
         alignment = None
-        if aware.tracks and np.any(before.labels == number):
+        if aware.finds_motions and np.any(before.labels == number):
             alignment = _align(aware, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
             tracks.motions[place], tracks.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
