@@ -68,7 +68,7 @@ class Scene(NamedTuple):
 
 
 def score_without_barrier(objective: Objective, motions: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`Objective.score` traced without `warp.look_up`'s barrier."""
+    """`Objective.score` traced without `sampling.look_up`'s barrier."""
     with mock.patch.object(jax.lax, "optimization_barrier", lambda words: words):
         return objective.score(motions)
 

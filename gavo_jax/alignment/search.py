@@ -261,7 +261,7 @@ def _search_levels(
     record: bool,
     skips_empty: bool = False,
 ) -> tuple[SearchState, Float[Array, "l iterations"], Population | None]:
-    """SearchState some levels, one after the other, each from the islands of the last; held about a centre.
+    """Search some levels, one after the other, each from the islands of the last; held about a centre.
 
     Whether a level without islands is left out is static: where every level has some, the test would cost time.
     """
@@ -287,7 +287,7 @@ def _search_level(
     search: SearchState,
     visit: tuple[Level, PRNGKeyArray],
 ) -> tuple[SearchState, tuple[Float[Array, " iterations"], Population | None]]:
-    """SearchState one level, from the islands of the last one, in the paper's five steps.
+    """Search one level, from the islands of the last one, in the paper's five steps.
 
     Take the reference's points (the visit has them), estimate brightness and noise, choose search coordinates, have
     the solver minimise E on every island, and hand the best distinct motions on to the next level.
@@ -334,7 +334,7 @@ def _search_island(
     origin: Float[Array, "4 4"],
     inhabited: Bool[Array, ""],
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
-    """SearchState one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
+    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=reach_of(options), searched=inhabited)
         reach = jnp.abs(unconditioner(problem.basis)) @ box

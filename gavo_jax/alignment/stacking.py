@@ -60,8 +60,8 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
 
 
 def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
-    """Both sides as of `stacked_images`: bytes and 16 bits, or float32 throughout. For each other combination of types
-    the search would be compiled anew.
+    """Both sides as `stacked_images` gives them: bytes and 16 bits, or float32 throughout. For each other combination
+    of types the search would be compiled anew.
     """
     sides = [stacked_images(side, camera) for side in (references, targets)]
     if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):

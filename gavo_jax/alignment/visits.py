@@ -20,9 +20,9 @@ class Exchanged(NamedTuple):
     """The two frames of a pair with their parts exchanged, for the symmetric error."""
 
     references: Reference
-    """Points of the target frame, as of `make_references`."""
+    """Points of the target frame; see `make_references`."""
     target: Target
-    """The anchor's frame, as of `prepare_target`."""
+    """The anchor's frame; see `prepare_target`."""
 
 
 def levels_of(camera: Camera, solver: Solver, options: AlignmentOptions) -> Levels:

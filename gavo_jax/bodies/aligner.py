@@ -104,8 +104,8 @@ class BodyAware:
         return MotionSegmenter(self.search.camera, self.search.settings)
 
     @property
-    def tracks(self) -> bool:
-        """Whether bodies' motions are found."""
+    def finds_motions(self) -> bool:
+        """Whether each body's own motion is looked for."""
         return self.search.settings.odometry.bodies == "track"
 
     def warm_up(self) -> float:

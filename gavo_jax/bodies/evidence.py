@@ -128,7 +128,7 @@ class Compared(NamedTuple):
     """Pixels of a view beside what V others show there; flat arrays of N."""
 
     residuals: Residuals
-    """[V, N], grey made as bright as the others."""
+    """[V, N]; of grey, with brightness taken off, and the light that changes from place to place."""
     grey: GreySample
     """Grey of the view itself, with its slopes."""
     seen_grey: Float[Array, "v n"]
@@ -141,7 +141,7 @@ class Compared(NamedTuple):
 def compare(
     here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera, stride: int = 1
 ) -> Compared:
-    """Every pixel of a view, or one of `stride` along either side, in V others; arguments as of `gather_evidence`."""
+    """Every pixel of a view, or one of `stride` along either side, in V others; see `gather_evidence`."""
     plane = image_plane(camera)
     here = here.moving_as(others.sweep[0])
     others = others.moving_as(here.sweep)

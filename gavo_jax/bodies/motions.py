@@ -51,7 +51,7 @@ def find_motions(
         if number == 0 or age > 0 or not np.any(part):
             continue
         alignment = None
-        if aware.tracks and np.any(before.labels == number):
+        if aware.finds_motions and np.any(before.labels == number):
             alignment = _align(aware, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
             tracks.motions[place], tracks.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
@@ -83,7 +83,7 @@ def _align(
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
-    """A frame's points where its rows saw them: by the camera's motion a body's points were settled wrongly."""
+    """A frame's points where its rows saw them: the shutter was undone by the camera's motion, not by a body's."""
     twist = tracker.instant_motion * (segmenter.full.readout / tracker.seconds)
     return apply_rolling_shutter(whole, twist, segmenter.planes)
 

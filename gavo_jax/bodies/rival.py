@@ -39,7 +39,7 @@ AGREED_AFTER, DROPPED_AFTER = 0.15, 0.42
 """Seconds after which a rival is dropped if it is the same motion; if nothing is decided. A body takes time to move
 away, however many frames are taken meanwhile."""
 DROPPED_EARLY, LEAST_DOUBT = 0.15, 20.0
-"""Seconds after which it is dropped if the first one's motion is within its covariance as often as not."""
+"""Seconds after which it is dropped where the squared Mahalanobis distance of the two motions is less than that."""
 FORGOTTEN = 1.0
 """Seconds after which it counts as clear whose motion the first one's is."""
 LARGEST = 100.0
@@ -93,7 +93,7 @@ class Rival(NamedTuple):
     rival_T_anchor: Float[np.ndarray, "4 4"]
     """Motion since the anchor by the rival's search."""
     covariance: Float[np.ndarray, "6 6"]
-    """Of the rival's motion since the anchor, by a step on the target's side: errors of its frames add up."""
+    """That of the rival's motion since the anchor, by a step on the target's side: errors of its frames add up."""
     age: Span
     """Time since the anchor."""
     ahead: Any

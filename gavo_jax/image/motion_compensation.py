@@ -16,7 +16,7 @@ from gavo_jax.image.pyramid import EDGE_TOLERANCE
 from gavo_jax.image.shutter import row_time
 
 HALVING = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0
-"""As of `pyramid.halve_grey`."""
+"""Weights along either side of the pixels that become one, as in `pyramid.halve_grey`."""
 UNKNOWN_DEPTH = 2.0
 """Metres that a pixel is taken to be away where the whole image has no reading."""
 

@@ -225,7 +225,7 @@ class Keyframes:
         return [keyframe for keyframe in self.all if keyframe.images is not None]
 
     def _thin(self) -> None:
-        """Give up images where there are too many: those of the later one of the two keyframes that are nearest to each
+        """Give up images where there are too many, those of the later one of the two keyframes that are nearest to each
         other: the older a keyframe, the more a loop to it tells.
         """
         kept = self.searchable()

@@ -61,7 +61,7 @@ class Recovering(SecondThought):
         return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
 
     def warm_up_both(self) -> float:
-        """Warm up both, side by side; the seconds this took."""
+        """Warm up both, side by side; returns the seconds this took."""
         if self.wide is None:
             return self.first.warm_up()
         return side_by_side(self.first.warm_up, self.wide.warm_up)

@@ -137,10 +137,10 @@ def _undo_rolling_shutter(
     """Points of both references where they were at their image's moment, by the motion that is known now; those of a
     first frame are still where their rows' moments left them.
     """
-    unsettled = newest.row_time
+    as_exposed = newest.row_time
     newest = undo_rolling_shutter(newest, moved.instant_motion * readout)
     keyframe = undo_rolling_shutter(keyframe, moved.motion * readout)
-    return newest._replace(row_time=jnp.where(moved.is_first, unsettled, newest.row_time)), keyframe
+    return newest._replace(row_time=jnp.where(moved.is_first, as_exposed, newest.row_time)), keyframe
 
 
 def _velocity_change_after(state: TrackerState, moved: Moved, elapsed: Float[Array, ""]) -> VelocityChange:

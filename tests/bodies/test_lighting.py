@@ -1,15 +1,24 @@
 """Light that changes from place to place is no body; texture that moves is not taken for light."""
 
+from functools import partial
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from carded import TRACKED
 
+from gavo_jax.alignment.visits import prepare_target
+from gavo_jax.bodies.evidence import Compared, compare, view_of
 from gavo_jax.bodies.lighting import light_residual
+from gavo_jax.bodies.scene import MotionSegmenter
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.image.levels import Levels
+from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.presets import preset
 from gavo_jax.status import AlignmentStatus
@@ -62,6 +71,31 @@ def test_what_does_not_count_says_nothing_of_the_light(texture: np.ndarray) -> N
     hidden = COLUMNS < 50
     residual = np.where(hidden, 60.0, 0.0)
     assert np.max(left(residual, grey, ~hidden)[:, 60:]) < 1.0
+
+
+@partial(jax.jit, static_argnames=("levels", "stride"))
+def compared(greys: jax.Array, depth: jax.Array, camera: Camera, levels: Levels, stride: int) -> Compared:
+    """The first of two images in the second one, by a camera at rest."""
+    pyramids = [build_pyramid(grey, depth, camera.depth_scale) for grey in greys]
+    here, there = (view_of(prepare_target(pyramid, levels), levels, jnp.zeros(6)) for pyramid in pyramids)
+    others = jax.tree.map(lambda leaf: leaf[None], there)
+    return compare(here, others, jnp.eye(4)[None], camera, stride)
+
+
+@pytest.mark.parametrize(("width", "height", "stride"), [(20, 16, 1), (83, 123, 2)])
+def test_light_is_taken_off_images_of_any_size(width: int, height: int, stride: int) -> None:
+    """Tiny, upright, and of sides that the stride does not divide: pixels taken for others would leave the bands."""
+    camera = Camera(0.8 * width, 0.8 * width, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    segmenter = MotionSegmenter(camera, TRACKED)
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0.0, 90.0, (height, width)), (0, 0), 1.5)
+    grey = np.clip(110.0 + noise, 0.0, 200.0)
+    bands = 1.0 + 0.12 * np.sin(np.arange(width) / width * 2.0 * np.pi)
+    greys = np.stack([grey, bands * grey]).round().astype(np.uint8)
+    depth = np.full((height, width), 2 * camera.depth_scale, np.uint16)
+    found = jax.device_get(compared(greys, depth, segmenter.camera, segmenter.levels, stride))
+    r, seen = found.residuals, found.residuals.inside > 0
+    assert np.mean(seen) > 0.7
+    assert np.mean(np.abs(r.grey[seen])) < 0.3 * np.mean(np.abs(r.grey_sample.value - found.seen_grey)[seen])
 
 
 class Flickering:

@@ -21,7 +21,7 @@ SMALL_WORD = re.compile(r"[a-z]+[,.:;]?(\s|$)")
 """A word that goes on a sentence; symbols, units, files' and other names have more than small letters."""
 PREPOSITIONS = {"Of", "By", "As", "From", "With", "In", "At", "On", "Where", "For"}
 """What a function's docstring doesn't begin with: it would go on the name."""
-FILES = (".json", ".csv", ".toml")
+FILES = (".json", ".csv", ".toml", ".py")
 """Endings of what is a file's name."""
 VALUES = {"camera": Camera, "alignment": AlignmentOptions, "odometry": OdometryOptions}
 """By name: what is said of a value of the class, or of a key in a file of settings."""
@@ -70,9 +70,9 @@ def mentioned(path: Path) -> set[str]:
 
 
 def is_there(name: str) -> bool:
-    """Whether a name is that of a module, of something in one, or of a value's field."""
+    """Whether a name is that of a module, of something in one, or of what a value has."""
     first, *rest = name.split(".")
-    if first in VALUES and len(rest) == 1 and rest[0] in VALUES[first].__dataclass_fields__:
+    if len(rest) == 1 and (value := VALUES.get(first)) and rest[0] in {*value.__dataclass_fields__, *dir(value)}:
         return True
     return any(leads_to(full, rest) for full in MODULES[first])
 
@@ -92,7 +92,7 @@ def leads_to(full: str, rest: list[str]) -> bool:
 
 
 def test_names_in_docstrings_are_there() -> None:
-    said = ((path.relative_to(PACKAGE), name) for path in PATHS for name in sorted(mentioned(path)))
+    said = ((path.relative_to(ROOT), name) for path in WRITTEN for name in sorted(mentioned(path)))
     wrong = [f"{path}: {name}" for path, name in said if not is_there(name)]
     assert not wrong
 

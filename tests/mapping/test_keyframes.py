@@ -1,4 +1,4 @@
-"""Keyframes: settled, bounded in number, found again; the driver that asks for them."""
+"""Keyframes: of one moment, bounded in number, found again; the driver that asks for them."""
 
 from dataclasses import replace
 from typing import Any
@@ -89,7 +89,7 @@ def there_and_back(frames: int) -> Trajectory:
 WALK = SyntheticSequence(trajectory=there_and_back(25), noise=NONE, camera=CAMERA)
 
 
-def test_a_settled_frame_is_that_of_a_global_shutter():
+def test_a_frame_without_its_own_motion_is_that_of_a_global_shutter():
     rolling = replace(CAMERA, readout=0.06)
     path = there_and_back(25)
     skewed = SyntheticSequence(trajectory=path, noise=NONE, camera=rolling)[6]
@@ -97,7 +97,7 @@ def test_a_settled_frame_is_that_of_a_global_shutter():
     truth = WALK.ground_truth.world_T_camera
     back = inverse(truth[7]) @ truth[5]
     twist = log(back) * RATE / 2
-    plain, settled, wanted = (
+    plain, compensated, wanted = (
         compensate_motion(frame.grey, frame.depth, rolling, motion)
         for frame, motion in ((skewed, np.zeros(6)), (skewed, twist), (straight, np.zeros(6)))
     )
@@ -106,9 +106,9 @@ def test_a_settled_frame_is_that_of_a_global_shutter():
         inner = (slice(4, -4), slice(6, -6))
         return float(np.abs(images.grey[inner].astype(float) - wanted.grey[inner]).mean())
 
-    assert off(settled) < 0.5 * off(plain)
-    known = (settled.depth > 0) & (wanted.depth > 0)
-    assert np.median(np.abs(settled.depth[known].astype(float) - wanted.depth[known])) < 25  # 5 mm
+    assert off(compensated) < 0.5 * off(plain)
+    known = (compensated.depth > 0) & (wanted.depth > 0)
+    assert np.median(np.abs(compensated.depth[known].astype(float) - wanted.depth[known])) < 25  # 5 mm
 
 
 def test_images_are_bounded_and_the_likest_are_candidates():

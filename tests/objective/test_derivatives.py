@@ -10,16 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from observed import (
-    CAMERA,
-    build,
-    exchanged,
-    jit_linearize,
-    jit_problem_score,
-    jit_residuals,
-    noisy_pair,
-    smooth_pair,
-)
+from observed import CAMERA, build, exchanged, jit_linearize, jit_problem_score, jit_residuals, noisy_pair, smooth_pair
 
 from gavo_jax.objective.losses import LOSSES, l2, student_t
 from gavo_jax.objective.problem import Problem

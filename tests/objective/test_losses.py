@@ -5,13 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from observed import (
-    build,
-    jit_error,
-    random_motions,
-    random_pair,
-    staircase,
-)
+from observed import build, jit_error, random_motions, random_pair, staircase
 
 from gavo_jax.objective.losses import LOSSES
 

@@ -86,13 +86,13 @@ def test_points_moved_behind_the_camera_lose_their_reading() -> None:
     assert all(np.all(np.isfinite(leaf)) for leaf in moved.points)
 
 
-def test_settled_points_are_where_they_were_in_the_middle_of_the_readout() -> None:
+def test_with_the_shutter_undone_points_are_where_they_were_in_the_middle_of_the_readout() -> None:
     pair = smooth_pair(rim=1)
     reference = make_reference(PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in pair[1:3])), CAMERA)
     twist = np.array([0.02, -0.01, 0.015, 0.01, -0.02, 0.015])
-    settled = jit_undo(reference, twist.astype(np.float32))
-    assert not np.any(settled.row_time)
-    before, after = (np.stack(points, dtype=float) for points in (reference.points, settled.points))
+    undone = jit_undo(reference, twist.astype(np.float32))
+    assert not np.any(undone.row_time)
+    before, after = (np.stack(points, dtype=float) for points in (reference.points, undone.points))
     for i in (70, 1000, 2900):
         row = i // CAMERA.width
         x, y, q = before[:, i]

@@ -4,10 +4,7 @@ import gc
 
 import numpy as np
 import pytest
-from driving import (
-    CAMERA,
-    SEARCH_ALONE,
-)
+from driving import CAMERA, SEARCH_ALONE
 
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Odometry

@@ -7,15 +7,7 @@ import weakref
 from dataclasses import replace
 
 import jax
-from driving import (
-    CAMERA,
-    FRAMES,
-    PLAIN,
-    SEARCH_ALONE,
-    Altered,
-    run,
-    unreadable,
-)
+from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, Altered, run, unreadable
 
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
