@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-CELLS = 10
-"""Cells along the longer side of the image; the gain is linear from the centre of one to that of the next."""
+CELLS, SMALLEST = 10, 6.0
+"""Cells along the longer side of the image, and pixels of the smallest one: a gain of less would explain texture. The gain
+is linear from the centre of one cell to that of the next."""
 UNCHANGED = 900.0
 """Squared grey levels of a cell's mean pixel at which its gain is half-way between 1 and the regression's."""
 LARGE = 20.0
@@ -44,6 +45,6 @@ def light_residual(
 
 def _shares(size: int, longest: int) -> Float[np.ndarray, "n cells"]:
     """How far each pixel of a side belongs to each cell along it: linear between the cells' centres."""
-    count = max(2, round(CELLS * size / longest))
+    count = max(2, round(size / max(longest / CELLS, SMALLEST)))
     places = np.clip((np.arange(size) + 0.5) / size * count - 0.5, 0.0, count - 1.0)
     return np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(count))).astype(np.float32)
