@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 CELLS, SMALLEST = 10, 6.0
-"""Cells along the longer side of the image, and pixels of the smallest one: a gain of less would explain texture. The gain
-is linear from the centre of one cell to that of the next."""
+"""Cells along the longer side of the image, and pixels of the smallest one: a gain of less would explain texture.
+The gain is linear from the centre of one cell to that of the next."""
 UNCHANGED = 900.0
 """Squared grey levels of a cell's mean pixel at which its gain is half-way between 1 and the regression's."""
 LARGE = 20.0
