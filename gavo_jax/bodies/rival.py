@@ -170,7 +170,7 @@ class WithRival:
                 return self._decide(attempt, other, aged, open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
-                return self._taken(other, aged, open_for, open_for)
+                return self._taken(other, aged, open_for, open_for, clearly=True)
         if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
             rival = self._nobody
         elif other is not None:
@@ -222,7 +222,9 @@ class WithRival:
         )
         return attempt._replace(state=RivalledState(attempt.state, after, open_for))
 
-    def _taken(self, other: Attempt, rival: Rival, open_for: Span, open_after: Span) -> Attempt:
+    def _taken(
+        self, other: Attempt, rival: Rival, open_for: Span, open_after: Span, *, clearly: bool = False
+    ) -> Attempt:
         """The rival's attempt in place of the first one's, by the way from where its camera was believed to be.
 
         Args:
@@ -230,12 +232,17 @@ class WithRival:
             rival: Before it, of the age it has then.
             open_for: How long it was open whose motion the first one's is.
             open_after: How long it is from now on.
+            clearly: Whether motions that differ by no more than the rival's errors are the same: nothing speaks for
+                the rival but that it goes on.
         """
         second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
         result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
         taken = other._replace(state=self._alone(other.state, open_after), result=result)
         earlier = int(rival.age.frames) - 1
-        parted = earlier == 0 or _exceeds(_between(rival.first_T_anchor, rival.rival_T_anchor), TOGETHER)
+        before = np.asarray(rival.first_T_anchor, np.float64), np.asarray(rival.rival_T_anchor, np.float64)
+        parted = earlier == 0 or _exceeds(_between(*before), TOGETHER)
+        if earlier and parted and clearly:
+            parted = _distance(*before, np.asarray(rival.covariance, np.float64)) > LEAST_DOUBT
         if parted:  # else the motions before were the same by both
             unknown = max(int(open_for.frames) - earlier - 1, 0)
             taken = taken._replace(unknown=unknown, revises=unknown + earlier)
