@@ -52,8 +52,8 @@ class DepthChange(NamedTuple):
 
     @property
     def usually_left(self) -> float:
-        """Median of `left`; not-a-number of fewer than tell."""
-        return float(np.median(self.left)) if len(self.left) >= MIN_REMEMBERED else np.nan
+        """Median of `left`, of two the lower one: half of the pairs may show a body. Not-a-number if too few tell."""
+        return float(np.quantile(self.left, 0.5, method="lower")) if len(self.left) >= MIN_REMEMBERED else np.nan
 
     @property
     def is_unexplained(self) -> bool:
