@@ -20,7 +20,6 @@ from typing import Any
 import common
 
 from gavo_jax import presets
-from gavo_jax.errors import GavoError
 from gavo_jax.objective.losses import l2
 from gavo_jax.output.screen import number
 from gavo_jax.presets import PAPER_OBJECTIVE
@@ -87,9 +86,7 @@ def contenders(variants: str, preset_name: str = "default") -> list[common.Conte
     """
     full = presets.preset("ga", preset_name)
     chosen = [common.preset_contender(FULL, full)]
-    for name in common.names(variants):
-        if name not in VARIANTS:
-            raise GavoError(f"unknown ingredient {name!r}: not one of {', '.join(VARIANTS)}")
+    for name in common.names_among(VARIANTS, "ingredient", variants):
         title, switch_off = VARIANTS[name]
         chosen.append(common.preset_contender(f"{name}: {title}", switch_off(full)))
     return chosen

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gavo_jax import se3
-from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 INTERVALS = (1 / 30, 2 / 30, 4 / 30)
@@ -53,9 +52,7 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
     """
     rows, sways = [], []
     for clip in common.names(clips):
-        truth = common.open_clip(clip).ground_truth
-        if truth is None:
-            raise GavoError(f"{clip}: no ground truth")
+        _, truth = common.open_true_clip(clip)
         for interval in INTERVALS:
             moments = np.arange(truth.timestamps[0], truth.timestamps[-1], interval)
             mean = velocities(truth, moments[:-1], moments[1:])

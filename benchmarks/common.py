@@ -5,7 +5,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers import PEERS
 from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory
 
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
@@ -115,6 +116,18 @@ def names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+def names_among(known: Collection[str], what: str, text: str) -> list[str]:
+    """Return the names between the commas.
+
+    Raises:
+        GavoError: one is not known.
+    """
+    for name in (chosen := names(text)):
+        if name not in known:
+            raise GavoError(f"unknown {what} {name!r}: not one of {', '.join(known)}")
+    return chosen
+
+
 def counts(text: str) -> list[int]:
     """Return the whole numbers between the commas.
 
@@ -149,6 +162,18 @@ def open_clip(text: str) -> FrameSequence:
             raise GavoError(f"{name}: no such folder, and GAVO_DATA does not name the folder of the clips")
         folder = Path(data) / name
     return open_source(folder)[:frames]
+
+
+def open_true_clip(text: str) -> tuple[FrameSequence, Trajectory]:
+    """Return the frames of a clip, as `open_clip` does, and its ground truth.
+
+    Raises:
+        GavoError: as by `open_clip`, or there is no ground truth.
+    """
+    clip = open_clip(text)
+    if clip.ground_truth is None:
+        raise GavoError(f"{text}: no ground truth")
+    return clip, clip.ground_truth
 
 
 class Contender(NamedTuple):

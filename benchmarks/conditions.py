@@ -22,12 +22,11 @@ from typing import Any
 import common
 import cv2
 import numpy as np
-from faults import Alter, Damaged, drift, follow, is_wrong
+from faults import Damaged, every_frame, follow, is_wrong, known_drift
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError
 from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory
 
@@ -37,17 +36,6 @@ Image = np.ndarray
 Grey = Callable[[int, Image], Image]
 """Makes a frame's grey levels, as floats, from its index and the clip's."""
 Condition = Callable[[FrameSequence], Damaged]
-
-
-def every_frame(alter: Alter) -> Condition:
-    """All frames are altered."""
-
-    def change(clip: FrameSequence) -> Damaged:
-        sequence = Damaged(clip, list(range(len(clip))))
-        sequence.alter = dict.fromkeys(range(len(clip)), alter)
-        return sequence
-
-    return change
 
 
 def grey(make: Grey) -> Condition:
@@ -196,14 +184,6 @@ def measure(
     return row, trajectory
 
 
-def known_drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float | None:
-    """Drift over the poses of some stamps, m/s; None where it is broken into segments of less than a second."""
-    try:
-        return drift(trajectory, stamps, truth)
-    except GavoError:
-        return None
-
-
 def main(
     clips: str = common.CLIPS, method: str = "ga:fast", conditions: str = ",".join(CONDITIONS), json: Path | None = None
 ) -> dict[str, Any]:
@@ -216,17 +196,12 @@ def main(
         json: file for the figures.
     """
     contender, rows, cells = common.parse_methods(method)[0], [], []
-    chosen = [name for name in common.names(conditions) if name != AS_IT_IS]
-    for name in chosen:
-        if name not in CONDITIONS:
-            raise GavoError(f"unknown condition {name!r}: not one of {', '.join(CONDITIONS)}")
+    chosen = [name for name in common.names_among(CONDITIONS, "condition", conditions) if name != AS_IT_IS]
     for clip in common.names(clips):
-        sequence = common.open_clip(clip)
-        if sequence.ground_truth is None:
-            raise GavoError(f"{clip}: no ground truth")
+        sequence, truth = common.open_true_clip(clip)
         clean = None
         for name in (AS_IT_IS, *chosen):
-            row, trajectory = measure(sequence, sequence.ground_truth, name, contender, clean)
+            row, trajectory = measure(sequence, truth, name, contender, clean)
             clean = trajectory if name == AS_IT_IS else clean
             rows.append({"clip": clip, "condition": name, **row})
             print(f"{clip} {name}: {row['flagged']:.0%} flagged", file=sys.stderr)

@@ -93,6 +93,17 @@ def altered(alter: Alter, count: int = 1) -> Fault:
     return damage
 
 
+def every_frame(alter: Alter) -> Callable[[FrameSequence], Damaged]:
+    """All frames are altered."""
+
+    def change(clip: FrameSequence) -> Damaged:
+        sequence = Damaged(clip, list(range(len(clip))))
+        sequence.alter = dict.fromkeys(range(len(clip)), alter)
+        return sequence
+
+    return change
+
+
 def with_grey(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault:
     """Damage of the grey image."""
     return altered(lambda clip, index, frame: replace(frame, grey=make(frame.grey)), count)
@@ -341,6 +352,14 @@ def drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> floa
     return relative_pose_error(trajectory[chosen], truth).translation.rmse
 
 
+def known_drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float | None:
+    """The same; None where the trajectory is broken into segments of less than a second."""
+    try:
+        return drift(trajectory, stamps, truth)
+    except GavoError:
+        return None
+
+
 def follow(sequence: Any, contender: common.Contender, seed: int) -> tuple[list[Step], Trajectory]:
     """Steps and trajectory of one run."""
     steps = revised(track(sequence, odometry=contender.make(sequence.camera, seed)))
@@ -401,17 +420,12 @@ def main(
         json: file for the figures.
     """
     contender = common.parse_methods(method)[0]
-    for name in common.names(faults):
-        if name not in FAULTS | LAWFUL:
-            raise GavoError(f"unknown fault {name!r}: not one of {', '.join(FAULTS | LAWFUL)}")
-    rows = []
+    chosen, rows = common.names_among(FAULTS | LAWFUL, "fault", faults), []
     for clip in common.names(clips):
-        sequence = common.open_clip(clip)
-        if sequence.ground_truth is None:
-            raise GavoError(f"{clip}: no ground truth")
+        sequence, truth = common.open_true_clip(clip)
         clean = [follow(sequence, contender, seed)[1] for seed in range(seeds)]
-        for name in common.names(faults):
-            rows.append(measure(clip, name, sequence, clean, contender, sequence.ground_truth))
+        for name in chosen:
+            rows.append(measure(clip, name, sequence, clean, contender, truth))
             print(f"{clip} {name}: {rows[-1].silent} of {rows[-1].wrong} wrong pairs ok", file=sys.stderr)
     cells = [
         [

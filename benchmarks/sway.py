@@ -16,7 +16,6 @@ from typing import Any
 import common
 import numpy as np
 
-from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
@@ -42,13 +41,11 @@ def measure(clip: str, method: str) -> list[dict[str, Any]]:
     Raises:
         GavoError: a clip without ground truth.
     """
-    sequence, settings, rows = common.open_clip(clip), common.preset_of(method), []
-    if sequence.ground_truth is None:
-        raise GavoError(f"{clip}: no ground truth")
+    (sequence, truth), settings, rows = common.open_true_clip(clip), common.preset_of(method), []
     for name, sway in VELOCITIES.items():
         odometry = Odometry(sequence.camera, replace(settings, odometry=replace(settings.odometry, sway=sway)))
         run = track_visibly(f"{clip}, {name}", sequence, odometry).outcome(sequence)
-        metres, radians = pair_errors(run.trajectory, sequence.ground_truth)
+        metres, radians = pair_errors(run.trajectory, truth)
         rows.append(
             {
                 "velocity": name,

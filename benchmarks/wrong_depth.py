@@ -20,11 +20,10 @@ from typing import Any
 
 import common
 import numpy as np
-from faults import Alter, Damaged, drift, is_wrong, late, of_depth, zoom
+from faults import Alter, every_frame, is_wrong, known_drift, late, of_depth, zoom
 
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError
 from gavo_jax.odometry.depth_change import MOST_LEFT
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.run import trajectory_of
@@ -57,8 +56,7 @@ FAULTS: dict[str, Alter] = {
 
 def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: common.Contender) -> dict[str, Any]:
     """One run of which every frame is altered."""
-    sequence: Any = Damaged(clip, list(range(len(clip))))
-    sequence.alter = dict.fromkeys(range(len(clip)), alter)
+    sequence: Any = every_frame(alter)(clip)
     odometry, steps, left = contender.make(sequence.camera, 0), [], []
     for step in track(sequence, odometry=odometry):
         steps.append(step)
@@ -68,15 +66,11 @@ def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: com
     told = revised(steps)
     wrong = [step.alignment.status == 0 for step in told if is_wrong(step, sequence, truth)]
     trajectory = trajectory_of(float(sequence.timestamps[0]), steps)
-    try:
-        metres = drift(trajectory, sequence.timestamps, truth)
-    except GavoError:  # broken into segments of less than a second
-        metres = None
     return {
         "flagged": float(np.mean([step.alignment.status != 0 for step in told])),
         "wrong": len(wrong),
         "silent": sum(wrong),
-        "drift": metres,
+        "drift": known_drift(trajectory, sequence.timestamps, truth),
         "left": float(np.median(left)) if left else None,
         "most_left": max(left, default=None),
     }
@@ -94,17 +88,12 @@ def main(
         json: file for the figures.
     """
     contender, rows, cells = common.parse_methods(method)[0], [], []
-    chosen = [name for name in common.names(faults) if name != CLEAN]
-    for name in chosen:
-        if name not in FAULTS:
-            raise GavoError(f"unknown fault {name!r}: not one of {', '.join(FAULTS)}")
+    chosen = [name for name in common.names_among(FAULTS, "fault", faults) if name != CLEAN]
     for clip in common.names(clips):
-        sequence = common.open_clip(clip)
-        if sequence.ground_truth is None:
-            raise GavoError(f"{clip}: no ground truth")
+        sequence, truth = common.open_true_clip(clip)
         clean = None
         for name in (CLEAN, *chosen):
-            row = measure(sequence, sequence.ground_truth, FAULTS[name], contender)
+            row = measure(sequence, truth, FAULTS[name], contender)
             clean = row["drift"] if name == CLEAN else clean
             ratio = row["drift"] / clean if row["drift"] and clean else None
             rows.append({"clip": clip, "fault": name, **row, "ratio": ratio})
