@@ -181,11 +181,11 @@ class WithRival:
         """Which of two attempts at a frame stands for it, and whether the rival, of the age it has then, is kept."""
         before = np.asarray(rival.first_T_anchor, np.float64)
         first = np.asarray(attempt.result.target_T_reference) @ before
-        second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
-        age = float(rival.age.seconds)
         onward = np.asarray(other.result.target_T_reference, np.float64)
-        before_it = transport_covariance(onward, np.asarray(rival.covariance, np.float64))
-        covariance = before_it + _in_target(other.result)
+        second = onward @ np.asarray(rival.rival_T_anchor, np.float64)
+        age = float(rival.age.seconds)
+        earlier = transport_covariance(onward, np.asarray(rival.covariance, np.float64))
+        covariance = earlier + _in_target(other.result)
         contradiction = _distance(first, second, _in_target(attempt.result) + covariance)
         apart, uncertainty = _between(first, second), deviation(other)
         if not uncertainty < VAGUE:
@@ -235,15 +235,15 @@ class WithRival:
             clearly: Whether motions that differ by no more than the rival's errors are the same: nothing speaks for
                 the rival but that it goes on.
         """
-        second = np.asarray(other.result.target_T_reference) @ np.asarray(rival.rival_T_anchor, np.float64)
-        result = _returned(other.result, second @ inverse(np.asarray(rival.first_T_anchor, np.float64)))
+        before = np.asarray(rival.first_T_anchor, np.float64), np.asarray(rival.rival_T_anchor, np.float64)
+        second = np.asarray(other.result.target_T_reference) @ before[1]
+        result = _returned(other.result, second @ inverse(before[0]))
         taken = other._replace(state=self._alone(other.state, open_after), result=result)
         earlier = int(rival.age.frames) - 1
-        before = np.asarray(rival.first_T_anchor, np.float64), np.asarray(rival.rival_T_anchor, np.float64)
-        parted = earlier == 0 or _exceeds(_between(*before), TOGETHER)
-        if earlier and parted and clearly:
+        parted = _exceeds(_between(*before), TOGETHER)
+        if parted and clearly:
             parted = _distance(*before, np.asarray(rival.covariance, np.float64)) > LEAST_DOUBT
-        if parted:  # else the motions before were the same by both
+        if parted or earlier == 0:  # else the motions before were the same by both
             unknown = max(int(open_for.frames) - earlier - 1, 0)
             taken = taken._replace(unknown=unknown, revises=unknown + earlier)
         return mistrusted(taken)
