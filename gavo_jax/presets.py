@@ -223,7 +223,13 @@ def _own(method: str, name: str) -> Settings:
             _paper_solver(method),
             PAPER_OBJECTIVE,
             OdometryOptions(
-                reference="previous", prior=False, synchronise=False, rolling_shutter=False, recover=False, bodies="off"
+                reference="previous",
+                prior=False,
+                synchronise=False,
+                rolling_shutter=False,
+                relight=False,
+                recover=False,
+                bodies="off",
             ),
         )
     if name == "default":

@@ -16,7 +16,7 @@ from gavo_jax.solvers.genetic import GeneticAlgorithm
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 PLAIN_ERROR = AlignmentOptions(robust_scale=False, brightness=False, depth=False, last_step=False, loss=l2)
 """Grey alone: half as long to compile as the default one."""
-ALONE = OdometryOptions(recover=False, bodies="off")
+ALONE = OdometryOptions(relight=False, recover=False, bodies="off")
 """No second search behind the first one, and nothing that looks for bodies."""
 NEWTON = Settings(GaussNewton(iterations=(0, 0, 0, 10, 20)), PLAIN_ERROR, ALONE)
 GENETIC = Settings(

@@ -23,7 +23,7 @@ from gavo_jax.bodies.motions import find_motions
 from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
+from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.rigid_motions import exp, log
@@ -95,7 +95,7 @@ class BodyAware:
     """
 
     first: Aligner
-    search: Search
+    search: FrameSearch
     is_eager: bool = False
 
     @cached_property

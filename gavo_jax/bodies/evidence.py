@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, UInt32
 
-from gavo_jax.bodies.lighting import light_residual
+from gavo_jax.bodies.lighting import light_change
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.levels import Levels, image_plane
 from gavo_jax.image.sampling import INVERSE_DEPTH_STEP, GreySample, Target, look_up, sample_depth, sample_grey
@@ -102,7 +102,7 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     """
     width, height = camera.width, camera.height
     compared = compare(here, others, others_T_here, camera)
-    r, grey, seen_grey, q, (u, v) = compared
+    r, grey, seen_grey, q, (u, v), *_ = compared
     residual = jnp.abs(r.grey)
     views = r.grey.shape[0]
     own = jnp.hypot(grey.along_u, grey.along_v)
@@ -136,6 +136,12 @@ class Compared(NamedTuple):
     inverse_depth: Float[Array, " n"]
     place: tuple[Float[Array, " n"], Float[Array, " n"]]
     """Column and row of each pixel in the view."""
+    lit: Float[Array, "v n"]
+    """Grey of the view as bright as the others are on the whole."""
+    light: Float[Array, "v n"]
+    """How much brighter the others show each place beyond that, as a share of it."""
+    same: Float[Array, "v n"]
+    """1 where both show the same surface, as far as depth tells, and neither is saturated, else 0."""
 
 
 def compare(
@@ -182,8 +188,9 @@ def compare(
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
     lit = brightness.seen(seen_grey)
     residual = r.grey_sample.value - lit
-    same = r.inside * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL) * (r.grey_sample.value < SATURATED)
+    is_told = jnp.maximum(r.grey_sample.value, grey.value) < SATURATED
+    same = r.inside * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL) * is_told
     shape = (-1, -(-height // stride), -(-width // stride))
-    change = light_residual(*(one.reshape(shape) for one in (residual, lit, same)))
-    r = r._replace(grey=residual - change.reshape(residual.shape))
-    return Compared(r, grey, seen_grey, q, (u, v))
+    light = light_change(*(one.reshape(shape) for one in (residual, lit, same))).reshape(residual.shape)
+    r = r._replace(grey=residual - lit * light)
+    return Compared(r, grey, seen_grey, q, (u, v), lit, light, same)

@@ -1,7 +1,8 @@
 """Light that changes from place to place: lenses darken corners, lamps flicker while rows are exposed, shadows fall.
 
-One gain and bias for the whole image leave such changes over, and a part of the scene would seem to move. They are
-smooth, and texture that moved is not: its residuals are of both signs within a small part of the image.
+One gain and bias for the whole image leave such changes over: a part of the scene would seem to move, and a motion be
+found that explains them. They are smooth, or alike along a row, and texture that moved is neither: its residuals are of
+both signs within a small part of the image.
 """
 
 import jax
@@ -12,6 +13,10 @@ from jaxtyping import Array, Float
 CELLS, SMALLEST = 10, 6.0
 """Cells along the longer side of the image, and pixels of the smallest one: a gain of less would explain texture.
 The gain is linear from the centre of one cell to that of the next."""
+STRIP = 3.0
+"""Pixels of the height of a strip of rows that has a gain of its own, where a lamp flickers."""
+FLICKER = 0.8
+"""Part of the residuals' power that the gains of strips leave at most where a lamp does: 0.91 is the least without."""
 UNCHANGED = 900.0
 """Squared grey levels of a cell's mean pixel at which its gain is half-way between 1 and the regression's."""
 LARGE = 20.0
@@ -19,10 +24,10 @@ LARGE = 20.0
 ROUNDS = 2
 
 
-def light_residual(
+def light_change(
     residual: Float[Array, "v h w"], grey: Float[Array, "v h w"], weight: Float[Array, "v h w"]
 ) -> Float[Array, "v h w"]:
-    """Return the part of grey residuals that a gain of every place's own explains, grey levels.
+    """Return how much brighter every place became, as a share of its grey: its gain less 1.
 
     Args:
         residual: Of pixels in V other images, grey levels.
@@ -30,21 +35,33 @@ def light_residual(
         weight: How far each pixel counts.
     """
     height, width = residual.shape[1:]
-    rows, columns = _shares(height, max(height, width)), _shares(width, max(height, width))
+    cell = max(max(height, width) / CELLS, SMALLEST)
+    rows, columns, strips = _shares(height, cell), _shares(width, cell), _shares(height, STRIP)
+    everywhere = np.ones((width, 1), np.float32)
 
-    def cells(image: jax.Array) -> jax.Array:
-        return jnp.einsum("hr,vhw,wc->vrc", rows, image, columns)
+    def gain(residual: jax.Array, weight: jax.Array, rows: np.ndarray, columns: np.ndarray) -> jax.Array:
+        def summed(image: jax.Array) -> jax.Array:
+            return jnp.einsum("hr,vhw,wc->vrc", rows, image, columns)
+
+        moment = summed(weight * grey**2) + UNCHANGED * jnp.maximum(summed(weight), 1.0)
+        return jnp.einsum("hr,vrc,wc->vhw", rows, summed(weight * grey * residual) / moment, columns)
+
+    def power(residual: jax.Array) -> jax.Array:
+        square = residual**2
+        return jnp.sum(weight * square / (1.0 + square / LARGE**2), axis=(1, 2), keepdims=True)
 
     def refine(_: int, change: jax.Array) -> jax.Array:
-        trusted = weight / (1.0 + ((residual - change) / LARGE) ** 2) ** 2
-        moment = cells(trusted * grey**2) + UNCHANGED * jnp.maximum(cells(trusted), 1.0)
-        return grey * jnp.einsum("hr,vrc,wc->vhw", rows, cells(trusted * grey * residual) / moment, columns)
+        trusted = weight / (1.0 + ((residual - grey * change) / LARGE) ** 2) ** 2
+        flicker = gain(residual, trusted, strips, everywhere)
+        flickers = power(residual - grey * flicker) < FLICKER * power(residual)
+        flicker = jnp.where(flickers, flicker, 0.0)
+        return flicker + gain(residual - grey * flicker, trusted, rows, columns)
 
     return jax.lax.fori_loop(0, ROUNDS, refine, jnp.zeros_like(residual))
 
 
-def _shares(size: int, longest: int) -> Float[np.ndarray, "n cells"]:
+def _shares(size: int, cell: float) -> Float[np.ndarray, "n cells"]:
     """How far each pixel of a side belongs to each cell along it: linear between the cells' centres."""
-    count = max(2, round(size / max(longest / CELLS, SMALLEST)))
+    count = max(2, round(size / cell))
     places = np.clip((np.arange(size) + 0.5) / size * count - 0.5, 0.0, count - 1.0)
     return np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(count))).astype(np.float32)

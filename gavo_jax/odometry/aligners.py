@@ -78,6 +78,24 @@ class Aligner(Protocol):
         ...
 
 
+class FrameSearch(Aligner, Protocol):
+    """An aligner that finds motions itself, from references that a `TrackerState` holds."""
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frames, without distortion."""
+        ...
+
+    @property
+    def settings(self) -> Settings:
+        """What searches, and how."""
+        ...
+
+    def blank_state(self) -> TrackerState:
+        """The state before the first frame."""
+        ...
+
+
 BEGINNING = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
 """Clock of a first frame."""
 
@@ -202,7 +220,7 @@ def _by_level(populations: Population | None) -> tuple[Population, ...]:
 
 def traced_part(options: OdometryOptions) -> OdometryOptions:
     """The options that shape the program; the others are reset, so that they cause no second compilation."""
-    return replace(options, recover=True, bodies="off", on_lost="hold", loops=False)
+    return replace(options, relight=True, recover=True, bodies="off", on_lost="hold", loops=False)
 
 
 def side_by_side(here: Callable[[], Any], beside: Callable[[], Any]) -> float:

@@ -10,7 +10,8 @@ from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import WithRival
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS
-from gavo_jax.odometry.aligners import Aligner, Search
+from gavo_jax.odometry.aligners import Aligner, FrameSearch, Search
+from gavo_jax.odometry.relighting import Relighting
 from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering
 from gavo_jax.settings import Settings
 
@@ -37,12 +38,13 @@ def make_aligner(camera: Camera, settings: Settings, key: PRNGKeyArray, record: 
 
 
 def with_recovery(aligner: Aligner, search: Search) -> Aligner:
-    """An aligner with second thoughts, where the search's settings ask for that: of bodies that move, without a depth
-    that does not agree, and with the wide search behind it.
+    """An aligner with second thoughts, where the search's settings ask for that: in another light, of bodies that move,
+    without a depth that does not agree, and with the wide search behind it.
     """
+    first, careful_search = with_light(aligner, search), with_light(search, search)
     if not search.settings.odometry.recover:
-        return with_bodies(aligner, search)
-    careful = DoubtingDepth(with_bodies(aligner, search), with_bodies(search, search))
+        return with_bodies(first, careful_search)
+    careful = DoubtingDepth(with_bodies(first, careful_search), with_bodies(careful_search, careful_search))
     wide = wide_search(search)
     behind = with_bodies(Polished(wide, search), wide)
     # loading it takes seconds, which a short run had better spare and a long one had better not stop for
@@ -56,7 +58,12 @@ def blank_of(aligner: Any) -> Any:
     return aligner.blank_state()
 
 
-def with_bodies(aligner: Aligner, search: Search) -> Aligner:
+def with_light(aligner: Any, search: FrameSearch) -> Any:
+    """An aligner that looks for light that changed, where the search's settings ask for that."""
+    return Relighting(aligner, search) if search.settings.odometry.relight else aligner
+
+
+def with_bodies(aligner: Aligner, search: FrameSearch) -> Aligner:
     """An aligner that leaves out what moves on its own, where the search's settings ask for that."""
     if search.settings.odometry.bodies == "off":
         return aligner

@@ -21,7 +21,9 @@ from gavo_jax.trajectory import Trajectory
 CAMERA = replace(DEFAULT_CAMERA.level(1), readout=0.02)
 HERTZ, RATE, PHASE = 10.0, 0.5, 0.7
 """Of a hand's tremor: times a second, and rad/s."""
-SEARCH = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(recover=False, bodies="off"))
+SEARCH = Settings(
+    GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(relight=False, recover=False, bodies="off")
+)
 
 
 def trembling(axis: int) -> Trajectory:

@@ -20,8 +20,8 @@ from gavo_jax.trajectory import Trajectory
 
 CAMERA = DEFAULT_CAMERA.level(1)
 FRAMES = 12
-PLAIN = OdometryOptions(recover=False, bodies="off")
-"""No wide search where a pair looks wrong: what happens to lost pairs is the subject here."""
+PLAIN = OdometryOptions(relight=False, recover=False, bodies="off")
+"""No second thoughts where a pair looks wrong: what happens to lost pairs is the subject here."""
 FRAME_TO_FRAME = replace(PLAIN, reference="previous", prior=False)
 SOLVER = GaussNewton(iterations=(0, 15, 0, 0, 20))
 """Two levels: soon compiled."""

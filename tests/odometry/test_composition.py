@@ -12,6 +12,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.composition import wide_search
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.relighting import Relighting
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering
 from gavo_jax.settings import Settings
@@ -47,8 +48,11 @@ def test_the_wide_search_stands_behind_the_default_one() -> None:
     rivalled = aligner.first.first, aligner.first.alone, aligner.second
     first, alone, second = (one.first for one in rivalled if isinstance(one, WithRival))
     assert isinstance(first, BodyAware) and isinstance(alone, BodyAware) and isinstance(second, BodyAware)
-    search, wide = first.search, second.search
-    assert first.first is search and alone.search is search and wide.key == search.key
+    relighting, wide = first.search, second.search
+    assert isinstance(relighting, Relighting) and isinstance(wide, Search)
+    assert first.first == relighting and alone.search == relighting
+    search = relighting.search
+    assert isinstance(search, Search) and relighting.first is search and wide.key == search.key
     assert second.first == Polished(wide, search)
     assert wide.settings.alignment.scouts > 0 and wide.settings.odometry.reference == "previous"
     assert wide.settings.solver.levels == SOLVER.levels

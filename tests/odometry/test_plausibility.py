@@ -28,7 +28,9 @@ from gavo_jax.status import AlignmentStatus as Status
 from gavo_jax.status import bit
 
 CAMERA = DEFAULT_CAMERA.level(1)
-SETTINGS = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(recover=False, bodies="off"))
+SETTINGS = Settings(
+    GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryOptions(relight=False, recover=False, bodies="off")
+)
 DT = 1 / 30
 
 

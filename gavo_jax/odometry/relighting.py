@@ -1,0 +1,123 @@
+"""Light that changed from place to place is put into the references, and the frame is searched for once more.
+
+A search knows one gain and bias of each reference. Where a lamp flickers while rows are exposed, goes on, or throws a
+shadow, neither fits, and the motion is drawn to one that explains the light.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Integer
+
+from gavo_jax.alignment.visits import levels_of
+from gavo_jax.bodies.evidence import compare, seen_level, view_of
+from gavo_jax.camera import Camera
+from gavo_jax.datasets.base import Frame
+from gavo_jax.image.levels import Levels
+from gavo_jax.image.sampling import Target
+from gavo_jax.objective.estimates import LARGE_GREY_RESIDUAL
+from gavo_jax.objective.points import Reference
+from gavo_jax.odometry.aligners import Attempt, FrameSearch
+from gavo_jax.odometry.second_thoughts import SecondThought
+from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.program_cache import CachedProgram
+from gavo_jax.settings import Settings
+
+UNEXPLAINED = 0.7
+"""Share of the grey residuals that are not large, below which light is looked at: most clips lie above."""
+EXPLAINED = 0.5
+"""Part of these, over the whole image, that a change of light has to explain for another search. Flicker, lamps and
+shadows explain 0.6 to 1 of them; bodies, which are textured, up to 0.3, and a search that takes them for light follows
+them."""
+
+
+@dataclass(frozen=True)
+class Relighting(SecondThought):
+    """An aligner that searches once more where light changed from place to place.
+
+    Attributes:
+        first: What is asked first.
+        search: What searches then.
+    """
+
+    search: FrameSearch
+
+    @property
+    def camera(self) -> Camera:
+        """The search's."""
+        return self.search.camera
+
+    @property
+    def settings(self) -> Settings:
+        """The search's."""
+        return self.search.settings
+
+    def blank_state(self) -> TrackerState:
+        """The search's."""
+        return self.search.blank_state()
+
+    def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
+        """The first attempt, or one with references in the frame's own light where that explains more."""
+        attempt = self.first.align(state, frame, clock)
+        result = attempt.result
+        explained = float(result.explained.grey)
+        if explained >= UNEXPLAINED or not np.all(np.isfinite(result.target_T_reference)):
+            return attempt
+        seen = Seen(attempt.state.previous_image, attempt.state.instant_motion, clock.elapsed)
+        motion = np.asarray(result.target_T_reference, np.float32)
+        levels = levels_of(self.camera, self.settings.solver, self.settings.alignment)
+        lit, left = _relit(state, seen, motion, self.camera, levels=levels)
+        if not float(left) < 1.0 - EXPLAINED:
+            return attempt
+        again = self.search.align(lit, frame, clock)
+        return again if float(again.result.explained.grey) > explained else attempt
+
+
+class Seen(NamedTuple):
+    """The new frame as its first attempt has it."""
+
+    image: Target
+    instant_motion: Float[Array, " 6"]
+    """Twist of the motion, had the camera moved all the time as it did at the frame's own moment."""
+    elapsed: Float[Array, ""]
+    """Seconds since the last frame."""
+
+
+@partial(CachedProgram, static=("levels",), returns=(TrackerState,))
+def _relit(
+    state: TrackerState, seen: Seen, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
+) -> tuple[TrackerState, Float[Array, ""]]:
+    """The state with references in the light of a new frame, by the motion to it; and the part of the large residuals
+    that are so in that light, too.
+    """
+    last = view_of(state.previous_image, levels, state.instant_motion * (camera.readout / state.seconds))
+    new = view_of(seen.image, levels, seen.instant_motion * (camera.readout / seen.elapsed))
+    level = camera.level(levels.numbers[seen_level(levels)])
+    compared = compare(last, jax.tree.map(lambda leaf: leaf[None], new), target_T_reference[None], level)
+    light, residual = compared.light[0], compared.residuals.grey[0]
+    without = residual + light * compared.lit[0]
+    before, after = (jnp.sum(compared.same[0] * (jnp.abs(one) >= LARGE_GREY_RESIDUAL)) for one in (without, residual))
+    planes = jax.tree.map(lambda leaf: leaf[:, None], levels.planes(camera))
+
+    def relit(reference: Reference) -> Reference:
+        """Points by the light of the nearest pixel: it is smooth."""
+        x, y, _ = reference.points
+        column = _nearest((planes.fx * x + planes.cx + 0.5) / planes.width, level.width)
+        row = _nearest((planes.fy * y + planes.cy + 0.5) / planes.height, level.height)
+        gain = 1.0 + light.reshape(level.height, level.width)[row, column]
+        return reference._replace(
+            grey=gain * reference.grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v
+        )
+
+    return state._replace(previous=relit(state.previous), keyframe=relit(state.keyframe)), after / jnp.maximum(
+        before, 1.0
+    )
+
+
+def _nearest(part: Float[Array, "*n"], size: int) -> Integer[Array, "*n"]:
+    """Index, along a side of so many pixels, of the one that lies at a part of the side's length."""
+    return jnp.clip(part * size, 0, size - 1).astype(jnp.int32)

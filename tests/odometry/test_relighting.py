@@ -1,0 +1,101 @@
+"""Where light changed from place to place, a frame is searched for once more, with references in its own light."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from carded import Carded
+from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER, Altered, errors, run
+from flicker import flickering, followed
+
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.odometry.aligners import Attempt, FrameSearch
+from gavo_jax.odometry.composition import make_aligner
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.relighting import Relighting
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.presets import preset
+from gavo_jax.settings import Settings
+from gavo_jax.status import AlignmentStatus
+
+RELIT = replace(PLAIN, relight=True)
+FAST = preset("gauss-newton", "fast")
+
+
+@dataclass(frozen=True)
+class Counting:
+    """A search that counts how often it was asked."""
+
+    search: FrameSearch
+    states: list[Any]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.search, name)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        self.states.append(state)
+        return self.search.align(state, frame, clock)
+
+
+def counted(sequence: Any) -> tuple[list[AlignmentStatus], list[Any]]:
+    """What a run says of its pairs, and the states of its second searches."""
+    relighting = make_aligner(CAMERA, Settings(SOLVER, odometry=RELIT), jax.random.key(0))
+    assert isinstance(relighting, Relighting)
+    again: list[Any] = []
+    search: Any = Counting(relighting.search, again)
+    odometry = Odometry(CAMERA, SEARCH_ALONE, aligner=replace(relighting, search=search))
+    steps = [odometry.register(frame, frame.timestamp) for frame in map(sequence.__getitem__, range(len(sequence)))]
+    return [step.alignment.status for step in steps if step], again
+
+
+@pytest.fixture(scope="module")
+def room() -> SyntheticSequence:
+    return SyntheticSequence(frames=6, camera=CAMERA)
+
+
+def test_a_flickering_lamp_does_not_move_the_camera(room: SyntheticSequence) -> None:
+    lit = Altered(room, flickering)
+    before, after = (run(lit, options) for options in (PLAIN, RELIT))
+    assert np.max(errors(after, lit)) < 0.7 * np.max(errors(before, lit))
+    assert min(float(step.alignment.explained.grey) for step in after.steps) > 0.9
+
+
+def test_light_that_is_even_asks_for_nothing(room: SyntheticSequence) -> None:
+    statuses, again = counted(Altered(room, lambda index, frame: replace(frame, grey=frame.grey // (1 + index % 2))))
+    assert statuses == [AlignmentStatus.OK] * 5 and not again
+
+
+def test_a_body_is_not_taken_for_light() -> None:
+    """References in the light of a body that moved would show it where it went, and the camera would follow it."""
+    statuses, again = counted(Carded())
+    assert AlignmentStatus.HIGH_ERROR in statuses and not again
+
+
+def test_references_are_as_bright_as_the_new_frame_shows_them(room: SyntheticSequence) -> None:
+    still = [flickering(index, replace(room[0], timestamp=index / 30), amplitude=0.1) for index in range(2)]
+    _, again = counted(still)
+    (state,) = again
+    plain = Odometry(CAMERA, SEARCH_ALONE)
+    plain.register(still[0], still[0].timestamp)
+    tracker: Any = plain.progress.tracker
+    finest = CAMERA.level(1)
+    before, after = (jax.tree.map(lambda leaf: np.asarray(leaf)[-1], one.previous) for one in (tracker, state))
+    rows = (np.asarray(before.points.y) * finest.fy + finest.cy + 0.5) / finest.height
+    wanted = np.divide(*(1.0 + 0.1 * np.sin(4.0 * np.pi * rows + 2.1 * index) for index in (1, 0)))
+    gain, has = after.grey / before.grey, before.points.q > 0
+    overall = np.median((gain / wanted)[has])  # the search estimates one gain for all by itself
+    assert np.std(wanted[has]) > 0.08
+    assert np.median(np.abs(gain / wanted / overall - 1.0)[has]) < 0.02
+    np.testing.assert_allclose(after.grey_u[has], (gain * before.grey_u)[has], rtol=1e-4)
+
+
+def test_a_clip_under_a_flickering_lamp(data_dir: Path) -> None:
+    """Bands of 8 % made every third pair `high_error`."""
+    clip = TumSequence(data_dir / "fr1_desk")
+    steps = followed(clip, clip.camera, FAST, frames=12)
+    assert {step.alignment.status for step in steps} == {AlignmentStatus.OK}
