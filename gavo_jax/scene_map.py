@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import without_distortion
+from gavo_jax.datasets.rectified import rectified, without_distortion
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
@@ -46,6 +47,9 @@ BLOCK = 8
 
 MOST_BLOCKS = 100_000
 """Blocks that a map may have, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
+
+LOOKED_AT = 4
+"""Pixels along either axis of which Open3D looks at one to find the blocks that a frame touches."""
 
 MIN_WEIGHT = 3.0
 """Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
@@ -117,7 +121,7 @@ class MapBuilder:
         """Make an empty field.
 
         Args:
-            camera: of the frames, without distortion.
+            camera: of the frames; where it has lens distortion, that is taken out of every frame.
             voxel: side, metres.
             farthest: depth beyond is left out, metres.
 
@@ -125,10 +129,11 @@ class MapBuilder:
             GavoError: an absurd voxel, or Open3D cannot be imported.
         """
         check_voxel(voxel)
-        self.camera, self.voxel, self.farthest = camera, voxel, farthest
+        self._recorded = camera
+        self.camera, self.voxel, self.farthest = camera.rectified(), voxel, farthest
         self._open3d = import_open3d()
         core = self._open3d.core
-        self._intrinsic = core.Tensor(camera.matrix)
+        self._intrinsic = core.Tensor(self.camera.matrix)
         types = (core.float32, core.float32, core.float32)
         self._grid = self._open3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight", "color"), types, ((1), (1), (3)), voxel, BLOCK, 1000, core.Device("CPU:0")
@@ -141,18 +146,28 @@ class MapBuilder:
         Args:
             frame: of the camera that the map was made for; its `color` is used where it has one.
             world_T_camera: its pose; the map is in that world, metres.
+
+        Raises:
+            FrameError: an image is not of the camera's size.
+            GavoError: the pose is no 4x4 matrix of finite numbers.
         """
         image, core = self._open3d.t.geometry.Image, self._open3d.core
+        frame, world_T_camera = rectified(frame, self._recorded), np.asarray(world_T_camera)
+        if world_T_camera.shape != (4, 4) or not np.isfinite(world_T_camera).all():
+            raise GavoError("world_T_camera: a 4x4 matrix of finite numbers is needed")
+        if frame.color is not None and np.shape(frame.color) != (*np.shape(frame.grey), 3):
+            raise FrameError(f"color image is of shape {np.shape(frame.color)}: {(*np.shape(frame.grey), 3)} is needed")
         metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
+        metres = np.where((metres > 0) & (metres < self.farthest), metres, np.float32(0))
         self.frames += 1
-        if not np.any((metres > 0) & (metres < self.farthest)):
+        if not metres.any():
             return
-        depth = image(np.ascontiguousarray(metres))
+        depth, seen = image(metres), image(_seen_from_afar(metres))
         rgb = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=2) if frame.color is None else frame.color
         color = image(np.ascontiguousarray(rgb, np.float32))
         extrinsic = core.Tensor(inverse(world_T_camera))
         reach = (1.0, self.farthest, TRUNCATION)
-        blocks = self._grid.compute_unique_block_coordinates(depth, self._intrinsic, extrinsic, *reach)
+        blocks = self._grid.compute_unique_block_coordinates(seen, self._intrinsic, extrinsic, *reach)
         blocks = self._within_memory(blocks)
         if len(blocks):
             self._grid.integrate(blocks, depth, color, self._intrinsic, self._intrinsic, extrinsic, *reach)
@@ -169,7 +184,12 @@ class MapBuilder:
         return blocks[known]
 
     def extract(self, shape: Shape = "cloud", left_out: Iterable[str] = ()) -> SceneMap:
-        """The surface as a cloud or a mesh; empty where nothing was seen often enough."""
+        """The surface as a cloud or a mesh; empty where nothing was seen often enough.
+
+        Raises:
+            GavoError: another shape.
+        """
+        check_shape(shape)
         weight = min(MIN_WEIGHT, max(0.0, self.frames - 1))
         words = [*left_out]
         if self.is_full:
@@ -187,6 +207,17 @@ class MapBuilder:
         return SceneMap(
             points.astype(np.float64), colors, normals.astype(np.float64), triangles, self.frames, tuple(words)
         )
+
+
+def _seen_from_afar(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Depth of which Open3D finds a reading where it looks for blocks, in every fourth pixel of every fourth row: where
+    all of those are empty, as of a sensor that leaves out rows, they have the farthest one beside them.
+    """
+    if metres[::LOOKED_AT, ::LOOKED_AT].any():
+        return metres
+    filled = metres.copy()
+    filled[::LOOKED_AT, ::LOOKED_AT] = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[::LOOKED_AT, ::LOOKED_AT]
+    return filled
 
 
 class LiveMap:
@@ -277,6 +308,7 @@ def build_map(
     Raises:
         GavoError: an absurd voxel, or Open3D cannot be imported.
     """
+    check_shape(shape)
     sequence, steps = without_distortion(sequence), list(steps)
     corrected: dict[float, tuple[np.ndarray, int]] = {}
     if trajectory is not None:
@@ -326,6 +358,12 @@ def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
         fit = [other for other, holds in ENDINGS.items() if shape in holds]
         raise GavoError(f"{path}: {ending} holds no {shape}: {' or '.join(fit)} does")
     return shape
+
+
+def check_shape(shape: str) -> None:
+    """Raise GavoError for what a map cannot be."""
+    if shape not in ("cloud", "mesh"):
+        raise GavoError(f"shape: cloud or mesh, not {shape!r}")
 
 
 def check_voxel(voxel: float) -> None:

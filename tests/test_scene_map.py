@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment, with_finding
-from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.sensor_noise import NONE
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
@@ -187,3 +188,39 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
 def test_nothing_seen_is_an_empty_map():
     sequence = SyntheticSequence(2, noise=NONE, camera=CAMERA)
     assert len(build_map(sequence, [], farthest=0.1).points) == 0
+
+
+@needs_open3d
+def test_frames_that_do_not_fit_are_refused_and_no_reading_is_a_surface():
+    """Images of another size were fused by the wrong pixels, poses that are not-a-number counted, the number of 16 bits
+    that stands for no reading was a wall, and another shape was taken for a mesh.
+    """
+    frame = SyntheticSequence(1, camera=CAMERA)[0]
+    builder = MapBuilder(CAMERA, 0.1)
+    for pose in (np.full((4, 4), np.nan), np.eye(4)[:3]):
+        with pytest.raises(GavoError, match="world_T_camera"):
+            builder.add(frame, pose)
+    with pytest.raises(FrameError, match="of shape"):
+        builder.add(replace(frame, grey=frame.grey[:50], depth=frame.depth[:50]), np.eye(4))
+    with pytest.raises(FrameError, match="color image is of shape"):
+        builder.add(replace(frame, color=np.zeros((50, 160, 3), np.uint8)), np.eye(4))
+    with pytest.raises(GavoError, match="cloud or mesh, not 'sphere'"):
+        builder.extract("sphere")  # pyright: ignore[reportArgumentType]
+    assert builder.frames == 0
+    fine = MapBuilder(replace(CAMERA, depth_scale=50000.0))
+    fine.add(replace(frame, depth=np.full_like(frame.depth, 65535)), np.eye(4))
+    assert len(fine.extract().points) == 0
+
+
+@needs_open3d
+@pytest.mark.parametrize("row", [0, 3])
+def test_a_map_does_not_need_the_rows_that_are_looked_at(row):
+    """Open3D looks at every fourth row for the blocks of a frame: where all of those were empty it raised an error."""
+    depth = np.full((CAMERA.height, CAMERA.width), int(2.02 * CAMERA.depth_scale), np.uint16)
+    depth[row::4] = 0
+    frame = Frame(np.full(depth.shape, 100, np.uint8), depth, 0.0)
+    builder = MapBuilder(CAMERA, 0.05)
+    for _ in range(3):
+        builder.add(frame, np.eye(4))
+    points = builder.extract().points
+    assert len(points) > 100 and np.abs(points[:, 2] - 2.02).max() < 0.05

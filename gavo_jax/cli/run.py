@@ -128,7 +128,8 @@ def _go_on(
     viewer: Viewer,
     mapper: BackgroundMapper | None,
 ) -> None:
-    """Have the driver, the viewer and the map stand where an earlier run stopped."""
+    """Have the driver, the viewer and the map stand where an earlier run stopped; what it wrote of its end goes."""
+    remove_trajectories(folder.path)
     odometry.progress = progress
     steps = folder.steps()
     for step in (None, *steps):

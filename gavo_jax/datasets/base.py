@@ -21,15 +21,24 @@ def what_helps(name: str, image: Any) -> str:
     return "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
 
 
+BRIGHTEST = 256.0
+"""Grey levels: rounding and interpolation reach no further."""
+
+
 def require_grey_levels(grey: Any) -> None:
-    """Refuse grey images whose levels reach to 1 and not to 255.
+    """Refuse grey images whose levels reach to 1, or beyond 255.
 
     Raises:
-        FrameError: They are floats, none above 1, and not all black.
+        FrameError: They are floats, none above 1, and not all black; or some are above 255.
     """
     values = np.asarray(grey)
-    if values.dtype.kind == "f" and values.size and 0.0 < np.max(values) <= 1.0:
+    if values.dtype == np.uint8 or not values.size:
+        return
+    most = np.max(values)
+    if values.dtype.kind == "f" and 0.0 < most <= 1.0:
         raise FrameError("grey levels reach from 0 to 255, not from 0 to 1: multiply by 255")
+    if BRIGHTEST < most < np.inf:
+        raise FrameError(f"grey levels reach from 0 to 255, not to {most:g}: scale the image")
 
 
 def require_seconds(name: str, stamp: Any) -> None:
@@ -42,14 +51,26 @@ def require_seconds(name: str, stamp: Any) -> None:
         raise GavoError(f"{name}: seconds are needed, a number, not {type(stamp).__name__}")
 
 
+def require_begin_in_seconds(stamp: float) -> None:
+    """Refuse the first stamp of a stream where it counts milliseconds, microseconds or nanoseconds since 1970.
+
+    Raises:
+        FrameError: It is, in seconds, thousands of years from now.
+    """
+    if LATEST < abs(stamp) < np.inf:
+        raise FrameError(f"timestamp: seconds are needed, and {stamp:.0f} of them are {stamp / YEAR:.0f} years")
+
+
+LATEST, YEAR = 1e11, 365.25 * 86400
+"""Seconds: no clock shows more, and milliseconds since 1970 are more."""
+
+
 class TimestampError(FrameError):
     """A frame whose time is in doubt."""
 
 
 MOST_DELAY = 0.1
 """Seconds: depth that is further from its colour image has a stamp that tells nothing."""
-SAME_STAMP = 1e-6
-"""Seconds by which a stamp changes as it is written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +107,10 @@ class Frame:
         return delay if abs(delay) <= MOST_DELAY else 0.0
 
     def at(self, timestamp: float) -> "Frame":
-        """The same images with another stamp, depth as long after it as before."""
-        if abs(timestamp - self.timestamp) < SAME_STAMP:
+        """The same images with another stamp, depth as long after it as before. Frames are told apart by their stamps,
+        so that one which differs in its last digit is another one.
+        """
+        if timestamp == self.timestamp:
             return self
         depth = None if self.depth_timestamp is None else timestamp + self.depth_delay
         return replace(self, timestamp=timestamp, depth_timestamp=depth)

@@ -9,10 +9,14 @@ from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.mapping.mapper import Loops, tied_segments
 from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.rigid_motions import interpolate
-from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 IN_DOUBT = 100.0
 """How much more a guessed motion counts than one that was found, where a correction has to change."""
+
+
+TINY = 1e-6
+"""Seconds between two poses at least, so that there is a way between any two."""
 
 
 class Doubts(NamedTuple):
@@ -39,15 +43,15 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     keyframes = loops.keyframes
     if not keyframes:
         return odometry
-    stamps = np.array([keyframe.timestamp for keyframe in keyframes])
+    places = _places(keyframes, odometry.timestamps)
     passed = _passed(odometry.timestamps, doubts)
-    at_keyframes = np.interp(stamps, odometry.timestamps, passed)
+    at_keyframes = passed[places]
     corrections = [keyframe.world_T_camera @ inverse(keyframe.world_T_odometry) for keyframe in keyframes]
     poses = np.empty_like(odometry.world_T_camera)
-    for i, (stamp, pose) in enumerate(zip(odometry.timestamps, odometry.world_T_camera, strict=True)):
-        after = int(np.searchsorted(stamps, stamp, side="right"))
+    for i, pose in enumerate(odometry.world_T_camera):
+        after = int(np.searchsorted(places, i, side="right"))
         before = max(after - 1, 0)
-        if 0 < after < len(stamps) and keyframes[before].segment == keyframes[after].segment:
+        if 0 < after < len(places) and keyframes[before].segment == keyframes[after].segment:
             share = (passed[i] - at_keyframes[before]) / (at_keyframes[after] - at_keyframes[before])
             poses[i] = interpolate(corrections[before] @ pose, corrections[after] @ pose, float(share))
         else:
@@ -57,22 +61,34 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     return corrected if doubts is None else bridged(corrected, doubts.lost)
 
 
+def _places(keyframes: list[Keyframe], stamps: Float64[np.ndarray, " n"]) -> list[int]:
+    """Places of keyframes among the poses: both are in the order in which the frames came, which need not be that of
+    their stamps, as a clock may have been set back.
+    """
+    names, places, start = [stamp_name(stamp) for stamp in stamps.tolist()], [], 0
+    for keyframe in keyframes:
+        start = names.index(stamp_name(keyframe.timestamp), start)
+        places.append(start)
+    return places
+
+
 def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64[np.ndarray, " n"]:
     """Seconds since the first pose, those of a guessed motion counted more often."""
     weights = 1.0 if doubts is None else np.where(doubts.guessed[1:], IN_DOUBT, 1.0)
-    return np.concatenate([[0.0], np.cumsum(weights * np.diff(stamps))])
+    return np.concatenate([[0.0], np.cumsum(weights * np.maximum(np.abs(np.diff(stamps)), TINY))])
 
 
 def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
     """A trajectory with the poses that were lost between two others of one segment put on the way between these."""
     known = np.flatnonzero(~lost)
-    poses, segments, stamps = trajectory.world_T_camera.copy(), trajectory.segments, trajectory.timestamps
+    poses, segments = trajectory.world_T_camera.copy(), trajectory.segments
+    passed = _passed(trajectory.timestamps, None)
     for start, end in zip(known, known[1:], strict=False):
         for i in range(start + 1, end):
             if segments[start] == segments[i] == segments[end]:
-                share = (stamps[i] - stamps[start]) / (stamps[end] - stamps[start])
+                share = (passed[i] - passed[start]) / (passed[end] - passed[start])
                 poses[i] = interpolate(poses[start], poses[end], float(share))
-    return Trajectory(stamps, poses, segments)
+    return Trajectory(trajectory.timestamps, poses, segments)
 
 
 def _begins(keyframes: list[Keyframe], number: int, segment: int) -> bool:

@@ -310,6 +310,6 @@ def _may_be_keyframe(step: Step) -> bool:
 
 def _decoded(sequence: Sequence, index: int) -> Frame | None:
     try:
-        return sequence[index]
+        return sequence[index].at(float(sequence.timestamps[index]))
     except FrameError:
         return None

@@ -16,7 +16,13 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
-from gavo_jax.datasets.base import Frame, FrameError, require_grey_levels, require_seconds
+from gavo_jax.datasets.base import (
+    Frame,
+    FrameError,
+    require_begin_in_seconds,
+    require_grey_levels,
+    require_seconds,
+)
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
@@ -205,9 +211,10 @@ class Odometry:
         Raises:
             FrameError: There is no first frame to start from.
             GavoError: What is given is no frame, its images are not of the camera's size or no grey and depth, or a
-                stamp is no number.
+                stamp is no number, or the first one is not in seconds.
         """
         frame = self._accepted(frame, timestamp)
+        timestamp = float(timestamp)  # an array may hold the next one soon
         stopwatch = Stopwatch()
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
@@ -269,8 +276,10 @@ class Odometry:
         elif not (frame is None or isinstance(frame, FrameError)):
             raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
         require_seconds("timestamp", timestamp)
+        if is_first:
+            require_begin_in_seconds(float(timestamp))
         if isinstance(frame, Frame):
-            return frame.at(timestamp)
+            return frame.at(float(timestamp))
         if is_first:
             raise frame or FrameError("the first frame could not be read")
         return frame

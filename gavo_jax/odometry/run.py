@@ -60,7 +60,7 @@ class OdometryRun:
             voxel: side, metres.
 
         Raises:
-            GavoError: Open3D cannot be imported, an absurd voxel, or the run does not hold its sequence.
+            GavoError: Open3D cannot be imported, another shape, an absurd voxel, or the run does not hold its sequence.
         """
         from gavo_jax.scene_map import build_map
 

@@ -51,11 +51,11 @@ def track(
 
 
 def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
-    """Frame after frame, or why it cannot be read; the next one is decoded in a thread meanwhile."""
+    """Frame after frame, at the sequence's stamps, or why there is none; a thread decodes the next one meanwhile."""
 
     def read(index: int) -> Frame | FrameError:
         try:
-            return rectified(sequence[index], sequence.camera.rectified())
+            return rectified(sequence[index], sequence.camera.rectified()).at(float(sequence.timestamps[index]))
         except FrameError as error:
             return error
 

@@ -199,7 +199,7 @@ class RunFolder:
                 f"{kept}: the images are not those that the run has seen before: run again without --resume"
             )
         self._open(files)
-        remove_files(self.path, METRICS, LOOPS, *({TRAJECTORY} - {self._poses}))
+        remove_files(self.path, METRICS, LOOPS, RECORDING, VIEW, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         self._last_pose = float(Trajectory.read_tum(self.path / self._poses).timestamps[-1])

@@ -113,6 +113,20 @@ def test_a_motion_gone_on_with_stays_as_it_is_but_takes_the_correction():
     np.testing.assert_allclose(corrected.world_T_camera[:, 1, 3], [0.0, 0.0, 0.04, 0.04, 0.04], atol=2e-3)
 
 
+def test_a_clock_that_was_set_back_does_not_matter():
+    """Keyframes were sought by their stamps, as if these grew: poses became not-a-number."""
+    poses = np.stack([exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(9)])
+    raised = exp(np.array([0.0, 0.04, 0.0, 0.0, 0.0, 0.0])) @ poses[8]
+    lost = np.array([False] * 5 + [True] + [False] * 3)
+    corrected = []
+    for back in (0.0, 1000.0):
+        stamps = np.arange(9.0) - back * (np.arange(9) > 3)
+        frames = [keyframe(k, stamps[i], poses[i], poses[i]) for k, i in enumerate((0, 4))]
+        loops = solved([*frames, keyframe(2, stamps[8], poses[8], raised)], [])
+        corrected.append(correct(Trajectory(stamps, poses), loops, Doubts(lost, lost)).world_T_camera)
+    np.testing.assert_allclose(corrected[1], corrected[0], atol=1e-9)
+
+
 def test_a_loop_joins_segments():
     frames = [keyframe(i, float(i), np.eye(4), np.eye(4), segment=i) for i in range(3)]
     loops = solved(frames, [edge(0, 2, 0.001)])

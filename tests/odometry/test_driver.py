@@ -19,6 +19,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, rectified
+from gavo_jax.odometry.hindsight import taken_back
 from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import OdometryRun, trajectory_of
 from gavo_jax.odometry.tracking import Clock
@@ -34,6 +35,48 @@ def test_what_is_no_time_is_refused_by_name(stamp: Any) -> None:
         replace(frame, timestamp=stamp)
     with pytest.raises(GavoError, match="depth_timestamp: seconds are needed"):
         replace(frame, depth_timestamp=stamp or "")
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e9, -1e9])
+def test_a_stream_in_other_units_of_time_is_refused(unit: float) -> None:
+    """Nanoseconds were taken for seconds without a word: no motion was implausible, and every guess wrong."""
+    first, second = Rendered(2, camera=small.CAMERA)
+    odometry = Odometry(small.CAMERA, small.NEWTON)
+    with pytest.raises(GavoError, match="timestamp: seconds are needed, and -?1.* years"):
+        odometry.register(first, int(1.3e9 * unit))
+    assert odometry.register(first, 1.3e9) is None
+    step = odometry.register(second, 1.3e18)
+    assert step is not None and not step.lost, "a single bad stamp ends no run"
+
+
+def test_a_stamp_is_a_number_of_the_step_s_own() -> None:
+    """An array that the caller changes for the next frame changed the last one's stamp, and every frame was late."""
+    odometry, stamp = Odometry(small.CAMERA, small.NEWTON), np.zeros(())
+    steps = []
+    for frame in Rendered(3, camera=small.CAMERA):
+        stamp[...] = frame.timestamp
+        steps.append(odometry.register(frame, stamp))  # pyright: ignore[reportArgumentType]
+    assert [(type(step.timestamp), step.lost) for step in steps[1:] if step] == 2 * [(float, False)]
+
+
+def test_a_frame_s_own_stamp_gives_way_to_the_last_digit() -> None:
+    """Hindsight tells by equal stamps which pair follows which: none did, and one that was wrong took back all."""
+    odometry = Odometry(small.CAMERA, small.NEWTON)
+    frames = list(Rendered(4, camera=small.CAMERA))
+    steps = [odometry.register(replace(frame, timestamp=frame.timestamp + 1e-9), frame.timestamp) for frame in frames]
+    known = [step for step in steps if step is not None]
+    assert [step.reference_timestamp for step in known] == [frame.timestamp for frame in frames[:-1]]
+    assert sorted(taken_back([*known[:-1], replace(known[-1], revises=1)])) == [1]
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_grey_of_more_than_eight_bits_is_refused(kind: Any) -> None:
+    """Every frame of 16 bits was lost as blank, and one twice as bright said that bodies moved."""
+    first, second = (replace(f, grey=f.grey.astype(kind) * kind(257)) for f in Rendered(2, camera=small.CAMERA))
+    with pytest.raises(GavoError, match="grey levels reach from 0 to 255, not to "):
+        Odometry(small.CAMERA, small.NEWTON).register(first, 0.0)
+    with pytest.raises(GavoError, match="grey levels reach from 0 to 255, not to "):
+        align(first, second, small.CAMERA, small.NEWTON)
 
 
 def big_endian(image: np.ndarray) -> np.ndarray:

@@ -43,6 +43,15 @@ def test_streams(sequence: SyntheticSequence) -> None:
     assert told == result.steps
 
 
+def test_who_watches_sees_the_stamps_of_the_sequence(sequence: SyntheticSequence) -> None:
+    """A map was kept by the frames' own stamps: where those are others, loops counted and corrected nothing."""
+    stamped, seen = Altered(sequence, lambda index, frame: replace(frame, timestamp=float(index))), []
+    for _ in track(stamped, SEARCH_ALONE, watch=lambda frame, _: seen.append(frame)):
+        if len(seen) == 3:
+            break
+    assert [frame.timestamp for frame in seen] == sequence.timestamps[:3].tolist()
+
+
 def test_memory_does_not_grow_with_the_frames(sequence: SyntheticSequence) -> None:
     """From frame to frame the device holds as much as before, and the host less than a hundredth of a frame more."""
     device: list[int] = []

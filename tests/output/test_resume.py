@@ -28,7 +28,9 @@ from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import blank_state
 from gavo_jax.output.checkpoint import Checkpoint, Mark, load_checkpoint, save_checkpoint
+from gavo_jax.output.files import RECORDING, VIEW
 from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.output.trajectories import BAG_METADATA, FILES
 from gavo_jax.presets import preset
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
@@ -216,6 +218,20 @@ def test_another_run_is_not_resumed(clip, broken, capsys, more, words):
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and str(broken / "config.json") in error and all(word in error for word in words)
     assert {path: path.read_bytes() for path in broken.iterdir()} == before
+
+
+def test_what_an_interrupted_run_wrote_of_its_end_is_not_the_whole_one_s(clip, broken, undrawn):
+    """The trajectory in other formats, and recordings, ended where the run was interrupted, beside the whole one."""
+    for name in (*FILES.values(), RECORDING, VIEW):
+        if name not in ("trajectory.txt", FILES["bag"]):
+            (broken / name).write_text("of the first frames")
+    (broken / FILES["bag"]).mkdir()
+    (broken / FILES["bag"] / BAG_METADATA).write_text("of the first frames")
+    assert main(arguments(clip, broken, "--resume", "--trajectory-format", "kitti")) == 0
+    assert len((broken / FILES["kitti"]).read_text().splitlines()) == 40
+    assert not [
+        name for name in (FILES["euroc"], FILES["json"], FILES["bag"], RECORDING, VIEW) if (broken / name).exists()
+    ]
 
 
 def test_a_run_of_another_lens_is_not_resumed(clip, broken, tmp_path, capsys):
