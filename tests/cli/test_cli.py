@@ -39,6 +39,11 @@ METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_tran
 rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
 compile_seconds milliseconds_per_pair_median frames_per_second""".split()
 FAST = ("--method", "gauss-newton")
+GENETIC = (
+    *("--set", "solver.population=[0, 0, 0, 8, 16]", "--set", "solver.iterations=[0, 0, 0, 6, 8]"),
+    *("--set", "alignment.last_step=false", "--set", "odometry.recover=false", "--set", "odometry.bodies=off"),
+)
+"""The settings `small.GENETIC`: recorded, their program is that of the viewer's tests."""
 
 
 @pytest.fixture
@@ -441,7 +446,7 @@ def test_align_needs_a_camera_and_a_likely_unit(gavo, clip):
 def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, clip):
     """Its lists are torn: what its depth counts is open if the camera's file does not say it."""
     rgb, depth = images(clip, "rgb"), images(clip, "depth")
-    command = ["align", rgb[0], depth[0], rgb[1], depth[1]]
+    command = ["align", rgb[0], depth[0], rgb[1], depth[1], *FAST]
     (clip / "rgb.txt").write_text("hello\n")
     assert gavo(*command).status == 0
     (clip / "camera.toml").unlink()
@@ -578,7 +583,7 @@ def test_compare_without_truth_tells_of_the_paths(gavo, clip, tmp_path):
 
 def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = ("run", "clip", "--camera", "clip/camera.toml", *FAST, "--output", "out", "--viewer", "save")
+    arguments = ("run", "clip", "--camera", "clip/camera.toml", *GENETIC, "--output", "out", "--viewer", "save")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "config.json").write_text("{}")
     done = gavo(*arguments)
