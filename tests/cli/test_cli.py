@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from command import Done, runner
+from command import GENETIC, Done, runner
 from small import CAMERA
 
 from gavo_jax import presets
@@ -39,11 +39,6 @@ METRICS = """sequence method preset seed device frames pairs lost_pairs rpe_tran
 rpe_rotation_rmse_deg_per_s rpe_translation_rmse_m_per_frame ate_translation_rmse_m distance_error_final_m
 compile_seconds milliseconds_per_pair_median frames_per_second""".split()
 FAST = ("--method", "gauss-newton")
-GENETIC = (
-    *("--set", "solver.population=[0, 0, 0, 8, 16]", "--set", "solver.iterations=[0, 0, 0, 6, 8]"),
-    *("--set", "alignment.last_step=false", "--set", "odometry.recover=false", "--set", "odometry.bodies=off"),
-)
-"""The settings `small.GENETIC`: recorded, their program is that of the viewer's tests."""
 
 
 @pytest.fixture
