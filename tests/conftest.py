@@ -57,6 +57,8 @@ LONGEST = (
     "datasets/test_forms.py",
     "selfcheck/test_selfcheck.py",
     "experiments/test_sharding.py",
+    "test_precision.py",
+    "cli/test_shared_folders.py",
 )
 """Files that take longest, in the order in which they begin: one that began last would keep a process waiting."""
 

@@ -67,6 +67,8 @@ VALUES = st.one_of(
     ),
 )
 GOOD_CAMERA = {"fx": "500.0", "fy": "500.0", "cx": "320.0", "cy": "240.0", "width": "640", "height": "480"}
+SMALL_CAMERA = "fx = 50.0\nfy = 50.0\ncx = 31.5\ncy = 23.5\nwidth = 64\nheight = 48\n"
+"""Its frames are soon rendered: to make a plan three of them are."""
 
 
 def cameras(sign: str) -> st.SearchStrategy[bytes]:
@@ -129,7 +131,7 @@ DOTTED = st.sampled_from(
 )
 PLANS = tables(
     ("", {"seeds": "2"}),
-    ("[[sequences]]", {"path": '"synthetic"', "frames": "3", "name": '"a"'}),
+    ("[[sequences]]", {"path": '"synthetic"', "camera": '"camera.toml"', "frames": "3", "name": '"a"'}),
     ("[[methods]]", {"name": '"ga"', "presets": '["fast"]', "solver.patience": "5", "sweep.alignment.loss": '["l2"]'}),
     ("[[methods]]", {"name": '"opencv-rgb"', "printed.a": "0.1"}),
     ("[ray]", {"cpus": "1"}),
@@ -179,6 +181,7 @@ def read_camera(suffix: str) -> Callable[[Path, bytes], None]:
 
 def read_experiment(folder: Path, content: bytes) -> None:
     (folder / "experiment.toml").write_bytes(content)
+    (folder / "camera.toml").write_text(SMALL_CAMERA)
     plan = read_plan(folder / "experiment.toml")
     assert plan.runs and len({run.id for run in plan.runs}) == len(plan.runs) and plan.batch >= 1
     assert all(run.pairs >= 1 for run in plan.runs) and 0 <= plan.programs <= len(plan.runs)

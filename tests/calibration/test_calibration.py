@@ -47,7 +47,7 @@ class Shaken:
 
     name, ground_truth = "shaken", None
 
-    def __init__(self, frames: int = 26):
+    def __init__(self, frames: int = 22):
         fine = np.arange(-0.1, frames / 30 + 0.2, 0.005)
         sequence = SyntheticSequence(noise=NONE, camera=replace(CAMERA, readout=READOUT), trajectory=shaken(fine))
         self.camera = replace(CAMERA, readout=0.0, fx=WRONG_LENS * CAMERA.fx, fy=WRONG_LENS * CAMERA.fy)

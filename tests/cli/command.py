@@ -7,6 +7,12 @@ import pytest
 
 from gavo_jax.cli import main
 
+GENETIC = (
+    *("--set", "solver.population=[0, 0, 0, 8, 16]", "--set", "solver.iterations=[0, 0, 0, 6, 8]"),
+    *("--set", "alignment.last_step=false", "--set", "odometry.recover=false", "--set", "odometry.bodies=off"),
+)
+"""The settings `small.GENETIC`: recorded, their program is that of the viewer's tests."""
+
 
 class Done(NamedTuple):
     status: int

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from command import Done, runner
+from command import GENETIC, Done, runner
 from small import CAMERA
 
 from gavo_jax import presets
@@ -441,7 +441,7 @@ def test_align_needs_a_camera_and_a_likely_unit(gavo, clip):
 def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, clip):
     """Its lists are torn: what its depth counts is open if the camera's file does not say it."""
     rgb, depth = images(clip, "rgb"), images(clip, "depth")
-    command = ["align", rgb[0], depth[0], rgb[1], depth[1]]
+    command = ["align", rgb[0], depth[0], rgb[1], depth[1], *FAST]
     (clip / "rgb.txt").write_text("hello\n")
     assert gavo(*command).status == 0
     (clip / "camera.toml").unlink()
@@ -578,7 +578,7 @@ def test_compare_without_truth_tells_of_the_paths(gavo, clip, tmp_path):
 
 def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = ("run", "clip", "--camera", "clip/camera.toml", *FAST, "--output", "out", "--viewer", "save")
+    arguments = ("run", "clip", "--camera", "clip/camera.toml", *GENETIC, "--output", "out", "--viewer", "save")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "config.json").write_text("{}")
     done = gavo(*arguments)

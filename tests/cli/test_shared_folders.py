@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import runner
+from command import GENETIC, runner
 
 from gavo_jax.experiments import tuning
 from gavo_jax.locks import hold
@@ -62,7 +62,7 @@ def figures(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-RUN = ("run", "clip", "--camera", "clip/camera.toml", "--method", "gauss-newton", "--output", "out")
+RUN = ("run", "clip", "--camera", "clip/camera.toml", *GENETIC, "--output", "out")
 COMPARE = ("compare", "clip", "--camera", "clip/camera.toml", "--methods", "opencv-rgb", "--output", "out")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import Done, runner
+from command import GENETIC, Done, runner
 from layouts import CAMERA, LAYOUTS, POSES, image
 from recordings import COLOR, DEPTH, KINDS, Shot, record
 
@@ -207,7 +207,7 @@ def test_run_says_what_makes_no_frame(gavo, clip, tmp_path):
 def test_view_finds_the_source_of_a_run_again(gavo, tmp_path):
     (tmp_path / "clip").mkdir()
     LAYOUTS["seven_scenes"][1](tmp_path / "clip")
-    assert gavo("run", "clip", *FAST, "--rate", 15, "--output", "out").status == 0
+    assert gavo("run", "clip", *GENETIC, "--rate", 15, "--output", "out").status == 0
     done = gavo("view", "out", "--viewer", "save")
     assert done.status == 0 and not done.err, done
 

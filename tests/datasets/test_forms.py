@@ -21,7 +21,7 @@ from gavo_jax.odometry.run import run_odometry
 from gavo_jax.presets import preset
 from gavo_jax.trajectory import Trajectory
 
-FRAMES = 50
+FRAMES = 38
 
 
 @pytest.fixture(scope="module")
