@@ -1,5 +1,6 @@
 """A run's trajectory as its map corrects it."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,12 +41,12 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
     become one.
     """
-    keyframes = loops.keyframes
-    if not keyframes:
+    placed = _placed(loops.keyframes, odometry.timestamps)
+    if not placed:
         return odometry
-    places = _places(keyframes, odometry.timestamps)
+    keyframes, places = zip(*placed, strict=True)
     passed = _passed(odometry.timestamps, doubts)
-    at_keyframes = passed[places]
+    at_keyframes = passed[list(places)]
     corrections = [keyframe.world_T_camera @ inverse(keyframe.world_T_odometry) for keyframe in keyframes]
     poses = np.empty_like(odometry.world_T_camera)
     for i, pose in enumerate(odometry.world_T_camera):
@@ -61,15 +62,17 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     return corrected if doubts is None else bridged(corrected, doubts.lost)
 
 
-def _places(keyframes: list[Keyframe], stamps: Float64[np.ndarray, " n"]) -> list[int]:
-    """Places of keyframes among the poses: both are in the order in which the frames came, which need not be that of
-    their stamps, as a clock may have been set back.
+def _placed(keyframes: list[Keyframe], stamps: Float64[np.ndarray, " n"]) -> list[tuple[Keyframe, int]]:
+    """Keyframes with their places among the poses: both are in the order in which the frames came, which need not be
+    that of their stamps, as a clock may have been set back. The map may be ahead of a run that was interrupted.
     """
-    names, places, start = [stamp_name(stamp) for stamp in stamps.tolist()], [], 0
+    names, placed, start = [stamp_name(stamp) for stamp in stamps.tolist()], [], 0
     for keyframe in keyframes:
-        start = names.index(stamp_name(keyframe.timestamp), start)
-        places.append(start)
-    return places
+        name = stamp_name(keyframe.timestamp)
+        if name in names[start:]:
+            start = names.index(name, start)
+            placed.append((keyframe, start))
+    return placed
 
 
 def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64[np.ndarray, " n"]:
@@ -91,7 +94,7 @@ def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
     return Trajectory(trajectory.timestamps, poses, segments)
 
 
-def _begins(keyframes: list[Keyframe], number: int, segment: int) -> bool:
+def _begins(keyframes: Sequence[Keyframe], number: int, segment: int) -> bool:
     """Whether a frame before that keyframe belongs to it and not to the one before."""
     return number < len(keyframes) and keyframes[number].segment == segment
 

@@ -92,6 +92,17 @@ def test_corrections_change_over_between_keyframes():
     np.testing.assert_allclose(corrected.world_T_camera[:, 0, 3], poses[:, 0, 3], atol=1e-9)
 
 
+def test_a_map_that_is_ahead_of_an_interrupted_run_corrects_what_there_is() -> None:
+    """The last pose was not-a-number: its keyframe is the last one in the trajectory, and the next one has no pose."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = np.arange(5.0)
+    raised = np.eye(4)
+    raised[1, 3] = 0.5
+    loops = solved([keyframe(i, float(k), poses[k], raised @ poses[k]) for i, k in enumerate((0, 2, 3))], [])
+    corrected = correct(Trajectory(np.arange(3.0), poses[:3]), loops)
+    np.testing.assert_allclose(corrected.world_T_camera, raised @ poses[:3], atol=1e-9)
+
+
 def test_guesses_are_put_on_the_way_between_what_is_known():
     poses = np.stack([np.eye(4)] * 5)
     poses[4, 0, 3] = 0.4
