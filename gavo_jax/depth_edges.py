@@ -10,7 +10,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float32
-from scipy import fft
 
 from gavo_jax.camera import Camera, inverse_depth
 from gavo_jax.datasets.base import Frame
@@ -112,8 +111,8 @@ def likeness(edges: Float32[np.ndarray, "h w"], jumps: Float32[np.ndarray, "h w"
     size = [cv2.getOptimalDFTSize(length + REACH) for length in edges.shape]  # nothing comes round from the other side
     flipped = [jumps, jumps[:, ::-1], jumps[::-1], jumps[::-1, ::-1]]
     ways = np.stack([*flipped, *(_zoomed(jumps, factor) for factor in ZOOMS)])
-    there, here = (np.asarray(fft.rfft2(images, size)) for images in (edges, ways))
-    found = np.asarray(fft.irfft2(there * np.conj(here), size))
+    there, here = (np.fft.rfft2(images, size) for images in (edges, ways))
+    found = np.fft.irfft2(there * np.conj(here), size)
     shifts = np.arange(-REACH, REACH + 1)
     return found[:, shifts[:, None], shifts] / np.maximum(ways.sum(axis=(1, 2), keepdims=True), 1.0)
 

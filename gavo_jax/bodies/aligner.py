@@ -62,7 +62,10 @@ MOST_ASIDE = 0.6
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
-"""Deviation, metres and radians, of a motion that goes on as before."""
+"""Least deviation, metres and radians, of a motion that goes on as before; more where the run's velocity changes so."""
+SURPRISE = 22.5
+"""Squared deviations between what was found and the last motion, gone on with, beyond which it did not go on:
+chi-squared with six degrees of freedom is larger once in a thousand times."""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Statuses of a motion that is worth asking about."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
@@ -274,12 +277,17 @@ class BodyAware:
 
     def _fused_with_prediction(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
-        both, weighted by their covariances.
+        both, weighted by their covariances. Where the two disagree, the camera did not go on as before.
         """
         found = np.asarray(attempt.result.target_T_reference)
         onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))
-        covariance, prior = np.float64(attempt.result.covariance), np.diag(np.repeat(np.square(GOES_ON), 3))
-        share = covariance @ np.linalg.inv(covariance + prior)
+        changed = np.square(float(clock.elapsed)) * np.asarray(state.tracker.velocity_change.changes, np.float64)
+        prior = np.diag(np.repeat(np.maximum(changed, np.square(GOES_ON)), 3))
+        covariance = np.float64(attempt.result.covariance)
+        certainty = np.linalg.inv(covariance + prior)
+        if onward @ certainty @ onward > SURPRISE:
+            return attempt
+        share = covariance @ certainty
         motion = found @ exp(share @ onward)
         return _moved(state, attempt, motion, share @ prior)
 

@@ -5,13 +5,11 @@ loops and ends with those that agree with each other and with the odometry, so t
 loop decides where it ends.
 """
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
-from scipy.special import chdtri
 
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.verification import Edge
@@ -153,7 +151,7 @@ def _plausible(
         residual = log(inverse(edge.earlier_T_later) @ said)
         drifted = transport_covariance(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
-        result.append(squared < chdtri(6, 1.0 - IMPOSSIBLE))
+        result.append(squared < _largest(IMPOSSIBLE))
     return np.array(result)
 
 
@@ -185,6 +183,8 @@ def _surprise(graph: Any, values: Any, trusted: int) -> float:
     """Variance of the odometry's residuals over what their covariances say, by their redundancy (Förstner 1979); near 1
     where the loops say little of it.
     """
+    from scipy.sparse import csc_array
+
     size = 6 * values.size()
     rows, columns, numbers = graph.linearize(values).sparseJacobian_()
     matrix = csc_array((numbers, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=(6 * graph.size(), size + 1))
@@ -199,6 +199,9 @@ def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
     """Sum of the leverages of some rows of a sparse Jacobian J, the diagonal of J (JᵀJ)⁻¹ Jᵀ; of many rows estimated by
     sums of them with random signs (Hutchinson 1989), within a per cent: this bounds the work.
     """
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
     factor, some = splu(csc_array(jacobian.T @ jacobian), permc_spec="MMD_AT_PLUS_A"), jacobian[rows].T
     if len(rows) <= MOST_ROWS:
         some = some.toarray()
@@ -210,7 +213,7 @@ def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
 def _fits(gtsam: Any, values: Any, edge: Edge) -> bool:
     """Whether what the poses say of a loop is within what its covariance allows."""
     residual = _residual(gtsam, values, edge)
-    return bool(residual @ np.linalg.solve(edge.covariance, residual) < chdtri(6, 1.0 - PROBABILITY))
+    return bool(residual @ np.linalg.solve(edge.covariance, residual) < _largest(PROBABILITY))
 
 
 def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:
@@ -220,3 +223,11 @@ def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:
 
 def _pose(gtsam: Any, transform: np.ndarray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(transform[:3, :3]), transform[:3, 3])
+
+
+@cache
+def _largest(probability: float) -> float:
+    """Return the value that chi-squared with six degrees of freedom exceeds in no more than the rest of the cases."""
+    from scipy.special import chdtri  # a sixth of the time in which the command starts, and most runs close no loops
+
+    return float(chdtri(6, 1.0 - probability))

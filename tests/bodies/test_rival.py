@@ -346,6 +346,21 @@ def test_what_the_images_do_not_tell_goes_on_as_before() -> None:
     assert guessed.usable and guessed.unknown == 1
 
 
+def test_nothing_goes_on_where_what_is_known_says_otherwise() -> None:
+    """The camera turned back: a motion that was 4 cm off became 16 cm off, with a deviation of 9 mm."""
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aware = BodyAware(search, search)
+    blank = aware.blank_state()
+    away = np.array([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0], np.float32)
+    state = blank._replace(tracker=blank.tracker._replace(motion=away, seconds=np.float32(1 / 30)))
+    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+    attempt = Attempt(blank.tracker, result_of(np.diag([0.015**2, 0.25] + [0.01**2] * 4)), usable=False)
+    assert aware._helped_by_prediction(state, clock, attempt, covered=0.1) is attempt
+    jerky = state.tracker.velocity_change._replace(changes=np.full(2, 9.0, np.float32))  # what is usual is no surprise
+    state = state._replace(tracker=state.tracker._replace(velocity_change=jerky))
+    assert aware._helped_by_prediction(state, clock, attempt, covered=0.1).usable
+
+
 @pytest.mark.parametrize("degrees", [0.0, 2.0, 10.0])
 def test_what_goes_on_beside_what_is_known_leaves_that_alone_while_the_camera_turns(degrees: float) -> None:
     """Along the reference's axis the found motion is 5 cm off, and knows it; along the others it is exact."""
