@@ -41,6 +41,7 @@ from gavo_jax.datasets.synthetic import SyntheticSequence as SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence as TumSequence
 from gavo_jax.datasets.tum_writing import write_tum as write_tum
 from gavo_jax.errors import GavoError as GavoError
+from gavo_jax.errors import GavoWarning as GavoWarning
 from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error
 from gavo_jax.evaluation import distance_error as distance_error
 from gavo_jax.evaluation import relative_pose_error as relative_pose_error

@@ -30,9 +30,9 @@ from gavo_jax.settings import Settings
 UNEXPLAINED = 0.7
 """Share of the grey residuals that are not large, below which light is looked at: most clips lie above."""
 EXPLAINED = 0.5
-"""Part of these, over the whole image, that a change of light has to explain for another search. Flicker, lamps and
-shadows explain 0.6 to 1 of them; bodies, which are textured, up to 0.3, and a search that takes them for light follows
-them."""
+"""Part of the large residuals, over the whole image, that a change of light has to explain for another search. Flicker,
+lamps and shadows explain 0.6 to 1 of them; bodies, which are textured, up to 0.3: a search that takes them for light
+would follow them."""
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,20 @@ class Relighting(SecondThought):
         attempt = self.first.align(state, frame, clock)
         result = attempt.result
         explained = float(result.explained.grey)
-        if explained >= UNEXPLAINED or not np.all(np.isfinite(result.target_T_reference)):
+        if not explained < UNEXPLAINED or not np.all(np.isfinite(result.target_T_reference)):
             return attempt
-        seen = Seen(attempt.state.previous_image, attempt.state.instant_motion, clock.elapsed)
+        new = NewFrame(attempt.state.previous_image, attempt.state.instant_motion, clock.elapsed)
         motion = np.asarray(result.target_T_reference, np.float32)
         levels = levels_of(self.camera, self.settings.solver, self.settings.alignment)
-        lit, left = _relit(state, seen, motion, self.camera, levels=levels)
+        lit, left = _relit(state, new, motion, self.camera, levels=levels)
         if not float(left) < 1.0 - EXPLAINED:
             return attempt
         again = self.search.align(lit, frame, clock)
         return again if float(again.result.explained.grey) > explained else attempt
 
 
-class Seen(NamedTuple):
-    """The new frame as its first attempt has it."""
+class NewFrame(NamedTuple):
+    """A frame as its first attempt has it."""
 
     image: Target
     instant_motion: Float[Array, " 6"]
@@ -89,15 +89,15 @@ class Seen(NamedTuple):
 
 @partial(CachedProgram, static=("levels",), returns=(TrackerState,))
 def _relit(
-    state: TrackerState, seen: Seen, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
+    state: TrackerState, new: NewFrame, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
 ) -> tuple[TrackerState, Float[Array, ""]]:
-    """The state with references in the light of a new frame, by the motion to it; and the part of the large residuals
-    that are so in that light, too.
+    """The state with references in the light of a new frame, by the motion to it; and what part of the large residuals
+    that light leaves.
     """
-    last = view_of(state.previous_image, levels, state.instant_motion * (camera.readout / state.seconds))
-    new = view_of(seen.image, levels, seen.instant_motion * (camera.readout / seen.elapsed))
+    here = view_of(state.previous_image, levels, state.instant_motion * (camera.readout / state.seconds))
+    there = view_of(new.image, levels, new.instant_motion * (camera.readout / new.elapsed))
     level = camera.level(levels.numbers[seen_level(levels)])
-    compared = compare(last, jax.tree.map(lambda leaf: leaf[None], new), target_T_reference[None], level)
+    compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_reference[None], level)
     light, residual = compared.light[0], compared.residuals.grey[0]
     without = residual + light * compared.lit[0]
     before, after = (jnp.sum(compared.same[0] * (jnp.abs(one) >= LARGE_GREY_RESIDUAL)) for one in (without, residual))
@@ -113,9 +113,8 @@ def _relit(
             grey=gain * reference.grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v
         )
 
-    return state._replace(previous=relit(state.previous), keyframe=relit(state.keyframe)), after / jnp.maximum(
-        before, 1.0
-    )
+    lit = state._replace(previous=relit(state.previous), keyframe=relit(state.keyframe))
+    return lit, (after + 1.0) / (before + 1.0)
 
 
 def _nearest(part: Float[Array, "*n"], size: int) -> Integer[Array, "*n"]:

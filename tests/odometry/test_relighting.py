@@ -8,13 +8,14 @@ import jax
 import numpy as np
 import pytest
 from carded import Carded
-from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER, Altered, errors, run
+from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER, Altered, Told, errors, run
 from flicker import flickering, followed
 
+from gavo_jax.alignment.result import no_alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.odometry.aligners import Attempt, FrameSearch
+from gavo_jax.odometry.aligners import BEGINNING, Attempt, FrameSearch
 from gavo_jax.odometry.composition import make_aligner
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.relighting import Relighting
@@ -92,6 +93,13 @@ def test_references_are_as_bright_as_the_new_frame_shows_them(room: SyntheticSeq
     assert np.std(wanted[has]) > 0.08
     assert np.median(np.abs(gain / wanted / overall - 1.0)[has]) < 0.02
     np.testing.assert_allclose(after.grey_u[has], (gain * before.grey_u)[has], rtol=1e-4)
+
+
+def test_where_nothing_is_seen_twice_nothing_is_known_of_the_light(room: SyntheticSequence) -> None:
+    told: Any = Told(no_alignment(AlignmentStatus.HIGH_ERROR))
+    nothing: Any = None
+    attempt = Relighting(told, nothing).align(nothing, room[0], BEGINNING)
+    assert attempt.result is told.result and np.isnan(attempt.result.explained.grey)
 
 
 def test_a_clip_under_a_flickering_lamp(data_dir: Path) -> None:
