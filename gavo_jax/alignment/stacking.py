@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from gavo_jax.camera import Camera, require_camera
+from gavo_jax.datasets.bars import without_bars
 from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
 from gavo_jax.errors import GavoError
 from gavo_jax.image.numbers import as_array, with_zeros
@@ -54,6 +55,8 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
             raise GavoError(fault + what_helps(name, image))
     require_grey_levels(grey)
     depth = with_zeros(depth)
+    if isinstance(grey, np.ndarray) and isinstance(depth, np.ndarray):
+        grey, depth = without_bars(grey, depth)
     if camera.is_distorted:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)

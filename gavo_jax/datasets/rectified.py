@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
+from gavo_jax.datasets.bars import without_bars
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
 from gavo_jax.image.numbers import as_array, as_depth
 from gavo_jax.trajectory import Trajectory
 
 
 def rectified(frame: Frame, camera: Camera) -> Frame:
-    """A frame of plain arrays, without the camera's lens distortion.
+    """A frame of plain arrays, without the camera's lens distortion and without black bars.
 
     Raises:
         FrameError: An image is not of the camera's size, or not one number per pixel.
@@ -25,7 +26,7 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         if np.shape(image) != size or kind.kind not in "uif":
             fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
             raise FrameError(fault + what_helps(name, image))
-    grey, depth = camera.undistort(as_array(frame.grey), as_depth(frame.depth))
+    grey, depth = camera.undistort(*without_bars(as_array(frame.grey), as_depth(frame.depth)))
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)
 
