@@ -30,7 +30,7 @@ def test_a_second_aligner_is_asked_where_the_first_is_not_sure(
     sequence = Rendered(frames=2, camera=CAMERA, noise=NONE)
     odometry = Odometry(CAMERA, aligner=Recovering(Told(first), Told(second)))
     odometry.register(sequence[0], 0.0)
-    step = odometry.register(sequence[1], 1 / 30)
+    step = odometry.register(sequence[1], sequence[1].timestamp)
     assert step is not None and step.lost is (x is None)
     assert step.world_T_camera[0, 3] == pytest.approx(-(x or 0.0))
     is_explained = AlignmentStatus.OK in (first.status, second.status)
