@@ -147,6 +147,13 @@ CONDITIONS: dict[str, Condition] = {
     "flicker of 20 %": grey(lambda index, levels: levels * (1.0 + 0.2 * np.sin(2.1 * index))),
     "bands of 4 %": bands(0.04),
     "bands of 8 %": bands(0.08),
+    "bands of 15 %": bands(0.15),
+    "a lamp that blinks": gain(
+        lambda index, columns, rows: 0.7 + 0.4 * (index // 4 % 2) * np.exp(-5 * ((columns + 0.4) ** 2 + rows**2))
+    ),
+    "a shadow that passes": gain(
+        lambda index, columns, rows: 1 - 0.4 / (1 + np.exp(16 * np.abs(columns + 1.3 - 0.04 * (index % 65)) - 5))
+    ),
     "vignette": gain(lambda index, columns, rows: 1.0 - 0.15 * (columns**2 + rows**2)),
     "shade": gain(lambda index, columns, rows: 1 - 0.3 / (1 + np.exp(5 * columns + 1.6 * np.sin(0.1 * index)))),
     "black bars": gain(lambda index, columns, rows: np.abs(rows) < 0.75),
