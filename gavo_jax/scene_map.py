@@ -152,17 +152,18 @@ class MapBuilder:
             GavoError: the pose is no 4x4 matrix of finite numbers.
         """
         image, core = self._open3d.t.geometry.Image, self._open3d.core
-        frame, world_T_camera = rectified(frame, self._recorded), np.asarray(world_T_camera)
+        world_T_camera = np.asarray(world_T_camera)
         if world_T_camera.shape != (4, 4) or not np.isfinite(world_T_camera).all():
             raise GavoError("world_T_camera: a 4x4 matrix of finite numbers is needed")
         if frame.color is not None and np.shape(frame.color) != (*np.shape(frame.grey), 3):
             raise FrameError(f"color image is of shape {np.shape(frame.color)}: {(*np.shape(frame.grey), 3)} is needed")
+        frame = rectified(frame, self._recorded)
         metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
         metres = np.where((metres > 0) & (metres < self.farthest), metres, np.float32(0))
         self.frames += 1
         if not metres.any():
             return
-        depth, seen = image(metres), image(_seen_from_afar(metres))
+        depth, seen = image(metres), image(_with_looked_at_filled(metres))
         rgb = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=2) if frame.color is None else frame.color
         color = image(np.ascontiguousarray(rgb, np.float32))
         extrinsic = core.Tensor(inverse(world_T_camera))
@@ -209,14 +210,13 @@ class MapBuilder:
         )
 
 
-def _seen_from_afar(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth of which Open3D finds a reading where it looks for blocks, in every fourth pixel of every fourth row: where
-    all of those are empty, as of a sensor that leaves out rows, they have the farthest one beside them.
+def _with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Depth with a reading in every pixel in which Open3D looks for blocks, each fourth of each fourth row, if there is
+    one near it: a sensor may leave out just those rows.
     """
-    if metres[::LOOKED_AT, ::LOOKED_AT].any():
-        return metres
-    filled = metres.copy()
-    filled[::LOOKED_AT, ::LOOKED_AT] = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[::LOOKED_AT, ::LOOKED_AT]
+    filled, looked_at = metres.copy(), np.s_[::LOOKED_AT, ::LOOKED_AT]
+    near = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[looked_at]
+    filled[looked_at] = np.where(metres[looked_at] > 0, metres[looked_at], near)
     return filled
 
 
@@ -306,7 +306,7 @@ def build_map(
         moving: where bodies are in the frame of a step.
 
     Raises:
-        GavoError: an absurd voxel, or Open3D cannot be imported.
+        GavoError: another shape, an absurd voxel, or Open3D cannot be imported.
     """
     check_shape(shape)
     sequence, steps = without_distortion(sequence), list(steps)

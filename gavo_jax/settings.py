@@ -101,8 +101,8 @@ class OdometryOptions:
         rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
         sway: Whether, under a rolling shutter, the camera's velocity at each frame's own moment is found with the
             motion; else it is taken for the mean since the last frame. See `alignment.sway`.
-        relight: Whether a pair that is badly explained, as light changed from place to place, is searched for again
-            with references in the new frame's light. See `odometry.relighting`.
+        relight: Whether a pair that is badly explained is searched for again in the new frame's light, where light
+            changed from place to place. See `odometry.relighting`.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
         bodies: Whether what moves on its own is left out of the search: `off` no, `mask` yes; `track` finds each body's
             own motion, too. See docs/bodies.md.

@@ -16,7 +16,16 @@ from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
-from gavo_jax.scene_map import LiveMap, MapBuilder, SceneMap, build_map, check_map, check_voxel, import_open3d
+from gavo_jax.scene_map import (
+    LiveMap,
+    MapBuilder,
+    SceneMap,
+    _with_looked_at_filled,
+    build_map,
+    check_map,
+    check_voxel,
+    import_open3d,
+)
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
@@ -224,3 +233,14 @@ def test_a_map_does_not_need_the_rows_that_are_looked_at(row):
         builder.add(frame, np.eye(4))
     points = builder.extract().points
     assert len(points) > 100 and np.abs(points[:, 2] - 2.02).max() < 0.05
+
+
+@pytest.mark.parametrize("stray", [False, True])
+def test_open3d_finds_a_reading_where_it_looks(stray: bool) -> None:
+    """A sensor leaves out every fourth row; one stray reading there does not do for all others."""
+    metres = np.full((40, 60), 2.0, np.float32)
+    metres[::4] = 0.0
+    metres[0, 0] = 3.0 * stray
+    filled = _with_looked_at_filled(metres)
+    assert np.all(filled[::4, ::4] > 0) and filled[0, 0] == (3.0 if stray else 2.0)
+    np.testing.assert_array_equal(filled[1], metres[1])

@@ -89,6 +89,8 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
             raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
         require_grey_levels(side[0])
+        if all(isinstance(images, np.ndarray) for images in side):
+            side = tuple(map(np.stack, zip(*map(without_bars, *side), strict=True)))
         return Images(jnp.asarray(side[0]), jnp.asarray(with_zeros(side[1])))
     images = [_rectified_images(frame, camera) for frame in side]
     return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

@@ -277,7 +277,7 @@ class BodyAware:
 
     def _fused_with_prediction(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
         """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
-        both, weighted by their covariances. Where the two disagree, the camera did not go on as before.
+        both, weighted by their covariances. As it is where the two disagree: the camera did not go on as before.
         """
         found = np.asarray(attempt.result.target_T_reference)
         onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))

@@ -136,7 +136,7 @@ class Compared(NamedTuple):
     inverse_depth: Float[Array, " n"]
     place: tuple[Float[Array, " n"], Float[Array, " n"]]
     """Column and row of each pixel in the view."""
-    lit: Float[Array, "v n"]
+    as_bright: Float[Array, "v n"]
     """Grey of the view as bright as the others are on the whole."""
     light: Float[Array, "v n"]
     """How much brighter the others show each place beyond that, as a share of it."""

@@ -16,7 +16,8 @@ The gain is linear from the centre of one cell to that of the next."""
 STRIP = 3.0
 """Pixels of the height of a strip of rows that has a gain of its own, where a lamp flickers."""
 FLICKER = 0.8
-"""Part of the residuals' power that the gains of strips leave at most where a lamp does: 0.91 is the least without."""
+"""Part of the residuals' power that the gains of strips leave at most where a lamp does. Without such a lamp at least
+0.91 is left of clips."""
 UNCHANGED = 900.0
 """Squared grey levels of a cell's mean pixel at which its gain is half-way between 1 and the regression's."""
 LARGE = 20.0

@@ -79,7 +79,7 @@ def _align(
         seconds=np.float32(before.seconds[place]),
         usual=Usual.unknown(),
     )
-    return aware.search.align(aware.segmenter.without(tracker, before.labels != number), frame, clock).result
+    return aware.search.plain.align(aware.segmenter.without(tracker, before.labels != number), frame, clock).result
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:

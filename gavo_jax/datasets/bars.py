@@ -1,4 +1,7 @@
-"""Black bars at the sides of images: of another shape than the scene's picture, they stay put as the scene moves."""
+"""Black bars at the sides of images: they stay put as the scene moves, as a body would that goes with the camera.
+
+Each image is judged by itself.
+"""
 
 from typing import Any
 
@@ -8,6 +11,8 @@ DARKEST = 20
 """Grey levels of the brightest bar."""
 ALIKE = 1
 """Grey levels by which the pixels of a bar differ at most."""
+LEAST = 4
+"""Pixels of the width of a bar."""
 MOST = 0.5
 """Share of a side that bars may take: beyond, the image is blank."""
 RIM = 4
@@ -36,16 +41,26 @@ def without_bars(grey: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.nd
 def _inside(image: Any) -> slice:
     """Rows that lie between bars, and off their rims."""
     size = len(image)
-    first, last = _bar(image), _bar(image[::-1])
-    if first + last > MOST * size:
-        return slice(0, size)
-    return slice(first + RIM if first else 0, size - (last + RIM if last else 0))
+    first, last = _margin(image), _margin(image[::-1])
+    return slice(0, size) if first + last > MOST * size else slice(first, size - last)
+
+
+def _margin(image: Any) -> int:
+    """How many rows are a bar and its rim, from the first one on; what is dark behind the rim belongs to it."""
+    searched = image[: int(MOST * len(image)) + 1]
+    end = _bar(searched)
+    if end < LEAST:
+        return 0
+    while more := _bar(searched[end + RIM :]):
+        end += RIM + more
+    return end + RIM
 
 
 def _bar(image: Any) -> int:
-    """How many rows are a bar, from the first one on."""
+    """How many rows, from the first one on, are all of one dark level."""
+    darkest, brightest = np.inf, -np.inf
     for count, row in enumerate(image):
-        darkest, brightest = np.min(row), np.max(row)
+        darkest, brightest = min(darkest, float(np.min(row))), max(float(np.max(row)), brightest)
         if not (brightest <= DARKEST and brightest - darkest <= ALIKE):  # not-a-number is no bar
             return count
     return len(image)

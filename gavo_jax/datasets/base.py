@@ -21,18 +21,18 @@ def what_helps(name: str, image: Any) -> str:
     return "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
 
 
-BRIGHTEST = 256.0
-"""Grey levels: rounding and interpolation reach no further."""
+BRIGHTEST = 400.0
+"""Grey levels: sharpening and cubic interpolation reach no further; images of ten bits and more do."""
 
 
 def require_grey_levels(grey: Any) -> None:
-    """Refuse grey images whose levels reach to 1, or beyond 255.
+    """Refuse grey images whose levels reach to 1, or far beyond 255.
 
     Raises:
-        FrameError: They are floats, none above 1, and not all black; or some are above 255.
+        FrameError: They are floats, none above 1, and not all black; or some are above `BRIGHTEST`.
     """
     values = np.asarray(grey)
-    if values.dtype == np.uint8 or not values.size:
+    if values.dtype == np.uint8 or values.dtype.kind not in "uif" or not values.size:
         return
     most = np.max(values)
     if values.dtype.kind == "f" and 0.0 < most <= 1.0:
@@ -51,6 +51,12 @@ def require_seconds(name: str, stamp: Any) -> None:
         raise GavoError(f"{name}: seconds are needed, a number, not {type(stamp).__name__}")
 
 
+YEAR = 365.25 * 86400
+"""Seconds."""
+LATEST = 1e11
+"""Seconds: no clock shows more, and milliseconds since 1970 are more."""
+
+
 def require_begin_in_seconds(stamp: float) -> None:
     """Refuse the first stamp of a stream where it counts milliseconds, microseconds or nanoseconds since 1970.
 
@@ -61,14 +67,12 @@ def require_begin_in_seconds(stamp: float) -> None:
         raise FrameError(f"timestamp: seconds are needed, and {stamp:.0f} of them are {stamp / YEAR:.0f} years")
 
 
-LATEST, YEAR = 1e11, 365.25 * 86400
-"""Seconds: no clock shows more, and milliseconds since 1970 are more."""
-
-
 class TimestampError(FrameError):
     """A frame whose time is in doubt."""
 
 
+SAME_STAMP = 1e-6
+"""Seconds by which a stamp changes as it is written."""
 MOST_DELAY = 0.1
 """Seconds: depth that is further from its colour image has a stamp that tells nothing."""
 
@@ -107,12 +111,14 @@ class Frame:
         return delay if abs(delay) <= MOST_DELAY else 0.0
 
     def at(self, timestamp: float) -> "Frame":
-        """The same images with another stamp, depth as long after it as before. Frames are told apart by their stamps,
-        so that one which differs in its last digit is another one.
+        """The same images with another stamp, depth as long after it as before. Where only the last digits of the stamp
+        differ depth keeps its own, as several frames may share one depth image.
         """
         if timestamp == self.timestamp:
             return self
-        depth = None if self.depth_timestamp is None else timestamp + self.depth_delay
+        depth = self.depth_timestamp
+        if depth is not None and not abs(timestamp - self.timestamp) < SAME_STAMP:
+            depth = timestamp + self.depth_delay
         return replace(self, timestamp=timestamp, depth_timestamp=depth)
 
 

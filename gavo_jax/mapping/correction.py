@@ -16,10 +16,6 @@ IN_DOUBT = 100.0
 """How much more a guessed motion counts than one that was found, where a correction has to change."""
 
 
-TINY = 1e-6
-"""Seconds between two poses at least, so that there is a way between any two."""
-
-
 class Doubts(NamedTuple):
     """Which poses of a trajectory are no more than guesses."""
 
@@ -41,7 +37,7 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
     become one.
     """
-    placed = _placed(loops.keyframes, odometry.timestamps)
+    placed = _placed(loops.keyframes, odometry)
     if not placed:
         return odometry
     keyframes, places = zip(*placed, strict=True)
@@ -62,23 +58,30 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
     return corrected if doubts is None else bridged(corrected, doubts.lost)
 
 
-def _placed(keyframes: list[Keyframe], stamps: Float64[np.ndarray, " n"]) -> list[tuple[Keyframe, int]]:
+def _placed(keyframes: list[Keyframe], odometry: Trajectory) -> list[tuple[Keyframe, int]]:
     """Keyframes with their places among the poses: both are in the order in which the frames came, which need not be
     that of their stamps, as a clock may have been set back. The map may be ahead of a run that was interrupted.
     """
-    names, placed, start = [stamp_name(stamp) for stamp in stamps.tolist()], [], 0
+    names, segments = [stamp_name(stamp) for stamp in odometry.timestamps.tolist()], odometry.segments.tolist()
+    placed, start = [], 0
     for keyframe in keyframes:
         name = stamp_name(keyframe.timestamp)
-        if name in names[start:]:
-            start = names.index(name, start)
+        places = [i for i in range(start, len(names)) if names[i] == name]
+        if places:  # a stamp may come again in another segment
+            start = next((i for i in places if segments[i] == keyframe.segment), places[0])
             placed.append((keyframe, start))
     return placed
 
 
 def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64[np.ndarray, " n"]:
-    """Seconds since the first pose, those of a guessed motion counted more often."""
+    """Seconds since the first pose, those of a guessed motion counted more often; where a clock was set back, the usual
+    time passes.
+    """
+    between = np.diff(stamps)
+    grows = between > 0
+    usual = np.median(between[grows]) if np.any(grows) else 1.0
     weights = 1.0 if doubts is None else np.where(doubts.guessed[1:], IN_DOUBT, 1.0)
-    return np.concatenate([[0.0], np.cumsum(weights * np.maximum(np.abs(np.diff(stamps)), TINY))])
+    return np.concatenate([[0.0], np.cumsum(weights * np.where(grows, between, usual))])
 
 
 def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:

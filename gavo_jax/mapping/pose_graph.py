@@ -151,7 +151,7 @@ def _plausible(
         residual = log(inverse(edge.earlier_T_later) @ said)
         drifted = transport_covariance(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
-        result.append(squared < _largest(IMPOSSIBLE))
+        result.append(squared < _chi_squared_below(IMPOSSIBLE))
     return np.array(result)
 
 
@@ -213,7 +213,7 @@ def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
 def _fits(gtsam: Any, values: Any, edge: Edge) -> bool:
     """Whether what the poses say of a loop is within what its covariance allows."""
     residual = _residual(gtsam, values, edge)
-    return bool(residual @ np.linalg.solve(edge.covariance, residual) < _largest(PROBABILITY))
+    return bool(residual @ np.linalg.solve(edge.covariance, residual) < _chi_squared_below(PROBABILITY))
 
 
 def _residual(gtsam: Any, values: Any, edge: Edge) -> np.ndarray:
@@ -226,8 +226,8 @@ def _pose(gtsam: Any, transform: np.ndarray) -> Any:
 
 
 @cache
-def _largest(probability: float) -> float:
-    """Return the value that chi-squared with six degrees of freedom exceeds in no more than the rest of the cases."""
+def _chi_squared_below(probability: float) -> float:
+    """The value that chi-squared with six degrees of freedom stays below with a probability."""
     from scipy.special import chdtri  # a sixth of the time in which the command starts, and most runs close no loops
 
     return float(chdtri(6, 1.0 - probability))

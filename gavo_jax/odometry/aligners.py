@@ -91,6 +91,11 @@ class FrameSearch(Aligner, Protocol):
         """What searches, and how."""
         ...
 
+    @property
+    def plain(self) -> "FrameSearch":
+        """It without second thoughts."""
+        ...
+
     def blank_state(self) -> TrackerState:
         """The state before the first frame."""
         ...
@@ -126,6 +131,11 @@ class Search:
             if collects:
                 gc.enable()
         return time.perf_counter() - start
+
+    @property
+    def plain(self) -> "Search":
+        """It has no second thoughts."""
+        return self
 
     def blank_state(self) -> TrackerState:
         """The state before the first frame."""

@@ -1,7 +1,7 @@
 """The aligner that settings ask for: the search, and which second thoughts stand around it."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from jaxtyping import PRNGKeyArray
 
@@ -10,10 +10,12 @@ from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import WithRival
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import LEVELS
-from gavo_jax.odometry.aligners import Aligner, FrameSearch, Search
+from gavo_jax.odometry.aligners import Aligner, FrameSearch, Search, side_by_side
 from gavo_jax.odometry.relighting import Relighting
 from gavo_jax.odometry.second_thoughts import DoubtingDepth, Polished, Recovering
 from gavo_jax.settings import Settings
+
+AlignerKind = TypeVar("AlignerKind", bound=Aligner)
 
 
 def wide_search(search: Search) -> Search:
@@ -51,6 +53,18 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
     return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
 
 
+def warm_up_wholly(aligner: Any) -> float:
+    """Compile what any pair may need, however the aligner is wrapped: what a doubtful one does beside what all do; the
+    seconds this took.
+    """
+    of_second_thoughts, one = [], aligner
+    while one is not None:
+        if hasattr(one, "warm_up_second"):
+            of_second_thoughts.append(one.warm_up_second)
+        one = getattr(one, "first", None)
+    return side_by_side(aligner.warm_up, lambda: [warm_up() for warm_up in of_second_thoughts])
+
+
 def blank_of(aligner: Any) -> Any:
     """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
     while not hasattr(aligner, "blank_state"):
@@ -58,7 +72,7 @@ def blank_of(aligner: Any) -> Any:
     return aligner.blank_state()
 
 
-def with_light(aligner: Any, search: FrameSearch) -> Any:
+def with_light(aligner: AlignerKind, search: FrameSearch) -> AlignerKind | Relighting:
     """An aligner that looks for light that changed, where the search's settings ask for that."""
     return Relighting(aligner, search) if search.settings.odometry.relight else aligner
 

@@ -28,12 +28,12 @@ from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
-from gavo_jax.odometry.composition import make_aligner
+from gavo_jax.odometry.composition import make_aligner, warm_up_wholly
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.odometry.second_thoughts import Recovering, without_depth
+from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.way import Way
 from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
@@ -190,9 +190,7 @@ class Odometry:
         Args:
             wholly: Also what only a doubtful pair needs: a camera would not wait while that is compiled.
         """
-        if wholly and isinstance(self.aligner, Recovering):
-            return self.aligner.warm_up_both()
-        return self.aligner.warm_up()
+        return warm_up_wholly(self.aligner) if wholly else self.aligner.warm_up()
 
     @in_32_bits
     def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:

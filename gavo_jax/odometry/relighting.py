@@ -4,7 +4,7 @@ A search knows one gain and bias of each reference. Where a lamp flickers while 
 shadow, neither fits, and the motion is drawn to one that explains the light.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -56,25 +56,45 @@ class Relighting(SecondThought):
         """The search's."""
         return self.search.settings
 
+    @property
+    def plain(self) -> FrameSearch:
+        """The search."""
+        return self.search.plain
+
     def blank_state(self) -> TrackerState:
         """The search's."""
         return self.search.blank_state()
 
+    def warm_up_second(self) -> None:
+        """Compile the look at the light."""
+        state = self.blank_state()
+        new = NewFrame(state.previous_image, state.instant_motion, state.seconds)
+        jax.block_until_ready(self._in_light_of(new, state, np.eye(4, dtype=np.float32)))
+
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The first attempt, or one with references in the frame's own light where that explains more."""
+        """The first attempt, or one with references in the frame's own light if that can be used, or explains more."""
         attempt = self.first.align(state, frame, clock)
         result = attempt.result
         explained = float(result.explained.grey)
         if not explained < UNEXPLAINED or not np.all(np.isfinite(result.target_T_reference)):
             return attempt
         new = NewFrame(attempt.state.previous_image, attempt.state.instant_motion, clock.elapsed)
-        motion = np.asarray(result.target_T_reference, np.float32)
-        levels = levels_of(self.camera, self.settings.solver, self.settings.alignment)
-        lit, left = _relit(state, new, motion, self.camera, levels=levels)
+        lit, left = self._in_light_of(new, state, np.asarray(result.target_T_reference, np.float32))
         if not float(left) < 1.0 - EXPLAINED:
             return attempt
         again = self.search.align(lit, frame, clock)
-        return again if float(again.result.explained.grey) > explained else attempt
+        is_better = (again.usable, float(again.result.explained.grey)) > (attempt.usable, explained)
+        return again if is_better else attempt
+
+    def _in_light_of(
+        self, new: "NewFrame", state: TrackerState, motion: Float[np.ndarray, "4 4"]
+    ) -> tuple[TrackerState, Float[Array, ""]]:
+        """Run `_with_light` for the search's camera and levels."""
+        camera, settings = self.camera, self.settings
+        if not settings.odometry.rolling_shutter:
+            camera = replace(camera, readout=0.0)
+        levels = levels_of(camera, settings.solver, settings.alignment)
+        return _with_light(state, new, motion, camera, levels=levels)
 
 
 class NewFrame(NamedTuple):
@@ -84,39 +104,41 @@ class NewFrame(NamedTuple):
     instant_motion: Float[Array, " 6"]
     """Twist of the motion, had the camera moved all the time as it did at the frame's own moment."""
     elapsed: Float[Array, ""]
-    """Seconds since the last frame."""
+    """Seconds since the reference."""
 
 
 @partial(CachedProgram, static=("levels",), returns=(TrackerState,))
-def _relit(
+def _with_light(
     state: TrackerState, new: NewFrame, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
 ) -> tuple[TrackerState, Float[Array, ""]]:
     """The state with references in the light of a new frame, by the motion to it; and what part of the large residuals
     that light leaves.
     """
-    here = view_of(state.previous_image, levels, state.instant_motion * (camera.readout / state.seconds))
+    is_moving = jnp.any(state.motion != 0.0)  # as far as is known: rows of a first frame are as they were exposed
+    sweep = jnp.where(is_moving, state.instant_motion * (camera.readout / state.seconds), jnp.nan)
+    here = view_of(state.previous_image, levels, sweep)
     there = view_of(new.image, levels, new.instant_motion * (camera.readout / new.elapsed))
     level = camera.level(levels.numbers[seen_level(levels)])
     compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_reference[None], level)
     light, residual = compared.light[0], compared.residuals.grey[0]
-    without = residual + light * compared.lit[0]
+    without = residual + light * compared.as_bright[0]
     before, after = (jnp.sum(compared.same[0] * (jnp.abs(one) >= LARGE_GREY_RESIDUAL)) for one in (without, residual))
     planes = jax.tree.map(lambda leaf: leaf[:, None], levels.planes(camera))
 
-    def relit(reference: Reference) -> Reference:
-        """Points by the light of the nearest pixel: it is smooth."""
+    def in_new_light(reference: Reference) -> Reference:
+        """Points by the light of the nearest pixel of the level that is looked at."""
         x, y, _ = reference.points
-        column = _nearest((planes.fx * x + planes.cx + 0.5) / planes.width, level.width)
-        row = _nearest((planes.fy * y + planes.cy + 0.5) / planes.height, level.height)
+        column = _index_at((planes.fx * x + planes.cx + 0.5) / planes.width, level.width)
+        row = _index_at((planes.fy * y + planes.cy + 0.5) / planes.height, level.height)
         gain = 1.0 + light.reshape(level.height, level.width)[row, column]
         return reference._replace(
             grey=gain * reference.grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v
         )
 
-    lit = state._replace(previous=relit(state.previous), keyframe=relit(state.keyframe))
+    lit = state._replace(previous=in_new_light(state.previous), keyframe=in_new_light(state.keyframe))
     return lit, (after + 1.0) / (before + 1.0)
 
 
-def _nearest(part: Float[Array, "*n"], size: int) -> Integer[Array, "*n"]:
-    """Index, along a side of so many pixels, of the one that lies at a part of the side's length."""
-    return jnp.clip(part * size, 0, size - 1).astype(jnp.int32)
+def _index_at(share: Float[Array, "*n"], size: int) -> Integer[Array, "*n"]:
+    """Index, along a side of so many pixels, of the one that lies at a share of its length."""
+    return jnp.clip(share * size, 0, size - 1).astype(jnp.int32)

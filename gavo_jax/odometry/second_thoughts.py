@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from gavo_jax.alignment.judgement import MIN_EXPLAINED_GREY
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.datasets.base import Frame
-from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree, side_by_side
+from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.status import AlignmentStatus
 
@@ -60,11 +60,10 @@ class Recovering(SecondThought):
         seconds = self.first.warm_up()
         return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
 
-    def warm_up_both(self) -> float:
-        """Warm up both, side by side; returns the seconds this took."""
-        if self.wide is None:
-            return self.first.warm_up()
-        return side_by_side(self.first.warm_up, self.wide.warm_up)
+    def warm_up_second(self) -> None:
+        """Compile what the second one needs."""
+        if self.wide is not None:
+            self.wide.warm_up()
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         """The first attempt if it is usable, else the second one if that is.

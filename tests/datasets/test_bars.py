@@ -9,6 +9,8 @@ import pytest
 from small import CAMERA, NEWTON
 
 from gavo_jax.alignment.pairs import align
+from gavo_jax.alignment.stacking import stacked_images
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.bars import RIM, without_bars
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rectified import rectified
@@ -50,6 +52,39 @@ def test_images_without_bars_stay_the_objects_that_they_are(grey: np.ndarray) ->
     for image in (grey, dim, bright, blank, unknown):
         found = without_bars(image, DEPTH)
         assert found[0] is image and found[1] is DEPTH
+
+
+def test_what_was_cleaned_stays_as_it_is(grey: np.ndarray) -> None:
+    """Frames pass more than once: dark rows behind the rim of a bar were another bar the next time."""
+    image = barred(grey)
+    image[13:20] = 3
+    clean, depth = without_bars(image, DEPTH)
+    again = without_bars(clean, depth)
+    assert again[0] is clean and again[1] is depth
+
+
+@pytest.mark.parametrize("size", [16, 17, 24])
+@pytest.mark.parametrize("rows", [4, 6, 7])
+def test_tiny_images_with_bars(grey: np.ndarray, size: int, rows: int) -> None:
+    image, depth = grey[:size, :size].copy(), DEPTH[:size, :size]
+    image[:rows], image[-rows:] = 0, 0
+    clean, kept = without_bars(image, depth)
+    assert clean.shape == kept.shape == (size, size)
+
+
+def test_rows_of_many_levels_or_few_rows_are_no_bar(grey: np.ndarray) -> None:
+    ramp, thin = grey.copy(), grey.copy()
+    ramp[:20] = np.arange(0, 20)[:, None]
+    thin[:3] = 0
+    assert without_bars(ramp, DEPTH)[0] is ramp and without_bars(thin, DEPTH)[0] is thin
+
+
+def test_stacks_of_images_come_without_bars(grey: np.ndarray) -> None:
+    camera = Camera(60.0, 60.0, 39.5, 29.5, 80, 60)
+    image = barred(grey)
+    one, many = (stacked_images(side, camera) for side in ([(image, DEPTH)], (image[None], DEPTH[None])))
+    for found, wanted in zip(many, one, strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_frames_and_pairs_come_without_bars() -> None:

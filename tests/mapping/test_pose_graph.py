@@ -1,5 +1,7 @@
 """The pose graph: right loops correct it, wrong ones don't, and the trajectory between keyframes follows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.sparse import csc_array
@@ -130,12 +132,24 @@ def test_a_clock_that_was_set_back_does_not_matter():
     raised = exp(np.array([0.0, 0.04, 0.0, 0.0, 0.0, 0.0])) @ poses[8]
     lost = np.array([False] * 5 + [True] + [False] * 3)
     corrected = []
-    for back in (0.0, 1000.0):
-        stamps = np.arange(9.0) - back * (np.arange(9) > 3)
+    for back, after in ((0.0, 3), (1000.0, 3), (1000.0, 6)):
+        stamps = np.arange(9.0) - back * (np.arange(9) > after)
         frames = [keyframe(k, stamps[i], poses[i], poses[i]) for k, i in enumerate((0, 4))]
         loops = solved([*frames, keyframe(2, stamps[8], poses[8], raised)], [])
         corrected.append(correct(Trajectory(stamps, poses), loops, Doubts(lost, lost)).world_T_camera)
     np.testing.assert_allclose(corrected[1], corrected[0], atol=1e-9)
+    np.testing.assert_allclose(corrected[2], corrected[0], atol=1e-9)
+
+
+def test_stamps_that_come_again_are_those_of_another_segment() -> None:
+    """A recording that is played twice: the second pass corrected the first one."""
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    raised = np.eye(4)
+    raised[1, 3] = 0.04
+    stamps, segments = np.r_[np.arange(4.0), np.arange(5.0)], np.r_[np.zeros(4, int), np.ones(5, int)]
+    frames = [keyframe(0, 0.0, poses[0], poses[0]), replace(keyframe(1, 1.0, poses[5], raised), segment=1)]
+    corrected = correct(Trajectory(stamps, poses, segments), solved(frames, []))
+    np.testing.assert_allclose(corrected.world_T_camera[:, 1, 3], [0.0] * 4 + [0.04] * 5, atol=1e-9)
 
 
 def test_a_loop_joins_segments():

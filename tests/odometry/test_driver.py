@@ -69,6 +69,16 @@ def test_a_frame_s_own_stamp_gives_way_to_the_last_digit() -> None:
     assert sorted(taken_back([*known[:-1], replace(known[-1], revises=1)])) == [1]
 
 
+def test_frames_may_share_a_depth_image_whose_stamp_does_not_change() -> None:
+    """Depth at half the rate: a stamp that was computed anew, off by rounding, made the depth `frozen`."""
+    blank, depth_stamp = np.zeros((2, 2), np.uint8), 1305031102.16
+    for index in range(12):
+        stamp = 1305031102.175304 + index / 300
+        frame = Frame(blank, blank.astype(np.uint16), stamp, depth_timestamp=depth_stamp)
+        assert frame.at(stamp + 3e-7).depth_timestamp == depth_stamp
+        assert frame.at(stamp + 0.5).depth_timestamp == pytest.approx(depth_stamp + 0.5, abs=1e-6)
+
+
 @pytest.mark.parametrize("kind", [np.uint16, np.float32])
 def test_grey_of_more_than_eight_bits_is_refused(kind: Any) -> None:
     """Every frame of 16 bits was lost as blank, and one twice as bright said that bodies moved."""

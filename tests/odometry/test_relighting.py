@@ -11,6 +11,7 @@ from carded import Carded
 from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER, Altered, Told, errors, run
 from flicker import flickering, followed
 
+from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
@@ -93,6 +94,50 @@ def test_references_are_as_bright_as_the_new_frame_shows_them(room: SyntheticSeq
     assert np.std(wanted[has]) > 0.08
     assert np.median(np.abs(gain / wanted / overall - 1.0)[has]) < 0.02
     np.testing.assert_allclose(after.grey_u[has], (gain * before.grey_u)[has], rtol=1e-4)
+
+
+def test_a_motion_that_can_be_used_does_not_give_way_to_one_that_cannot(room: SyntheticSequence) -> None:
+    """By the light that goes with a motion nearly everything can be explained."""
+    lit = [flickering(index, room[index]) for index in range(2)]
+    search: Any = make_aligner(CAMERA, SEARCH_ALONE, jax.random.key(0))
+    first = search.align(search.start(lit[0]), lit[1], clock_of(lit))
+    assert first.usable and float(first.result.explained.grey) < 0.7
+    explained = first.result.explained._replace(grey=np.float32(1.0))
+    for usable in (False, True):
+        told: Any = Answering(search, first._replace(result=first.result._replace(explained=explained), usable=usable))
+        attempt = Relighting(search, told).align(search.start(lit[0]), lit[1], clock_of(lit))
+        assert (float(attempt.result.explained.grey) == 1.0) == usable
+
+
+@dataclass(frozen=True)
+class Answering:
+    """A search that has one answer."""
+
+    search: Any
+    answer: Attempt
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.search, name)
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        return self.answer
+
+
+def clock_of(pair: list[Frame]) -> Clock:
+    """When the second of two frames was taken."""
+    return Clock(np.float32(pair[1].timestamp - pair[0].timestamp), np.float32(0.0), np.uint32(1))
+
+
+def test_a_camera_does_not_wait_for_the_light(monkeypatch: pytest.MonkeyPatch, room: SyntheticSequence) -> None:
+    """The program that looks at it took two seconds in the middle of a run."""
+    odometry = Odometry(CAMERA, Settings(SOLVER, odometry=RELIT))
+    monkeypatch.setattr(program_cache, "_loaded", {})
+    odometry.warm_up(wholly=True)
+    before = set(program_cache._loaded)
+    for index in range(4):
+        odometry.register(flickering(index, room[index]), room[index].timestamp)
+    assert {"_with_light", "track_frame"} <= {function.__name__ for function, *_ in before}
+    assert set(program_cache._loaded) == before
 
 
 def test_where_nothing_is_seen_twice_nothing_is_known_of_the_light(room: SyntheticSequence) -> None:
