@@ -65,6 +65,7 @@ VARIANTS: dict[str, tuple[str, Callable[[Settings], Settings]]] = {
     "sway": ("each frame's velocity the mean since the last", _odometry(sway=False)),
     "keyframe": ("previous frame only", _odometry(reference="previous")),
     "prior": ("no constant velocity", _odometry(prior=False)),
+    "relight": ("in the light as it was", _odometry(relight=False)),
     "recover": ("no second try", _odometry(recover=False)),
     "points": ("every pixel", _alignment(points=None)),
     "views": ("both references on every level", _alignment(views=(2, 2, 2, 2, 2))),

@@ -104,7 +104,8 @@ def weigh(channels: list[tuple[np.ndarray, ...]]) -> tuple[float, ...]:
 def measure(clip: str) -> dict[int, dict[str, float]]:
     """Medians over a clip's pairs, level by level."""
     sequence, settings = common.open_clip(clip), presets.preset("gauss-newton")
-    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False, bodies="off"))
+    alone = replace(settings.odometry, reference="previous", relight=False, recover=False, bodies="off")
+    settings = replace(settings, odometry=alone)
     odometry = Odometry(sequence.camera, settings)
     pairs, states = [], []
 

@@ -30,7 +30,8 @@ def measure(clip: str, readouts: list[int]) -> list[dict[str, Any]]:
     """E, relative to the first readout's, and drift of a clip for each readout in milliseconds."""
     sequence = common.open_clip(clip)
     settings = presets.preset("gauss-newton")
-    settings = replace(settings, odometry=replace(settings.odometry, reference="previous", recover=False, sway=False))
+    alone = replace(settings.odometry, reference="previous", relight=False, recover=False, sway=False)
+    settings = replace(settings, odometry=alone)
     rows, first = [], None
     for milliseconds in readouts:
         camera = replace(sequence.camera, readout=milliseconds / 1000)
