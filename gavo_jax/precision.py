@@ -1,26 +1,39 @@
-"""JAX in 32 bits, whatever the program around it has chosen: all that is compiled here is written for them."""
+"""JAX in 32 bits and its usual modes, whatever the program around it has chosen: what is compiled here needs them."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+USUAL: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+    "jax_enable_x64": (False, jax.enable_x64),
+    "jax_numpy_rank_promotion": ("allow", jax.numpy_rank_promotion),
+    "jax_numpy_dtype_promotion": ("standard", jax.numpy_dtype_promotion),
+    "jax_debug_nans": (False, jax.debug_nans),
+    "jax_debug_infs": (False, jax.debug_infs),
+}
+"""Modes, what they are as JAX comes, and what sets them. Here not-a-number and infinity are no errors: they stand for
+what is not known, or worth nothing."""
+
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
-    """The function as it is in a process that has not switched on JAX's 64 bits (`jax_enable_x64`).
+    """The function as it is in a process that has switched on neither JAX's 64 bits (`jax_enable_x64`) nor another mode
+    of `USUAL`.
 
-    The switch is one of each thread: what is handed to another one has to be wrapped, too.
+    The switches are those of each thread: what is handed to another one has to be wrapped, too.
     """
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not jax.config.read("jax_enable_x64"):
-            return function(*args, **kwargs)
-        with jax.enable_x64(False):
+        changed = [(usual, switch) for name, (usual, switch) in USUAL.items() if getattr(jax.config, name) != usual]
+        with ExitStack() as modes:
+            for usual, switch in changed:
+                modes.enter_context(switch(usual))
             return function(*args, **kwargs)
 
     return call

@@ -3,11 +3,15 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
+import pytest
 from small import CAMERA, GENETIC
 
 import gavo_jax as gavo
@@ -18,7 +22,7 @@ FRAMES = SyntheticSequence(frames=4, camera=CAMERA)
 SETTINGS = replace(GENETIC, odometry=replace(GENETIC.odometry, bodies="mask"))
 
 
-def test_results_are_those_of_32_bits(tmp_path: Path) -> None:
+def test_results_are_those_of_32_bits(tmp_path: Path, wanted: list[np.ndarray]) -> None:
     """In a process of its own: the switch is for the whole program, and threads begin with it."""
     program = (
         "import sys; import numpy as np; from test_precision import results\n"
@@ -29,8 +33,13 @@ def test_results_are_those_of_32_bits(tmp_path: Path) -> None:
     outside = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": places}
     subprocess.run([sys.executable, "-c", program, str(tmp_path / "found.npz")], env=outside, check=True)
     with np.load(tmp_path / "found.npz") as found:
-        for name, wanted in zip(found.files, results(), strict=True):
-            np.testing.assert_array_equal(found[name], wanted)
+        for name, one in zip(found.files, wanted, strict=True):
+            np.testing.assert_array_equal(found[name], one)
+
+
+@pytest.fixture(scope="module")
+def wanted() -> list[np.ndarray]:
+    return results()
 
 
 def results() -> list[np.ndarray]:
@@ -48,3 +57,21 @@ def test_where_it_is_switched_off_nothing_changes() -> None:
         assert in_32_bits(lambda: jax.numpy.zeros(1))().dtype == np.float32
         assert jax.numpy.zeros(1).dtype == np.float64
     assert in_32_bits(lambda: jax.numpy.zeros(1))().dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        partial(jax.numpy_rank_promotion, "raise"),
+        partial(jax.numpy_dtype_promotion, "strict"),
+        partial(jax.debug_nans, True),
+        partial(jax.debug_infs, True),
+    ],
+    ids=["ranks", "types", "not-a-number", "infinity"],
+)
+def test_modes_that_look_for_errors_do_not_look_here(mode: Callable[[], Any], wanted: list[np.ndarray]) -> None:
+    """They ended in tracebacks: ours leaves promotion to JAX, and not-a-number stands for what is not known."""
+    with mode():
+        found = results()
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
