@@ -186,11 +186,11 @@ def compare(
     few = few._replace(inside=few.inside * (jnp.abs(few.depth) < LARGE_DEPTH_RESIDUAL))
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
-    lit = brightness.seen(seen_grey)
-    residual = r.grey_sample.value - lit
+    as_bright = brightness.seen(seen_grey)
+    residual = r.grey_sample.value - as_bright
     is_told = jnp.maximum(r.grey_sample.value, grey.value) < SATURATED
     same = r.inside * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL) * is_told
     shape = (-1, -(-height // stride), -(-width // stride))
-    light = light_change(*(one.reshape(shape) for one in (residual, lit, same))).reshape(residual.shape)
-    r = r._replace(grey=residual - lit * light)
-    return Compared(r, grey, seen_grey, q, (u, v), lit, light, same)
+    light = light_change(*(one.reshape(shape) for one in (residual, as_bright, same))).reshape(residual.shape)
+    r = r._replace(grey=residual - as_bright * light)
+    return Compared(r, grey, seen_grey, q, (u, v), as_bright, light, same)

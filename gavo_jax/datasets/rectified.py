@@ -31,6 +31,15 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
     return replace(frame, grey=grey, depth=depth, color=color)
 
 
+def rectified_at(sequence: Sequence, index: int) -> Frame:
+    """A frame of a sequence, `rectified`, at the sequence's stamp.
+
+    Raises:
+        FrameError: It cannot be read, or as `rectified`.
+    """
+    return rectified(sequence[index], sequence.camera.rectified()).at(float(sequence.timestamps[index]))
+
+
 def without_distortion(sequence: Sequence) -> Sequence:
     """A sequence whose frames have no lens distortion: itself, where they have none."""
     return Rectified(sequence) if sequence.camera.is_distorted else sequence

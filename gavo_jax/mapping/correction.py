@@ -62,13 +62,14 @@ def _placed(keyframes: list[Keyframe], odometry: Trajectory) -> list[tuple[Keyfr
     """Keyframes with their places among the poses: both are in the order in which the frames came, which need not be
     that of their stamps, as a clock may have been set back. The map may be ahead of a run that was interrupted.
     """
-    names, segments = [stamp_name(stamp) for stamp in odometry.timestamps.tolist()], odometry.segments.tolist()
+    places_of: dict[str, list[int]] = {}
+    for i, stamp in enumerate(odometry.timestamps.tolist()):
+        places_of.setdefault(stamp_name(stamp), []).append(i)
     placed, start = [], 0
     for keyframe in keyframes:
-        name = stamp_name(keyframe.timestamp)
-        places = [i for i in range(start, len(names)) if names[i] == name]
+        places = [i for i in places_of.get(stamp_name(keyframe.timestamp), ()) if i >= start]
         if places:  # a stamp may come again in another segment
-            start = next((i for i in places if segments[i] == keyframe.segment), places[0])
+            start = next((i for i in places if odometry.segments[i] == keyframe.segment), places[0])
             placed.append((keyframe, start))
     return placed
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import rectified
+from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.mapping.candidates import LoopCandidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
@@ -311,6 +311,6 @@ def _may_be_keyframe(step: Step) -> bool:
 
 def _decoded(sequence: Sequence, index: int) -> Frame | None:
     try:
-        return rectified(sequence[index], sequence.camera.rectified()).at(float(sequence.timestamps[index]))
+        return rectified_at(sequence, index)
     except FrameError:
         return None

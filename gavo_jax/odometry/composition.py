@@ -1,5 +1,6 @@
 """The aligner that settings ask for: the search, and which second thoughts stand around it."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -57,19 +58,20 @@ def warm_up_wholly(aligner: Any) -> float:
     """Compile what any pair may need, however the aligner is wrapped: what a doubtful one does beside what all do; the
     seconds this took.
     """
-    of_second_thoughts, one = [], aligner
-    while one is not None:
-        if hasattr(one, "warm_up_second"):
-            of_second_thoughts.append(one.warm_up_second)
-        one = getattr(one, "first", None)
-    return side_by_side(aligner.warm_up, lambda: [warm_up() for warm_up in of_second_thoughts])
+    second = [layer.warm_up_second for layer in _layers(aligner) if hasattr(layer, "warm_up_second")]
+    return side_by_side(aligner.warm_up, lambda: [warm_up() for warm_up in second])
 
 
 def blank_of(aligner: Any) -> Any:
     """The state of a search, however it is wrapped, before the first frame: in the shapes and types of every state."""
-    while not hasattr(aligner, "blank_state"):
-        aligner = aligner.first
-    return aligner.blank_state()
+    return next(layer for layer in _layers(aligner) if hasattr(layer, "blank_state")).blank_state()
+
+
+def _layers(aligner: Any) -> Iterator[Any]:
+    """An aligner, what it stands around, and so on."""
+    while aligner is not None:
+        yield aligner
+        aligner = getattr(aligner, "first", None)
 
 
 def with_light(aligner: AlignerKind, search: FrameSearch) -> AlignerKind | Relighting:

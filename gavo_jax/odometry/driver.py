@@ -274,10 +274,11 @@ class Odometry:
         elif not (frame is None or isinstance(frame, FrameError)):
             raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
         require_seconds("timestamp", timestamp)
+        timestamp = float(timestamp)
         if is_first:
-            require_begin_in_seconds(float(timestamp))
+            require_begin_in_seconds(timestamp)
         if isinstance(frame, Frame):
-            return frame.at(float(timestamp))
+            return frame.at(timestamp)
         if is_first:
             raise frame or FrameError("the first frame could not be read")
         return frame

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import rectified
+from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Solver
@@ -55,7 +55,7 @@ def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
 
     def read(index: int) -> Frame | FrameError:
         try:
-            return rectified(sequence[index], sequence.camera.rectified()).at(float(sequence.timestamps[index]))
+            return rectified_at(sequence, index)
         except FrameError as error:
             return error
 
