@@ -24,7 +24,7 @@ import common
 import cv2
 import numpy as np
 
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.files import open_pair

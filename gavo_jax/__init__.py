@@ -15,9 +15,9 @@ from gavo_jax.alignment.pairs import align as align
 from gavo_jax.alignment.pairs import align_batch as align_batch
 from gavo_jax.alignment.result import Alignment as Alignment
 from gavo_jax.camera import Camera as Camera
-from gavo_jax.camera_files import Calibration as Calibration
-from gavo_jax.camera_files import load_calibration as load_calibration
-from gavo_jax.camera_files import load_camera as load_camera
+from gavo_jax.camera_files.calibration import Calibration as Calibration
+from gavo_jax.camera_files.calibration import load_calibration as load_calibration
+from gavo_jax.camera_files.calibration import load_camera as load_camera
 from gavo_jax.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from gavo_jax.compiler import CompilerWarning as CompilerWarning
 from gavo_jax.datasets import actors as actors

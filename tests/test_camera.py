@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gavo_jax.camera import PRESETS, RIM, Camera, preset_for_sequence, require_camera
-from gavo_jax.camera_files import load_camera
+from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.errors import GavoError
 
 SMALL = Camera(50.0, 52.0, 31.2, 23.9, 64, 48)

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gavo_jax.camera import MAX_SIDE, Camera
-from gavo_jax.camera_files import load_camera
+from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import batches

@@ -5,7 +5,7 @@ from pathlib import Path
 import tomli_w
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.errors import write_bytes
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gavo_jax.alignment.pairs import align as align_pair
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
 from gavo_jax.compilation_cache import enable_compilation_cache

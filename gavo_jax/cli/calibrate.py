@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.cli.options import Calibrate
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.compilation_cache import enable_compilation_cache

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import load_calibration
+from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run

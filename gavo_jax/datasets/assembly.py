@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt16
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.images import NO_READING, to_8_bits, white_of, without_invalid
 from gavo_jax.datasets.registration import Registration

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, Size
+from gavo_jax.camera_files.calibration import Calibration, Size
 from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera, preset_for_sequence
-from gavo_jax.camera_files import DEPTH_SCALE, Calibration, Size, load_calibration
+from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, Size, load_calibration
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth

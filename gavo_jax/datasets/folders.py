@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_exports import common_camera
-from gavo_jax.camera_files import Calibration, load_calibration
-from gavo_jax.camera_words import REQUIRED
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.camera_files.exports import common_camera
+from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import (
     Entry,

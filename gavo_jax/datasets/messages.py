@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gavo_jax.camera_words import camera_info_distortion
+from gavo_jax.camera_files.words import camera_info_distortion
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.images import PNG_SIGNATURE, decode_color, decode_depth, to_float32
 from gavo_jax.errors import GavoError

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_files import MAX_JSON_BYTES
+from gavo_jax.camera_files.calibration import MAX_JSON_BYTES
 from gavo_jax.datasets.truth import pose_of
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory

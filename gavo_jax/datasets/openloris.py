@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera_exports import OPENLORIS_COLOR
-from gavo_jax.camera_files import Calibration, load_calibration
-from gavo_jax.camera_storage import read_storage, values_of
-from gavo_jax.camera_words import numbers_of
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.camera_files.exports import OPENLORIS_COLOR
+from gavo_jax.camera_files.storage import read_storage, values_of
+from gavo_jax.camera_files.words import numbers_of
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.truth import TRUTH, Seconds, pose_of

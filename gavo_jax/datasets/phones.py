@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import MAX_JSON_BYTES, Calibration, load_calibration
+from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.folders import NumberedFolder, PlainFolder, of_each_frame

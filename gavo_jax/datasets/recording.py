@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, Size, camera_from_table
+from gavo_jax.camera_files.calibration import Calibration, Size, camera_from_table
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading

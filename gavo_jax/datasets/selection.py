@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from gavo_jax.camera_files import load_camera
+from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import Reading

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import METRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.folders import NumberedFolder

@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import DEPTH_SCALE, Calibration, load_calibration
+from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, load_calibration
 from gavo_jax.datasets.files import (
     Entry,
     FileSequence,

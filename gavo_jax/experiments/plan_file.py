@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax import presets
-from gavo_jax.camera_files import load_camera
+from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.errors import GavoError, read_toml

@@ -14,7 +14,7 @@ from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
 from gavo_jax.calibration.scan import coarse, refine
-from gavo_jax.camera_files import Calibration, load_calibration
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of, in_all
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
 from gavo_jax.datasets.base import Frame

@@ -27,7 +27,7 @@ from layouts import (
 )
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import load_calibration
+from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.files import Reading

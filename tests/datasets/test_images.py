@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair
 from gavo_jax.datasets.images import MAX_BYTES, read_color, read_depth, white_of, without_invalid

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from layouts import CAMERA, LASER_T_COLOR, POSES, loris_sensors, loris_transforms, open_loris
 
-from gavo_jax.camera_files import load_calibration
+from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.openloris import OpenLoris
 from gavo_jax.datasets.registry import open_source

@@ -9,7 +9,7 @@ import pytest
 from layouts import image
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading, open_pair
 from gavo_jax.datasets.folders import ScanNet

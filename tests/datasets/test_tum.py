@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import Calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, TimestampError
 from gavo_jax.datasets.files import open_pair
 from gavo_jax.datasets.tum import TumSequence

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_words import Table, beside
+from gavo_jax.camera_files.words import Table, beside
 from gavo_jax.errors import GavoError, shown
 
 Rays = tuple[np.ndarray, np.ndarray]

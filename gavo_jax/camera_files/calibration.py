@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, Camera
-from gavo_jax.camera_makes import PARSERS, PROJECTION, Table
-from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
+from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
+from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24

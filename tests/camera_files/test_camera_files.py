@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files import load_calibration, load_camera
+from gavo_jax.camera_files.calibration import load_calibration, load_camera
 from gavo_jax.errors import GavoError
 
 MATRIX = np.array([[500.0, 0, 319.5], [0, 510.0, 239.5], [0, 0, 1]])

@@ -1,6 +1,6 @@
 """Camera files as several makes of software write them: TOML, ROS, Kalibr, OpenCV, Open3D, ORB-SLAM, plain numbers.
 
-A parser returns what a file says as a table of the keys of our own TOML file; `camera_files` checks the numbers.
+A parser returns what a file says as a table of the keys of our own TOML file; `calibration` checks the numbers.
 """
 
 import json
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_exports import (
+from gavo_jax.camera_files.exports import (
     Table,
     is_nerfstudio,
     is_openloris,
@@ -21,8 +21,8 @@ from gavo_jax.camera_exports import (
     read_openloris,
     read_realsense,
 )
-from gavo_jax.camera_storage import line_of, read_storage, real_of, values_of
-from gavo_jax.camera_words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
+from gavo_jax.camera_files.storage import line_of, read_storage, real_of, values_of
+from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
 from gavo_jax.errors import GavoError, number, parse_toml, shown
 
 PROJECTION = "projection_matrix"

@@ -1,0 +1,1 @@
+"""The cameras of a device from a file, whoever wrote it."""
