@@ -20,8 +20,8 @@ import tyro
 from gavo_jax import presets
 from gavo_jax.camera import Camera
 from gavo_jax.comparison import peer_odometry
-from gavo_jax.compilation_cache import enable_compilation_cache
-from gavo_jax.compiler import processor
+from gavo_jax.compilation.cache import enable_compilation_cache
+from gavo_jax.compilation.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.synthetic import SyntheticSequence

@@ -28,7 +28,7 @@ from scaling import time_batches, time_in_turn, time_scoring
 
 from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.camera import Camera
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.driver import Odometry

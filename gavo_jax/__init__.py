@@ -6,7 +6,7 @@ end_at_once()  # before anything that takes time to import
 
 import warnings
 
-from gavo_jax.compiler import prepare_process
+from gavo_jax.compilation.compiler import prepare_process
 
 prepare_process()  # before anything imports JAX
 
@@ -18,8 +18,8 @@ from gavo_jax.camera import Camera as Camera
 from gavo_jax.camera_files.calibration import Calibration as Calibration
 from gavo_jax.camera_files.calibration import load_calibration as load_calibration
 from gavo_jax.camera_files.calibration import load_camera as load_camera
-from gavo_jax.compilation_cache import enable_compilation_cache as enable_compilation_cache
-from gavo_jax.compiler import CompilerWarning as CompilerWarning
+from gavo_jax.compilation.cache import enable_compilation_cache as enable_compilation_cache
+from gavo_jax.compilation.compiler import CompilerWarning as CompilerWarning
 from gavo_jax.datasets import actors as actors
 from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError

@@ -27,8 +27,8 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from gavo_jax.compiler import processor_digest  # noqa: E402
-from gavo_jax.program_cache import keep_programs_in  # noqa: E402
+from gavo_jax.compilation.compiler import processor_digest  # noqa: E402
+from gavo_jax.compilation.programs import keep_programs_in  # noqa: E402
 
 # programs of the tests, and of the commands that they start, are kept between runs
 KEPT = Path.home() / ".cache" / "gavo-jax"
@@ -57,7 +57,7 @@ LONGEST = (
     "datasets/test_forms.py",
     "selfcheck/test_selfcheck.py",
     "experiments/test_sharding.py",
-    "test_precision.py",
+    "compilation/test_precision.py",
     "cli/test_shared_folders.py",
 )
 """Files that take longest, in the order in which they begin: one that began last would keep a process waiting."""

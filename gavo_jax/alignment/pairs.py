@@ -14,12 +14,12 @@ from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.stacking import Images, stacked_pairs, stacked_sides
 from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
-from gavo_jax.precision import in_32_bits
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus

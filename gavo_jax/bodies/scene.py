@@ -16,11 +16,11 @@ from gavo_jax.bodies.evidence import View, seen_level, view_of
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.masking import without_points
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.image.levels import ImagePlane, Levels
 from gavo_jax.image.sampling import Target
 from gavo_jax.objective.points import Reference
 from gavo_jax.odometry.tracking import TrackerState
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, median_by_bisection, surface_area
 from gavo_jax.bodies.evidence import View, compare
 from gavo_jax.camera import Camera
-from gavo_jax.program_cache import CachedProgram
+from gavo_jax.compilation.programs import CachedProgram
 
 DECISIVE = 6.0
 """Difference of two costs from which on a block has its whole vote."""

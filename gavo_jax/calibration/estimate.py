@@ -19,11 +19,11 @@ from jaxtyping import Integer
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
 from gavo_jax.calibration.scan import Least, Score, coarse, refine
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
-from gavo_jax.precision import in_32_bits
 
 Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
 ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import tyro
 
-from gavo_jax import compiler, interrupts
+from gavo_jax import interrupts
 from gavo_jax.cli.options import (
     Align,
     Calibrate,
@@ -28,6 +28,7 @@ from gavo_jax.cli.options import (
     View,
 )
 from gavo_jax.cli.usage import HelpPage, asking_for_help, fault_of_usage
+from gavo_jax.compilation import compiler
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, GavoWarning, shown, tell
 from gavo_jax.version import __version__
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
-    jax.config.update("jax_enable_x64", False)  # in every thread; see `precision`
+    jax.config.update("jax_enable_x64", False)  # in every thread; see `compilation.precision`
     with interrupts.raised(), _told_warnings():
         try:
             status = _run(arguments)

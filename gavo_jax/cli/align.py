@@ -13,7 +13,7 @@ from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import (
     Entry,

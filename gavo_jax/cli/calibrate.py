@@ -9,7 +9,7 @@ from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.cli.options import Calibrate
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible

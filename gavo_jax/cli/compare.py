@@ -12,7 +12,7 @@ from gavo_jax.cli.options import Compare
 from gavo_jax.cli.run_table import covered_in_part, path_and_end, why_no_drift
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
 from gavo_jax.comparison import peer_odometry
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED

@@ -10,9 +10,10 @@ from pathlib import Path
 import jax
 from packaging.requirements import Requirement
 
-from gavo_jax import compiler, presets
+from gavo_jax import presets
 from gavo_jax.cli.options import Doctor
-from gavo_jax.compilation_cache import cache_folder, enable_compilation_cache, why_not_private
+from gavo_jax.compilation import compiler
+from gavo_jax.compilation.cache import cache_folder, enable_compilation_cache, why_not_private
 from gavo_jax.datasets import registry
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.screen import say

@@ -10,7 +10,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Experiment
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.errors import GavoError, printable, read_text
 from gavo_jax.experiments.distinction import tell_apart
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor

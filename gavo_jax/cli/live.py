@@ -12,7 +12,8 @@ from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
+from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.devices import open_device
 from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
@@ -31,7 +32,6 @@ from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
-from gavo_jax.waits import Stopwatch
 
 NOT_LIVE = "not with the live source '{}': record it and run over that"
 

@@ -16,7 +16,7 @@ from gavo_jax.cli.selection import (
     with_shortcuts,
     with_whole_paths,
 )
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.devices import is_live

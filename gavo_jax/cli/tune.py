@@ -9,7 +9,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Tune
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.tuning import Choice, Tuning, read_tuning, without_password
 from gavo_jax.experiments.tuning import tune as search

@@ -10,7 +10,7 @@ import numpy as np
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.compilation_cache import enable_compilation_cache
+from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible

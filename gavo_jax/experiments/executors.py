@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import jax
 
 from gavo_jax.comparison import peer_odometry
+from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
@@ -25,7 +26,6 @@ from gavo_jax.odometry.run import run_odometry, trajectory_of
 from gavo_jax.output.files import environment
 from gavo_jax.peers import make_peer
 from gavo_jax.settings import Settings
-from gavo_jax.waits import Stopwatch
 
 Row = dict[str, Any]
 

@@ -21,6 +21,8 @@ from jaxtyping import Float64
 
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
+from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.rectified import rectified
@@ -31,9 +33,7 @@ from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.stream import decoded
 from gavo_jax.odometry.tracking import Clock, TrackerState, first_state, track_frame
-from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings
-from gavo_jax.waits import Stopwatch
 
 Register = Callable[[Frame | FrameError, float], list[Step | None]]
 

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
-from gavo_jax.precision import in_32_bits
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -19,9 +19,9 @@ from gavo_jax.alignment.repetition import another_period_is_in_reach
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.alignment.stacking import Images
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.image.motion_compensation import CompensatedImages
 from gavo_jax.mapping.candidates import MOST, LoopCandidate
-from gavo_jax.precision import in_32_bits
 from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton

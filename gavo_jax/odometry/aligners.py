@@ -22,10 +22,10 @@ from gavo_jax.alignment.result import Alignment, on_host, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Seen
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
-from gavo_jax.precision import in_32_bits
 from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus

@@ -16,6 +16,8 @@ from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
+from gavo_jax.compilation.precision import in_32_bits
+from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import (
     Frame,
     FrameError,
@@ -35,12 +37,10 @@ from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.way import Way
-from gavo_jax.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
-from gavo_jax.waits import Stopwatch
 
 
 @dataclass(frozen=True)

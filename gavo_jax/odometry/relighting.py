@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Integer
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.evidence import compare, seen_level, view_of
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.sampling import Target
@@ -24,7 +25,6 @@ from gavo_jax.objective.points import Reference
 from gavo_jax.odometry.aligners import Attempt, FrameSearch
 from gavo_jax.odometry.second_thoughts import SecondThought
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.settings import Settings
 
 UNEXPLAINED = 0.7

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from gavo_jax.alignment.result import Alignment
+from gavo_jax.compilation.precision import in_32_bits
+from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
@@ -19,13 +21,11 @@ from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before, run_identity
 from gavo_jax.odometry.stream import track, unwatched
-from gavo_jax.precision import in_32_bits
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
-from gavo_jax.waits import Stopwatch
 
 if TYPE_CHECKING:
     from gavo_jax.scene_map import SceneMap

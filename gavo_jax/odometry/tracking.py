@@ -16,6 +16,7 @@ from gavo_jax.alignment.search import Population, align_views
 from gavo_jax.alignment.sway import Swaying, VelocityChange
 from gavo_jax.alignment.visits import Exchanged, levels_of, prepare_target
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid, halve_inverse_depth
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.synchronisation import synchronise_depth
@@ -23,7 +24,6 @@ from gavo_jax.image.warp import Points, warp
 from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
 from gavo_jax.odometry.exposure import Exposure, relight
 from gavo_jax.odometry.plausibility import Usual, judge_by_history
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 

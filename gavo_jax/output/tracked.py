@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+from gavo_jax.compilation.waits import Stopwatch, told_of_waits
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import tell
 from gavo_jax.interrupts import interruptible
@@ -12,7 +13,6 @@ from gavo_jax.odometry.run import RunOutcome, finish_run
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.screen import pair_progress
 from gavo_jax.viewer.base import NO_VIEWER, Viewer
-from gavo_jax.waits import Stopwatch, told_of_waits
 
 
 class Tracked(NamedTuple):

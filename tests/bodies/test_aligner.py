@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from carded import CAMERA, FRAMES, TRACKED, Carded, beliefs, view
 
-from gavo_jax import program_cache
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.bodies.aligner import SUSPECTED, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief
@@ -19,6 +18,7 @@ from gavo_jax.bodies.evidence import gather_evidence
 from gavo_jax.bodies.identity import BodyTracks, associate, body_components
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import MotionSegmenter
+from gavo_jax.compilation import programs
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.odometry.aligners import Attempt
@@ -106,13 +106,13 @@ def test_a_strong_body_before_a_plain_room_does_not_take_the_camera_along_from_t
 def test_no_frame_after_the_warm_up_waits_for_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kept programs are compiled once for each kind of input, wherever that lies."""
     sequence, odometry = Carded(), Odometry(CAMERA, TRACKED)
-    monkeypatch.setattr(program_cache, "_loaded", {})
+    monkeypatch.setattr(programs, "_loaded", {})
     odometry.warm_up()
-    before = set(program_cache._loaded)
+    before = set(programs._loaded)
     assert {"_look", "track_frame"} <= {function.__name__ for function, *_ in before}
     for index in range(3):
         odometry.register(sequence[index], index / 30)
-    assert set(program_cache._loaded) == before
+    assert set(programs._loaded) == before
 
 
 def test_a_camera_that_moves_fast_finds_no_bodies_where_nothing_moves(data_dir: Path) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from command import Done, runner
 
-from gavo_jax import compiler, presets
+from gavo_jax import presets
+from gavo_jax.compilation import compiler
 from gavo_jax.datasets import registry
 from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__

@@ -11,8 +11,8 @@ from carded import Carded
 from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER, Altered, Told, errors, run
 from flicker import flickering, followed
 
-from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.compilation import programs
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
@@ -131,13 +131,13 @@ def clock_of(pair: list[Frame]) -> Clock:
 def test_a_camera_does_not_wait_for_the_light(monkeypatch: pytest.MonkeyPatch, room: SyntheticSequence) -> None:
     """The program that looks at it took two seconds in the middle of a run."""
     odometry = Odometry(CAMERA, Settings(SOLVER, odometry=RELIT))
-    monkeypatch.setattr(program_cache, "_loaded", {})
+    monkeypatch.setattr(programs, "_loaded", {})
     odometry.warm_up(wholly=True)
-    before = set(program_cache._loaded)
+    before = set(programs._loaded)
     for index in range(4):
         odometry.register(flickering(index, room[index]), room[index].timestamp)
     assert {"_with_light", "track_frame"} <= {function.__name__ for function, *_ in before}
-    assert set(program_cache._loaded) == before
+    assert set(programs._loaded) == before
 
 
 def test_where_nothing_is_seen_twice_nothing_is_known_of_the_light(room: SyntheticSequence) -> None:

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from gavo_jax import program_cache
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.compilation import programs
+from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry
@@ -18,7 +19,6 @@ from gavo_jax.odometry.second_thoughts import Recovering
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output import screen
 from gavo_jax.output.tracked import track_visibly
-from gavo_jax.program_cache import CachedProgram
 from gavo_jax.status import AlignmentStatus
 from tests.small import CAMERA, Rendered, StandIn
 
@@ -52,7 +52,7 @@ def rendered() -> Rendered:
 @pytest.fixture(autouse=True)
 def _anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """No program is kept from an earlier test."""
-    monkeypatch.setattr(program_cache, "_folder", None)
+    monkeypatch.setattr(programs, "_folder", None)
 
 
 def test_what_is_compiled_on_the_way_is_said_and_does_not_slow_the_run(monkeypatch: pytest.MonkeyPatch) -> None:

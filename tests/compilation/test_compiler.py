@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from jax._src import compilation_cache
 
-from gavo_jax import compiler
-from gavo_jax.compiler import CompilerWarning, prepare_process, processor_digest, unfit_compiler
+from gavo_jax.compilation import compiler
+from gavo_jax.compilation.compiler import CompilerWarning, prepare_process, processor_digest, unfit_compiler
 
 
 @pytest.fixture

@@ -26,8 +26,8 @@ import numpy as np
 from jax import export
 from jax.core import Tracer
 
+from gavo_jax.compilation.waits import counted_wait
 from gavo_jax.errors import GavoError, write_bytes
-from gavo_jax.waits import counted_wait
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -226,7 +226,7 @@ def _known(code: Any) -> str:
 def _made_from() -> bytes:
     """Digest of this package's code and of what it is traced with."""
     digest = hashlib.sha256(repr([platform.python_version(), *map(version, TRACED_WITH)]).encode())
-    folder = Path(__file__).parent
+    folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
     return digest.digest()

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import jax
 
-from gavo_jax.compiler import processor_digest
+from gavo_jax.compilation.compiler import processor_digest
+from gavo_jax.compilation.programs import keep_programs_in
 from gavo_jax.errors import GavoWarning
-from gavo_jax.program_cache import keep_programs_in
 
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 

@@ -12,12 +12,12 @@ import jax
 import pytest
 from small import CAMERA
 
-from gavo_jax import program_cache
-from gavo_jax.compilation_cache import enable_compilation_cache, why_not_private
+from gavo_jax.compilation import programs
+from gavo_jax.compilation.cache import enable_compilation_cache, why_not_private
+from gavo_jax.compilation.programs import keep_programs_in
 from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoWarning
-from gavo_jax.program_cache import keep_programs_in
 
 NOBODY = 65534
 
@@ -80,7 +80,7 @@ def test_where_others_can_write_nothing_is_kept_and_one_warning_says_so(tmp_path
     with pytest.warns(GavoWarning) as said:
         enable_compilation_cache(folder)
     assert len(said) == 1 and str(folder) in str(said[0].message) and "nothing is kept" in str(said[0].message)
-    assert program_cache._folder is None and jax.config.values["jax_compilation_cache_dir"] == before
+    assert programs._folder is None and jax.config.values["jax_compilation_cache_dir"] == before
 
 
 @pytest.mark.parametrize("mask", [0o000, 0o002, 0o022])
@@ -91,7 +91,7 @@ def test_a_folder_of_ones_own_is_private_whatever_the_mask(tmp_path, mask):
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 enable_compilation_cache(tmp_path / "cache")
-            assert program_cache._folder == tmp_path / "cache" / "traced"
+            assert programs._folder == tmp_path / "cache" / "traced"
             (tmp_path / "cache" / "traced" / "program").touch()
     finally:
         os.umask(previous)
@@ -112,7 +112,7 @@ def test_no_folder_is_no_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         enable_compilation_cache(tmp_path / "file" / "cache")
-    assert program_cache._folder is None
+    assert programs._folder is None
 
 
 def test_the_command_goes_on_with_one_line(tmp_path):

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from jax import export
 
-from gavo_jax import AlignmentOptions, AlignmentStatus, Camera, presets, program_cache
+from gavo_jax import AlignmentOptions, AlignmentStatus, Camera, presets
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.compilation import programs
+from gavo_jax.compilation.programs import CachedProgram, Foreign, identify, keep_programs_in
+from gavo_jax.compilation.waits import Stopwatch, told_of_waits
 from gavo_jax.image.warp import Points
 from gavo_jax.objective.losses import geman_mcclure, huber
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.presets import METHODS, PRESETS
-from gavo_jax.program_cache import CachedProgram, Foreign, identify, keep_programs_in
-from gavo_jax.waits import Stopwatch, told_of_waits
 
 OPTIONS = AlignmentOptions(points=100)
 NUMBERS = np.arange(4, dtype=np.float32)
@@ -93,7 +94,7 @@ def test_its_own_results_are_no_new_program(folder: Path) -> None:
     for _ in range(3):
         result = program(result.doubled, OPTIONS)
     assert traces == 1
-    assert len(program_cache._loaded) == 1
+    assert len(programs._loaded) == 1
 
 
 def test_functions_of_one_name_are_different_programs(folder: Path) -> None:
@@ -157,7 +158,7 @@ def test_jax_settings_that_change_within_a_process_tell_programs_apart(folder: P
 def test_changed_code_is_traced_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program(NUMBERS, OPTIONS)
     start_anew(folder)
-    monkeypatch.setattr(program_cache, "_made_from", lambda: b"another version")
+    monkeypatch.setattr(programs, "_made_from", lambda: b"another version")
     program(NUMBERS, OPTIONS)
     assert traces == 2
     start_anew(folder)
@@ -168,23 +169,23 @@ def test_changed_code_is_traced_anew(folder: Path, monkeypatch: pytest.MonkeyPat
 
 def test_the_digest_of_the_code_covers_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def digest() -> bytes:
-        program_cache._made_from.cache_clear()
-        return program_cache._made_from()
+        programs._made_from.cache_clear()
+        return programs._made_from()
 
-    (tmp_path / "sub").mkdir()
-    for name in ("here.py", "sub/module.py"):
+    for name in ("here/programs.py", "sub/module.py"):
+        (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(program_cache, "__file__", str(tmp_path / "here.py"))
+    monkeypatch.setattr(programs, "__file__", str(tmp_path / "here/programs.py"))
     seen = {digest(), digest()}
     assert len(seen) == 1
     (tmp_path / "sub/module.py").write_text("x = 2\n")
     seen.add(digest())
     (tmp_path / "sub/module.py").rename(tmp_path / "sub/renamed.py")
     seen.add(digest())
-    monkeypatch.setattr(program_cache, "version", lambda name: "0.0.1")
+    monkeypatch.setattr(programs, "version", lambda name: "0.0.1")
     seen.add(digest())
     assert len(seen) == 4
-    program_cache._made_from.cache_clear()
+    programs._made_from.cache_clear()
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:-100], lambda data: data[:50] + b"x" * 100])

@@ -15,8 +15,8 @@ import pytest
 from small import CAMERA, GENETIC
 
 import gavo_jax as gavo
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.synthetic import SyntheticSequence
-from gavo_jax.precision import in_32_bits
 
 FRAMES = SyntheticSequence(frames=4, camera=CAMERA)
 SETTINGS = replace(GENETIC, odometry=replace(GENETIC.odometry, bodies="mask"))
@@ -29,7 +29,7 @@ def test_results_are_those_of_32_bits(tmp_path: Path, wanted: list[np.ndarray]) 
         "import jax; assert jax.numpy.zeros(1).dtype == np.float64\n"
         "np.savez(sys.argv[1], *results()); assert jax.numpy.zeros(1).dtype == np.float64"
     )
-    places = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    places = os.pathsep.join([*map(str, Path(__file__).parents[:2]), os.environ.get("PYTHONPATH", "")])
     outside = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": places}
     subprocess.run([sys.executable, "-c", program, str(tmp_path / "found.npz")], env=outside, check=True)
     with np.load(tmp_path / "found.npz") as found:

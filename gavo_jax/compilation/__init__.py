@@ -1,0 +1,1 @@
+"""Which JAX is fit, how its programs are made, where they are kept, and how long they are waited for."""
