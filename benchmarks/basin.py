@@ -36,7 +36,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.output import plots
 from gavo_jax.output.screen import number
-from gavo_jax.peers import PEERS, make_peer
+from gavo_jax.peers.registry import PEERS, make_peer
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 

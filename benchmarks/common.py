@@ -19,7 +19,6 @@ import tyro
 
 from gavo_jax import presets
 from gavo_jax.camera import Camera
-from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.compilation.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
@@ -32,7 +31,8 @@ from gavo_jax.output import plots, screen
 from gavo_jax.output.files import environment, prepare_folder, write_json
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.comparison import peer_odometry
+from gavo_jax.peers.registry import PEERS
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory
 

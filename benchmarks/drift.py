@@ -27,7 +27,7 @@ from records import Record, read_record
 from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output import plots
 from gavo_jax.output.screen import number
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.registry import PEERS
 
 TITLE = "drift on "
 METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers()

@@ -48,7 +48,7 @@ from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.output.screen import number
 from gavo_jax.output.tracked import track_visibly
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.registry import PEERS
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse

@@ -11,7 +11,6 @@ from gavo_jax import presets
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.run_table import covered_in_part, path_and_end, why_no_drift
 from gavo_jax.cli.selection import MAX_SEED, open_sequence
-from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
@@ -45,7 +44,8 @@ from gavo_jax.output.files import (
 from gavo_jax.output.report import REPORT, Picture, Table, write_report
 from gavo_jax.output.screen import DASH, known_columns, number, print_table, say, waiting
 from gavo_jax.output.tracked import track_visibly
-from gavo_jax.peers import PEERS, make_peer
+from gavo_jax.peers.comparison import peer_odometry
+from gavo_jax.peers.registry import PEERS, make_peer
 from gavo_jax.trajectory import Trajectory
 
 COLUMNS = (

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
 from gavo_jax import presets
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.registry import PEERS
 
 METHODS = (*presets.METHODS, *presets.plugin_names())
 Method = Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")]

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import jax
 
-from gavo_jax.comparison import peer_odometry
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError
@@ -24,7 +23,8 @@ from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.metrics import Metrics, compute_metrics
 from gavo_jax.odometry.run import run_odometry, trajectory_of
 from gavo_jax.output.files import environment
-from gavo_jax.peers import make_peer
+from gavo_jax.peers.comparison import peer_odometry
+from gavo_jax.peers.registry import make_peer
 from gavo_jax.settings import Settings
 
 Row = dict[str, Any]

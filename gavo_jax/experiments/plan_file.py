@@ -28,7 +28,7 @@ from gavo_jax.experiments.values import (
     whole_of,
 )
 from gavo_jax.mapping.pose_graph import require_gtsam
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.registry import PEERS
 from gavo_jax.presets import PRESETS
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import flatten, override, refuse_unknown, refuse_unknown_method

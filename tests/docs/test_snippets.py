@@ -26,7 +26,7 @@ from gavo_jax.cli.selection import choose_settings
 from gavo_jax.datasets.download import folder_of
 from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.tuning import read_tuning
-from gavo_jax.peers import PEERS
+from gavo_jax.peers.registry import PEERS
 
 FRAMES = 6
 WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-from gavo_jax.peer import PeerResult, check_size, failure, result_of
+from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 from gavo_jax.trajectory import inverse
 
 NEAREST, FARTHEST = 0.4, 5.0

@@ -12,7 +12,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.tracking import Clock
-from gavo_jax.peers import Peer, make_peer
+from gavo_jax.peers.registry import Peer, make_peer
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 
@@ -51,7 +51,7 @@ class PeerAligner:
 
 
 def peer_odometry(name: str, camera: Camera) -> Odometry:
-    """The driver with the peer of that name (`peers.PEERS`), for frames of a rectified camera.
+    """The driver with the peer of that name (`peers.registry.PEERS`), for frames of a rectified camera.
 
     Raises:
         GavoError: no such peer, or its library cannot be imported.

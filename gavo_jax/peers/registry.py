@@ -16,14 +16,14 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.cloud_peers import KissIcpPeer, SmallGicpPeer
 from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
-from gavo_jax.feature_peers import FeaturePeer
 from gavo_jax.features import FeatureKind
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
-from gavo_jax.peer import Peer, PeerResult, check_size, failure, result_of
+from gavo_jax.peers.base import Peer, PeerResult, check_size, failure, result_of
+from gavo_jax.peers.clouds import KissIcpPeer, SmallGicpPeer
+from gavo_jax.peers.features import FeaturePeer
 
 
 class OpenCVPeer:

@@ -29,7 +29,7 @@ class Peer(Protocol):
     """An odometry of another library, ready for frames of one camera.
 
     Attributes:
-        name: key in `peers.PEERS`.
+        name: key in `peers.registry.PEERS`.
         versions: of the libraries behind it, for the records of a run.
     """
 

@@ -5,7 +5,7 @@ import cv2
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import FeatureKind, Features, detect, solve_motion
-from gavo_jax.peer import PeerResult, check_size, failure, result_of
+from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 
 
 class FeaturePeer:

@@ -12,7 +12,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.peers import PEERS, Peer, make_peer
+from gavo_jax.peers.registry import PEERS, Peer, make_peer
 from gavo_jax.trajectory import inverse
 
 CAMERA = Camera(fx=260.0, fy=258.0, cx=159.5, cy=119.5, width=320, height=240)

@@ -1,0 +1,1 @@
+"""Other libraries' odometries in the same terms, behind the same driver."""
