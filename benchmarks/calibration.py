@@ -22,8 +22,8 @@ from scipy.stats import chi2
 
 from gavo_jax.alignment.pairs import align
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.sensor_noise import KINECT, NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.output.screen import number
 from gavo_jax.se3 import log

@@ -23,7 +23,7 @@ from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.compilation.compiler import processor
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS, ROTATION_DRIFT

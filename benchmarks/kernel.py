@@ -33,7 +33,7 @@ import numpy as np
 from gavo_jax.alignment.fitting import objectives_of
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import Pyramid, build_pyramid
 from gavo_jax.objective.error import Objective, Residuals, lane_sum

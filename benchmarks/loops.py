@@ -29,7 +29,7 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import absolute_trajectory_error
 from gavo_jax.mapping.correction import correct

@@ -39,9 +39,9 @@ from moving_clips import LOOKS, CardClip
 from gavo_jax.bodies.records import Body
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.datasets.bodies_truth import WithBodies
-from gavo_jax.datasets.moving import body_of_part
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.bodies_truth import WithBodies
+from gavo_jax.datasets.rendered.moving import body_of_part
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import relative_pose_error, rotation_angle
 from gavo_jax.odometry.driver import Step

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from gavo_jax.datasets.actors import turn
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.datasets.moving import BodyTruth
+from gavo_jax.datasets.rendered.actors import turn
+from gavo_jax.datasets.rendered.moving import BodyTruth
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import inverse
 

@@ -28,8 +28,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.sensor_noise import KINECT
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import KINECT
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.experiments.together import track_together

@@ -13,7 +13,7 @@ from gavo_jax.bodies.belief import Belief, form_belief
 from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.settings import OdometryOptions, Settings

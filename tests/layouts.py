@@ -9,7 +9,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.depth_unit import KINECT_STEP
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.trajectory import quaternion_from_rotation
 

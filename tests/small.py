@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.objective.losses import l2
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton

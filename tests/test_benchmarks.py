@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from small import CAMERA, NEWTON, Rendered
 
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.odometry.metrics import DRIFT

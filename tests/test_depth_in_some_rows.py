@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.frame_checks import Finding, History, Use, check_frame, check_images
 from gavo_jax.inspection import inspect_sequence
 from gavo_jax.status import AlignmentStatus as Status

@@ -14,7 +14,7 @@ from gavo_jax import presets
 from gavo_jax.cli import main
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.selection import choose_settings
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.status import AlignmentStatus
 
 FOLDER = Path(__file__).parent.parent / "examples"

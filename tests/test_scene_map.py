@@ -11,8 +11,8 @@ from small import CAMERA
 
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun

@@ -7,7 +7,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 
 SYNTHETIC = "synthetic"

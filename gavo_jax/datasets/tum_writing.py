@@ -10,7 +10,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.bodies_truth import MASKS, WithBodies, write_mask, write_truth
+from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mask, write_truth
 from gavo_jax.errors import GavoError
 
 

@@ -11,7 +11,7 @@ from gavo_jax.alignment.pairs import align
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 
 FRAMES = (0, 1, 8, 9, 14, 15, 22, 23)
 Images = tuple[np.ndarray, np.ndarray]

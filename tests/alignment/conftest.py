@@ -5,8 +5,8 @@ from aligning import FRAMES
 from small import CAMERA
 
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 
 
 @pytest.fixture(scope="session")

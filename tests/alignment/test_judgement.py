@@ -13,7 +13,7 @@ from gavo_jax.alignment.information import Information
 from gavo_jax.alignment.judgement import Examination, find_against
 from gavo_jax.alignment.pairs import align
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.objective.derivatives import Linearization
 from gavo_jax.objective.error import Scales
 from gavo_jax.objective.estimates import ExplainedShare

@@ -8,7 +8,7 @@ from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
 from gavo_jax.alignment.result import no_alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.rigid_motions import exp, length_and_angle
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse

@@ -17,7 +17,7 @@ from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.se3 import exp
 from gavo_jax.solvers.gauss_newton import GaussNewton

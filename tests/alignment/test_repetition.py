@@ -10,7 +10,7 @@ from small import ALONE, CAMERA
 import gavo_jax as gavo
 from gavo_jax import se3
 from gavo_jax.alignment.repetition import another_period_fits_expected, another_period_is_in_reach, repetitions
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 
 SETTINGS = replace(gavo.preset("gauss-newton"), odometry=ALONE)
 DISTANCE = 1.5

@@ -3,7 +3,7 @@
 import numpy as np
 from aligning import run
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.status import AlignmentStatus
 
 

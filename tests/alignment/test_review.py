@@ -11,8 +11,8 @@ from small import CAMERA, NEWTON
 from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.status import AlignmentStatus, bit
 
 

@@ -10,7 +10,7 @@ from gavo_jax import presets
 from gavo_jax.alignment.pairs import align
 from gavo_jax.alignment.visits import visited_levels
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.settings import AlignmentOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus

@@ -13,7 +13,7 @@ from gavo_jax.alignment.pairs import align, align_batch
 from gavo_jax.alignment.stacking import stacked_images
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.settings import AlignmentOptions, Settings

@@ -8,8 +8,8 @@ import pytest
 from small import Rendered
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.image.shutter import Shutter, delay, row_time, twist_flow
 from gavo_jax.image.warp import Points, warp
 from gavo_jax.odometry.run import OdometryRun, run_odometry

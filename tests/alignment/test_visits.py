@@ -6,7 +6,7 @@ import numpy as np
 
 from gavo_jax.alignment.visits import prepare_pair, stack_levels
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.settings import AlignmentOptions

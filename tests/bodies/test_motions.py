@@ -15,7 +15,7 @@ from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.identity import BodyTracks, associate
 from gavo_jax.bodies.records import Seen, in_world
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.stream import track

@@ -7,7 +7,7 @@ import pytest
 from carded import CAMERA, TRACKED, Carded
 
 from gavo_jax.bodies.scene import MotionSegmenter
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry

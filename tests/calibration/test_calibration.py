@@ -19,8 +19,8 @@ from gavo_jax.cli.calibrate import calibration_of, in_all
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.depth_unit import KINECT_STEP
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.se3 import exp
 from gavo_jax.trajectory import Trajectory

@@ -14,8 +14,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.devices import register_device
 from gavo_jax.datasets.live import LiveImages
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.scene_map import build_map

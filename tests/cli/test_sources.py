@@ -15,8 +15,8 @@ from recordings import COLOR, DEPTH, KINDS, Shot, record
 
 from gavo_jax.cli.options import Source
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.datasets.sensor_noise import KINECT
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import KINECT
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.trajectory import Trajectory
 

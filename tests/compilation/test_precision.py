@@ -16,7 +16,7 @@ from small import CAMERA, GENETIC
 
 import gavo_jax as gavo
 from gavo_jax.compilation.precision import in_32_bits
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 
 FRAMES = SyntheticSequence(frames=4, camera=CAMERA)
 SETTINGS = replace(GENETIC, odometry=replace(GENETIC.odometry, bodies="mask"))

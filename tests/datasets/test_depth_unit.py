@@ -8,9 +8,9 @@ from layouts import CAMERA, LAYOUTS, METRES, image, kinect, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
+from gavo_jax.datasets.rendered.sensor_noise import KINECT
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.selection import open_part
-from gavo_jax.datasets.sensor_noise import KINECT
-from gavo_jax.datasets.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 
 FR1 = Camera.preset("fr1")

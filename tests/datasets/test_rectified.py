@@ -8,8 +8,8 @@ import numpy as np
 from small import CAMERA, NEWTON
 
 from gavo_jax.datasets.rectified import rectified, without_distortion
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 

@@ -38,7 +38,7 @@ def test_links_of_the_site_stay_in_it(page: Path) -> None:
 def test_the_reference_has_every_public_name() -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     documented = re.findall(r"^::: gavo_jax\.([\w.]+)$", pages, re.MULTILINE)
-    actors = [f"datasets.actors.{name}" for name in ("box", "figure", "Sway", "Walk", "Swing")]
+    actors = [f"datasets.rendered.actors.{name}" for name in ("box", "figure", "Sway", "Walk", "Swing")]
     returned = ["evaluation.RelativePoseError", "evaluation.ErrorSeries", "bodies.records.Body"]
     public = [*names_of(gavo), *(f"solvers.{name}" for name in names_of(gavo.solvers))]
     assert sorted(documented) == sorted([*public, *actors, *returned])

@@ -13,8 +13,8 @@ from small import CAMERA, NEWTON
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.sensor_noise import KINECT
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import KINECT
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.experiments.sharding import align_batch_sharded
 from gavo_jax.solvers.genetic import GeneticAlgorithm
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from small import CAMERA
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import batches, frames_of

@@ -12,7 +12,7 @@ import pytest
 
 from gavo_jax import presets
 from gavo_jax.cli import main
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments import executors, tuning
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, git_state

@@ -16,8 +16,8 @@ from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.sensor_noise import KINECT
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import KINECT
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.experiments import together
 from gavo_jax.experiments.executors import LocalExecutor
 from gavo_jax.experiments.plan import Plan

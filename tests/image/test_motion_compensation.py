@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.motion_compensation import compensate_motion, filled_inverse_depth, halve_depth
 
 CAMERA = replace(Camera.preset("icl").level(2), readout=0.03)

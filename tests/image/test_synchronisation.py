@@ -9,8 +9,8 @@ from seen import CAMERA, plane
 from twists import hat, twists
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.synchronisation import synchronise_depth
 

@@ -9,7 +9,7 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import MOST_AHEAD, BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper

@@ -11,8 +11,8 @@ from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.bodies.records import Body, Seen
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.motion_compensation import compensate_motion
 from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures

@@ -4,7 +4,7 @@ import pytest
 from driving import CAMERA, FRAMES, run
 from small import Rendered
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.run import OdometryRun
 
 

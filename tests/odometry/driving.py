@@ -9,7 +9,7 @@ from small import StandIn
 
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.run import OdometryRun, run_odometry
 from gavo_jax.odometry.tracking import Clock

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from driving import CAMERA, SEARCH_ALONE
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Odometry
 
 

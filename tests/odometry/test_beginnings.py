@@ -10,8 +10,8 @@ from small import Rendered, StandIn
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies.records import Seen
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.beginnings import PROVEN_AFTER, Beginning, begun, followed, revised_by
 from gavo_jax.odometry.driver import Odometry, Step

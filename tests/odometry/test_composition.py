@@ -8,7 +8,7 @@ from driving import CAMERA, PLAIN, SEARCH_ALONE, SOLVER
 
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.rival import WithRival
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.composition import wide_search
 from gavo_jax.odometry.driver import Odometry

@@ -14,8 +14,8 @@ from small import Rendered
 from gavo_jax.alignment.pairs import align
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, rectified

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from driving import FRAMES, Altered, errors, known, run
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import Solution
 from gavo_jax.odometry.driver import Step

@@ -12,7 +12,7 @@ import pytest
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.odometry.aligners import Attempt

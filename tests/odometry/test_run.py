@@ -9,7 +9,7 @@ import small
 from driving import Altered, errors, known, run
 from small import Rendered
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry

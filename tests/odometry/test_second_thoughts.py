@@ -6,7 +6,7 @@ from driving import CAMERA, SEARCH_ALONE, Told, found
 from small import Rendered
 
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.datasets.sensor_noise import NONE
+from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.odometry.aligners import BEGINNING
 from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry

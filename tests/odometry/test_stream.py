@@ -10,7 +10,7 @@ import jax
 from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, Altered, run, unreadable
 
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.stream import track
 

@@ -12,8 +12,8 @@ from small import Rendered
 
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.sensor_noise import NONE
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.sensor_noise import NONE
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.warp import Points
 from gavo_jax.objective.points import make_references, move_reference

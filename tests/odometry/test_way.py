@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small import ALONE, CAMERA
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.way import Way
 from gavo_jax.rigid_motions import exp, length_and_angle

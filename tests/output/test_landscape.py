@@ -6,7 +6,7 @@ import numpy as np
 from small import CAMERA
 
 from gavo_jax.alignment.pairs import align
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.output import drawing
 from gavo_jax.output.landscape import STEPS, error_landscape

@@ -18,7 +18,7 @@ import pytest
 from small import CAMERA, GENETIC
 
 from gavo_jax.cli import main, run
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.evaluation import distance_error
 from gavo_jax.output.plots import plot_distance_error, save
 from gavo_jax.output.report import Picture, Table, write_report

@@ -18,7 +18,7 @@ from small import CAMERA, GENETIC
 
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body
-from gavo_jax.datasets.synthetic import SyntheticSequence
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.stream import track

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from gavo_jax.datasets.moving import BodyTruth, body_of_part
+from gavo_jax.datasets.rendered.moving import BodyTruth, body_of_part
 from gavo_jax.trajectory import format_tum_row
 
 TRUTH, MASKS = "bodies_truth.csv", "masks"

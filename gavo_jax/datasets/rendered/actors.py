@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.moving import MovingBody, MovingPart, Path
-from gavo_jax.datasets.room import Box
+from gavo_jax.datasets.rendered.moving import MovingBody, MovingPart, Path
+from gavo_jax.datasets.rendered.room import Box
 from gavo_jax.errors import GavoError
 
 _STREAM = 3

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from gavo_jax.datasets.room import Box, Faces, Room, box_faces, build_room, shine
-from gavo_jax.datasets.textures import TEXTURES, Atlas, paint
+from gavo_jax.datasets.rendered.room import Box, Faces, Room, box_faces, build_room, shine
+from gavo_jax.datasets.rendered.textures import TEXTURES, Atlas, paint
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 

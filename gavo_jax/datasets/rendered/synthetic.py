@@ -15,18 +15,18 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.actors import builtin_bodies, turn
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
-from gavo_jax.datasets.rendering import render
-from gavo_jax.datasets.room import (
+from gavo_jax.datasets.rendered.actors import builtin_bodies, turn
+from gavo_jax.datasets.rendered.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
+from gavo_jax.datasets.rendered.rendering import render
+from gavo_jax.datasets.rendered.room import (
     HIGHEST_VIEW,
     LOWEST_VIEW,
     MARGIN_X,
     MARGIN_Y,
     free_space,
 )
-from gavo_jax.datasets.sensor_noise import KINECT, SensorNoise
+from gavo_jax.datasets.rendered.sensor_noise import KINECT, SensorNoise
 from gavo_jax.errors import GavoError
 from gavo_jax.image.shutter import row_time
 from gavo_jax.trajectory import Trajectory

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.room import Faces, Room
-from gavo_jax.datasets.textures import LEVELS, Atlas
+from gavo_jax.datasets.rendered.room import Faces, Room
+from gavo_jax.datasets.rendered.textures import LEVELS, Atlas
 
 _NEAR = 0.05
 _SEAM = 1e-4

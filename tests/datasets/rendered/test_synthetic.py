@@ -9,10 +9,10 @@ import pytest
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.rendering import render
-from gavo_jax.datasets.room import build_room, free_space
-from gavo_jax.datasets.sensor_noise import KINECT, NONE, SensorNoise
-from gavo_jax.datasets.synthetic import DEFAULT_CAMERA, SyntheticSequence, builtin_path
+from gavo_jax.datasets.rendered.rendering import render
+from gavo_jax.datasets.rendered.room import build_room, free_space
+from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE, SensorNoise
+from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence, builtin_path
 from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from gavo_jax.datasets.textures import Atlas, paint
+from gavo_jax.datasets.rendered.textures import Atlas, paint
 
 MARGIN_X, MARGIN_Y = 2.2, 1.75
 """Furniture stands within these distances (m) of the walls across x and across y; the middle of the room stays free."""

@@ -1,0 +1,1 @@
+"""Sequences that are rendered: rooms with textures and bodies that move, and what they truly are."""
