@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from command import runner
-from layouts import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, RTABMAP_STAMPS, image, raw
-from recordings import COLOR, DEPTH, Recorder, Shot, record
+from written_bags import COLOR, DEPTH, Recorder, Shot, record
+from written_folders import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, RTABMAP_STAMPS, image, raw
 
 SHOTS = [
     Shot(1 + i / 30, np.dstack([grey] * 3), raw(metres, 1000))

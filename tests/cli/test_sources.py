@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from command import GENETIC, Done, runner
-from layouts import CAMERA, LAYOUTS, POSES, image
-from recordings import COLOR, DEPTH, KINDS, Shot, record
+from written_bags import COLOR, DEPTH, KINDS, Shot, record
+from written_folders import CAMERA, LAYOUTS, POSES, image
 
 from gavo_jax.cli.options import Source
 from gavo_jax.cli.selection import open_sequence

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from layouts import CAMERA, LAYOUTS, METRES, image, kinect, raw
+from written_folders import CAMERA, LAYOUTS, METRES, image, kinect, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth

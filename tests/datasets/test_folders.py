@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from layouts import (
+from written_folders import (
     ARKIT_STAMPS,
     CAMERA,
     DEPTHS,
@@ -868,7 +868,7 @@ class Lines:
 
     @staticmethod
     def open(path: Path, reading: Reading) -> Sequence:
-        from layouts import ROOM
+        from written_folders import ROOM
 
         return ROOM
 

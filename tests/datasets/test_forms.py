@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from layouts import image
-from recordings import KINDS, Shot, record
+from written_bags import KINDS, Shot, record
+from written_folders import image
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import CAMERA, LASER_T_COLOR, POSES, loris_sensors, loris_transforms, open_loris
+from written_folders import CAMERA, LASER_T_COLOR, POSES, loris_sensors, loris_transforms, open_loris
 
 from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets.files import Reading

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from layouts import image
+from written_folders import image
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import POSES, RTABMAP_STAMPS, rtabmap, rtabmap_camera, rtabmap_export
+from written_folders import POSES, RTABMAP_STAMPS, rtabmap, rtabmap_camera, rtabmap_export
 
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.rtabmap import RtabMap

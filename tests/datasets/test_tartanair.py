@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from layouts import GREYS, METRES, image, packed, tartan_air, tartan_air_2, tartan_poses
+from written_folders import GREYS, METRES, image, packed, tartan_air, tartan_air_2, tartan_poses
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import FrameError

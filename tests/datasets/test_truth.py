@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, STRAY_STAMPS, image, raw
+from written_folders import CAMERA, DEPTHS, GREYS, LAYOUTS, METRES, POSES, STRAY_STAMPS, image, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.files import Reading

@@ -15,15 +15,15 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from layouts import CAMERA, GREYS, METRES
-from recordings import COLOR, COMPRESSIONS, DEPTH, KINDS, STYLES, Recorder, Shot, record
+from written_bags import COLOR, COMPRESSIONS, DEPTH, KINDS, STYLES, Recorder, Shot, record
+from written_folders import CAMERA, GREYS, METRES
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets import recording
-from gavo_jax.datasets.bags import BagSequence
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.messages import HALVED, LAYOUTS, color_of, depth_of
+from gavo_jax.datasets.recordings import recording
+from gavo_jax.datasets.recordings.bags import BagSequence
+from gavo_jax.datasets.recordings.messages import HALVED, LAYOUTS, color_of, depth_of
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 from gavo_jax.inspection import summary

@@ -17,7 +17,7 @@ from gavo_jax.camera_files.calibration import Calibration, Size, camera_from_tab
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.messages import (
+from gavo_jax.datasets.recordings.messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
@@ -28,9 +28,9 @@ from gavo_jax.datasets.messages import (
     is_calibrated,
     is_depth,
 )
-from gavo_jax.datasets.stamps import Topic
-from gavo_jax.datasets.topics import Images, are_of_two_cameras, choose, says_rectified, says_registered
-from gavo_jax.datasets.transforms import ANY_TOPIC, FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
+from gavo_jax.datasets.recordings.stamps import Topic
+from gavo_jax.datasets.recordings.topics import Images, are_of_two_cameras, choose, says_rectified, says_registered
+from gavo_jax.datasets.recordings.transforms import ANY_TOPIC, FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 
 SUFFIXES = (".bag", ".mcap", ".db3")

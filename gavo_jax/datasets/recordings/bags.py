@@ -17,10 +17,10 @@ from gavo_jax.datasets.assembly import MILLIMETRES, DepthImage, DepthUnit, Frame
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
 from gavo_jax.datasets.files import Reading, places_of_a_few
-from gavo_jax.datasets.messages import color_of, depth_of
-from gavo_jax.datasets.recording import METADATA, SUFFIXES, Bag, legible
-from gavo_jax.datasets.stamps import Topic, in_one_time, of_one_run, once
-from gavo_jax.datasets.topics import says_rectified
+from gavo_jax.datasets.recordings.messages import color_of, depth_of
+from gavo_jax.datasets.recordings.recording import METADATA, SUFFIXES, Bag, legible
+from gavo_jax.datasets.recordings.stamps import Topic, in_one_time, of_one_run, once
+from gavo_jax.datasets.recordings.topics import says_rectified
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, associate
 

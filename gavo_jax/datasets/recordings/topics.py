@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gavo_jax.datasets.messages import COMPRESSED, DEPTH_ENCODINGS, IMAGE, INFRARED, encoding_of, is_depth
+from gavo_jax.datasets.recordings.messages import COMPRESSED, DEPTH_ENCODINGS, IMAGE, INFRARED, encoding_of, is_depth
 from gavo_jax.errors import GavoError
 
 COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered", "depth_to_rgb", "depth_to_color")
