@@ -24,11 +24,11 @@ from gavo_jax.datasets.base import Frame as Frame
 from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence
 from gavo_jax.datasets.base import TimestampError as TimestampError
-from gavo_jax.datasets.devices import register_device as register_device
 from gavo_jax.datasets.files import Reading as Reading
-from gavo_jax.datasets.live import LiveImages as LiveImages
-from gavo_jax.datasets.live import Newest as Newest
-from gavo_jax.datasets.live import frame_of as frame_of
+from gavo_jax.datasets.live.devices import register_device as register_device
+from gavo_jax.datasets.live.frames import LiveImages as LiveImages
+from gavo_jax.datasets.live.frames import Newest as Newest
+from gavo_jax.datasets.live.frames import frame_of as frame_of
 from gavo_jax.datasets.registry import open_source as open_source
 from gavo_jax.datasets.registry import register_dataset as register_dataset
 from gavo_jax.datasets.rendered import actors as actors

@@ -15,8 +15,8 @@ from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, 
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.devices import open_device
-from gavo_jax.datasets.live import LiveDevice, LiveImages, Newest, frame_of
+from gavo_jax.datasets.live.devices import open_device
+from gavo_jax.datasets.live.frames import LiveDevice, LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible

@@ -19,7 +19,7 @@ from gavo_jax.cli.selection import (
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.devices import is_live
+from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import tell

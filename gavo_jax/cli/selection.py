@@ -7,8 +7,8 @@ from typing import Any
 from gavo_jax import presets
 from gavo_jax.cli.options import Run, SearchOptions, Source
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.devices import is_live
 from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.datasets.rendered.actors import MOST_BODIES
 from gavo_jax.datasets.selection import SYNTHETIC, open_part

@@ -12,8 +12,8 @@ from small import CAMERA, NEWTON
 from gavo_jax import presets
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.devices import register_device
-from gavo_jax.datasets.live import LiveImages
+from gavo_jax.datasets.live.devices import register_device
+from gavo_jax.datasets.live.frames import LiveImages
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError

@@ -10,8 +10,8 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.live import LiveImages, Newest, frame_of
-from gavo_jax.datasets.realsense import RealSense, camera_of
+from gavo_jax.datasets.live.frames import LiveImages, Newest, frame_of
+from gavo_jax.datasets.live.realsense import RealSense, camera_of
 from gavo_jax.errors import GavoError
 
 SIZE = (CAMERA.height, CAMERA.width)

@@ -7,7 +7,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.exports import sdk_distortion
-from gavo_jax.datasets.live import LiveImages
+from gavo_jax.datasets.live.frames import LiveImages
 from gavo_jax.errors import GavoError
 from gavo_jax.libusb import import_with_libusb
 

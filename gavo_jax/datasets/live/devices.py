@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from gavo_jax.datasets import realsense
-from gavo_jax.datasets.live import LiveDevice
+from gavo_jax.datasets.live import realsense
+from gavo_jax.datasets.live.frames import LiveDevice
 from gavo_jax.errors import GavoError
 
 _devices: dict[str, Callable[[], LiveDevice]] = {realsense.NAME: realsense.RealSense}

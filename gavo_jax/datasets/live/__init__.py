@@ -1,0 +1,1 @@
+"""Frames as a device gives them, the newest first."""
