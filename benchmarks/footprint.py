@@ -23,7 +23,7 @@ from typing import Any
 import common
 import numpy as np
 
-from gavo_jax.datasets.tum_writing import write_tum
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.output.screen import number
 

@@ -28,10 +28,10 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.sensor_noise import KINECT
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.experiments.together import track_together
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry

@@ -25,6 +25,8 @@ from gavo_jax.datasets.base import FrameError as FrameError
 from gavo_jax.datasets.base import Sequence as Sequence
 from gavo_jax.datasets.base import TimestampError as TimestampError
 from gavo_jax.datasets.files import Reading as Reading
+from gavo_jax.datasets.layouts.tum import TumSequence as TumSequence
+from gavo_jax.datasets.layouts.tum_writing import write_tum as write_tum
 from gavo_jax.datasets.live.devices import register_device as register_device
 from gavo_jax.datasets.live.frames import LiveImages as LiveImages
 from gavo_jax.datasets.live.frames import Newest as Newest
@@ -38,8 +40,6 @@ from gavo_jax.datasets.rendered.moving import MovingPart as MovingPart
 from gavo_jax.datasets.rendered.room import Box as Box
 from gavo_jax.datasets.rendered.sensor_noise import SensorNoise as SensorNoise
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence as SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence as TumSequence
-from gavo_jax.datasets.tum_writing import write_tum as write_tum
 from gavo_jax.errors import GavoError as GavoError
 from gavo_jax.errors import GavoWarning as GavoWarning
 from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error

@@ -125,8 +125,8 @@ def forty_frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A TUM folder of 160×120 pixels, which takes a second and a half to render: to be copied, no test changes it."""
     from small import CAMERA
 
+    from gavo_jax.datasets.layouts.tum_writing import write_tum
     from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-    from gavo_jax.datasets.tum_writing import write_tum
 
     folder = tmp_path_factory.mktemp("forty") / "clip"
     write_tum(SyntheticSequence(frames=40, camera=CAMERA), folder)

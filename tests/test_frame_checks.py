@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame, doubts_last_stamp
 from gavo_jax.status import AlignmentStatus as Status
 

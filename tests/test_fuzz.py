@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from gavo_jax.camera import MAX_SIDE, Camera
 from gavo_jax.camera_files.calibration import load_camera
-from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import batches
 from gavo_jax.experiments.plan_file import read_plan

@@ -9,8 +9,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.depth_unit import KINECT_STEP
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.trajectory import quaternion_from_rotation
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)

@@ -8,14 +8,20 @@ from typing import Any, Protocol
 
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.folders import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
-from gavo_jax.datasets.image_folders import COLOR_FOLDERS, DEPTH_FOLDERS, missing_folder, missing_images, missing_word
-from gavo_jax.datasets.openloris import OpenLoris
-from gavo_jax.datasets.phones import ArkitScenes, Record3D, StrayScan
+from gavo_jax.datasets.layouts.image_folders import (
+    COLOR_FOLDERS,
+    DEPTH_FOLDERS,
+    missing_folder,
+    missing_images,
+    missing_word,
+)
+from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.layouts.openloris import OpenLoris
+from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
+from gavo_jax.datasets.layouts.rtabmap import RtabMap
+from gavo_jax.datasets.layouts.tartanair import TartanAir
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.recordings.bags import BagSequence
-from gavo_jax.datasets.rtabmap import RtabMap
-from gavo_jax.datasets.tartanair import TartanAir
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError, blamed
 
 PLUGINS = "gavo_jax.datasets"

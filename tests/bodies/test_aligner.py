@@ -19,8 +19,8 @@ from gavo_jax.bodies.identity import BodyTracks, associate, body_components
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.compilation import programs
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track

@@ -15,8 +15,8 @@ from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.consensus import ask_area
 from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.image.sampling import Target

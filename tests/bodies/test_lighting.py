@@ -16,7 +16,7 @@ from gavo_jax.bodies.evidence import Compared, compare, view_of
 from gavo_jax.bodies.lighting import light_change
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.image.levels import Levels
 from gavo_jax.image.pyramid import build_pyramid
 from gavo_jax.presets import preset

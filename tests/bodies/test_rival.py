@@ -17,8 +17,8 @@ from gavo_jax.bodies.rival import OVER, RivalledState, Span, WithRival, _distanc
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.bodies.votes import vote
 from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step

@@ -21,9 +21,9 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.cli import compare, options, view
 from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.cli.usage import COMMANDS
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.sensor_noise import KINECT
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output import tracked

@@ -15,9 +15,9 @@ from written_folders import CAMERA, LAYOUTS, POSES, image
 
 from gavo_jax.cli.options import Source
 from gavo_jax.cli.selection import open_sequence
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.sensor_noise import KINECT
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.trajectory import Trajectory
 
 INFO = "/camera/color/camera_info"
@@ -255,7 +255,7 @@ def test_bodies_move_through_the_synthetic_room(gavo):
 
 def test_millimetres_with_a_benchmarks_camera_are_refused(gavo, data_dir, tmp_path):
     """What used to end with status 0 and a trajectory five times too short."""
-    from gavo_jax.datasets.tum import TumSequence
+    from gavo_jax.datasets.layouts.tum import TumSequence
 
     for frame in TumSequence(data_dir / "fr1_xyz", undistort=False)[:3]:
         image(tmp_path / f"fr1_mm/rgb/{frame.timestamp:.6f}.png", frame.grey)

@@ -15,8 +15,8 @@ from small import CAMERA
 from gavo_jax.compilation import programs
 from gavo_jax.compilation.cache import enable_compilation_cache, why_not_private
 from gavo_jax.compilation.programs import keep_programs_in
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoWarning
 
 NOBODY = 65534

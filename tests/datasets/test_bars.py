@@ -13,9 +13,9 @@ from gavo_jax.alignment.stacking import stacked_images
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.bars import RIM, without_bars
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.presets import preset
 

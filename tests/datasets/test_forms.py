@@ -14,8 +14,8 @@ from written_folders import image
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.presets import preset

@@ -12,7 +12,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading, open_pair
-from gavo_jax.datasets.folders import ScanNet
+from gavo_jax.datasets.layouts.numbered import ScanNet
 from gavo_jax.datasets.registration import Registration
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from small import CAMERA
 
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import batches, frames_of
 from gavo_jax.experiments.plan_file import read_plan

@@ -12,8 +12,8 @@ from small import StandIn
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, Step

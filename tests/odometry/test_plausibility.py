@@ -12,8 +12,8 @@ import pytest
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import MAX_DOUBTED, MAX_HELD, Odometry, Step

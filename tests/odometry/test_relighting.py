@@ -14,8 +14,8 @@ from flicker import flickering, followed
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.compilation import programs
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.odometry.aligners import BEGINNING, Attempt, FrameSearch
 from gavo_jax.odometry.composition import make_aligner
 from gavo_jax.odometry.driver import Odometry

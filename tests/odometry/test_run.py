@@ -9,8 +9,8 @@ import small
 from driving import Altered, errors, known, run
 from small import Rendered
 
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.run import OdometryRun, run_odometry

@@ -10,7 +10,7 @@ import pytest
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.peers.registry import PEERS, Peer, make_peer
 from gavo_jax.trajectory import inverse

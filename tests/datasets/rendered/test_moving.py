@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from gavo_jax.camera import Camera
+from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.actors import MOST_BODIES, Sway, box
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, TRUTH
 from gavo_jax.datasets.rendered.moving import BodyTruth, MovingBody, MovingPart
 from gavo_jax.datasets.rendered.room import Box
 from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 

@@ -9,12 +9,12 @@ import pytest
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.rendering import render
 from gavo_jax.datasets.rendered.room import build_room, free_space
 from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE, SensorNoise
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence, builtin_path
-from gavo_jax.datasets.tum import TumSequence
-from gavo_jax.datasets.tum_writing import write_tum
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation
 

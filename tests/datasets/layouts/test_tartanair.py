@@ -11,8 +11,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.images import read_depth
+from gavo_jax.datasets.layouts.tartanair import TartanAir
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.tartanair import TartanAir
 from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.inspection import summary
 

@@ -15,11 +15,11 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.folders import NumberedFolder, PlainFolder, of_each_frame
-from gavo_jax.datasets.image_folders import plain_files
 from gavo_jax.datasets.images import read_depth
+from gavo_jax.datasets.layouts.image_folders import plain_files
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_each_frame
+from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.names import Found, by_number
-from gavo_jax.datasets.pairing import Paired
 from gavo_jax.datasets.truth import Seconds, numbers_in, posed
 from gavo_jax.errors import GavoError, data_rows, read_text
 from gavo_jax.trajectory import Trajectory, inverse

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from written_folders import POSES, RTABMAP_STAMPS, rtabmap, rtabmap_camera, rtabmap_export
 
+from gavo_jax.datasets.layouts.rtabmap import RtabMap
 from gavo_jax.datasets.registry import open_source
-from gavo_jax.datasets.rtabmap import RtabMap
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 

@@ -27,11 +27,11 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.image_folders import passed_over, plain_files
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
+from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
+from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
+from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among
-from gavo_jax.datasets.nerf import TRANSFORMS, read_transforms
-from gavo_jax.datasets.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse

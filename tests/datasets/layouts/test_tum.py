@@ -15,7 +15,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, TimestampError
 from gavo_jax.datasets.files import open_pair
-from gavo_jax.datasets.tum import TumSequence
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 

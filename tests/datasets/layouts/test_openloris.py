@@ -8,7 +8,7 @@ from written_folders import CAMERA, LASER_T_COLOR, POSES, loris_sensors, loris_t
 
 from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.openloris import OpenLoris
+from gavo_jax.datasets.layouts.openloris import OpenLoris
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 

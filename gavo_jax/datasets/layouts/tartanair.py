@@ -13,8 +13,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import METRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.folders import NumberedFolder
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from gavo_jax.datasets.layouts.numbered import NumberedFolder
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.truth import in_order, numbers_in, posed
 from gavo_jax.errors import GavoError
