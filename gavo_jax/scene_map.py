@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -23,6 +22,7 @@ from gavo_jax.datasets.rectified import rectified, without_distortion
 from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
+from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
@@ -42,14 +42,8 @@ TRUNCATION = 6.0
 FARTHEST = 4.0
 """Metres: beyond, the noise of a structured-light or stereo camera exceeds several voxels."""
 
-BLOCK = 8
-"""Voxels along the side of a block."""
-
-MOST_BLOCKS = 100_000
-"""Blocks that a map may have, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
-
-LOOKED_AT = 4
-"""Pixels along either axis of which Open3D looks at one to find the blocks that a frame touches."""
+OFF_THE_GRID = 1e-6
+"""Metres added to depth: a surface that lies exactly on voxels would have no side for Open3D."""
 
 MIN_WEIGHT = 3.0
 """Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
@@ -163,26 +157,33 @@ class MapBuilder:
         self.frames += 1
         if not metres.any():
             return
-        depth, seen = image(metres), image(_with_looked_at_filled(metres))
+        metres = np.where(metres > 0, metres + np.float32(OFF_THE_GRID), metres)
+        seen, matrix = image_for_blocks(metres, self.camera, self.voxel)
+        depth, seen, by = image(metres), image(seen), core.Tensor(matrix)
         rgb = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=2) if frame.color is None else frame.color
         color = image(np.ascontiguousarray(rgb, np.float32))
         extrinsic = core.Tensor(inverse(world_T_camera))
         reach = (1.0, self.farthest, TRUNCATION)
-        blocks = self._grid.compute_unique_block_coordinates(seen, self._intrinsic, extrinsic, *reach)
-        blocks = self._within_memory(blocks)
+        blocks = self._grid.compute_unique_block_coordinates(seen, by, extrinsic, *reach)
+        blocks = self._within_memory(blocks, world_T_camera[:3, 3])
         if len(blocks):
             self._grid.integrate(blocks, depth, color, self._intrinsic, self._intrinsic, extrinsic, *reach)
 
-    def _within_memory(self, blocks: Any) -> Any:
-        """Blocks that may be touched: from the largest number on only those that are there."""
-        table = self._grid.hashmap()
+    def _within_memory(self, blocks: Any, place: Float[np.ndarray, " 3"]) -> Any:
+        """Blocks that may be touched: beyond the largest number those that are there, and of the others the nearest."""
+        table, core = self._grid.hashmap(), self._open3d.core
         if table.size() + len(blocks) <= MOST_BLOCKS:
             return blocks
-        _, known = table.find(blocks)
-        if table.size() + int((~known.numpy()).sum()) <= MOST_BLOCKS:
+        known = table.find(blocks)[1].numpy()
+        room = MOST_BLOCKS - table.size()
+        if int((~known).sum()) <= room:
             return blocks
         self.is_full = True
-        return blocks[known]
+        numbers = blocks.numpy()
+        distances = np.linalg.norm((numbers + 0.5) * (BLOCK * self.voxel) - place, axis=1)
+        new = np.flatnonzero(~known)
+        kept = np.concatenate([np.flatnonzero(known), new[np.argsort(distances[new], kind="stable")[:room]]])
+        return core.Tensor(numbers[kept])
 
     def extract(self, shape: Shape = "cloud", left_out: Iterable[str] = ()) -> SceneMap:
         """The surface as a cloud or a mesh; empty where nothing was seen often enough.
@@ -208,16 +209,6 @@ class MapBuilder:
         return SceneMap(
             points.astype(np.float64), colors, normals.astype(np.float64), triangles, self.frames, tuple(words)
         )
-
-
-def _with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth with a reading in every pixel in which Open3D looks for blocks, each fourth of each fourth row, if there is
-    one near it: a sensor may leave out just those rows.
-    """
-    filled, looked_at = metres.copy(), np.s_[::LOOKED_AT, ::LOOKED_AT]
-    near = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[looked_at]
-    filled[looked_at] = np.where(metres[looked_at] > 0, metres[looked_at], near)
-    return filled
 
 
 class LiveMap:
@@ -368,7 +359,8 @@ def check_shape(shape: str) -> None:
 
 def check_voxel(voxel: float) -> None:
     """Raise GavoError for a voxel that no map can have."""
-    if not isinstance(voxel, int | float | np.integer | np.floating) or not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+    is_number = isinstance(voxel, int | float | np.integer | np.floating) and not isinstance(voxel, bool)
+    if not is_number or not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
         raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel!r}")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small import CAMERA
 
+from gavo_jax import scene_map
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import NONE
@@ -20,7 +21,6 @@ from gavo_jax.scene_map import (
     LiveMap,
     MapBuilder,
     SceneMap,
-    _with_looked_at_filled,
     build_map,
     check_map,
     check_voxel,
@@ -53,7 +53,7 @@ def test_other_endings_are_refused(name, shape, words):
         check_map(name, shape)
 
 
-@pytest.mark.parametrize("voxel", [0.0, -1.0, float("nan"), 2.0, "1cm", None, [0.01]])
+@pytest.mark.parametrize("voxel", [0.0, -1.0, float("nan"), 2.0, "1cm", None, [0.01], True])
 def test_absurd_voxels_are_refused(voxel: Any) -> None:
     with pytest.raises(GavoError, match="voxel: must be from"):
         check_voxel(voxel)
@@ -235,12 +235,39 @@ def test_a_map_does_not_need_the_rows_that_are_looked_at(row):
     assert len(points) > 100 and np.abs(points[:, 2] - 2.02).max() < 0.05
 
 
-@pytest.mark.parametrize("stray", [False, True])
-def test_open3d_finds_a_reading_where_it_looks(stray: bool) -> None:
-    """A sensor leaves out every fourth row; one stray reading there does not do for all others."""
-    metres = np.full((40, 60), 2.0, np.float32)
-    metres[::4] = 0.0
-    metres[0, 0] = 3.0 * stray
-    filled = _with_looked_at_filled(metres)
-    assert np.all(filled[::4, ::4] > 0) and filled[0, 0] == (3.0 if stray else 2.0)
-    np.testing.assert_array_equal(filled[1], metres[1])
+def wall(metres: float, voxel: float) -> SceneMap:
+    """The map of a wall straight ahead that fills the image."""
+    depth = np.full((CAMERA.height, CAMERA.width), round(metres * CAMERA.depth_scale), np.uint16)
+    builder = MapBuilder(CAMERA, voxel)
+    for _ in range(3):
+        builder.add(Frame(np.full(depth.shape, 100, np.uint8), depth, 0.0), np.eye(4))
+    return builder.extract()
+
+
+@needs_open3d
+@pytest.mark.parametrize("voxel", [0.02, 0.005])
+def test_small_voxels_leave_no_holes(voxel: float) -> None:
+    """A third of the wall was missing, without a word, where blocks are smaller than four pixels."""
+    metres = 3.0 + 0.3 * voxel
+    points = wall(metres, voxel).points
+    half = 0.8 * metres * np.array([CAMERA.width / CAMERA.fx, CAMERA.height / CAMERA.fy]) / 2
+    inner = points[np.all(np.abs(points[:, :2]) < half, axis=1), :2]
+    cells, size = np.floor(inner / (4 * voxel)), 2 * half / (4 * voxel)
+    assert len(np.unique(cells, axis=0)) > 0.95 * np.prod(size)
+
+
+@needs_open3d
+def test_a_wall_that_lies_on_the_voxels_is_seen() -> None:
+    """It had no side, and the map was empty."""
+    points = wall(2.0, 0.05).points
+    assert len(points) > 100 and np.abs(points[:, 2] - 2.0).max() < 1e-3
+
+
+@needs_open3d
+def test_a_full_map_keeps_what_is_near(monkeypatch) -> None:
+    """The first frame that went beyond was left out as a whole."""
+    far = np.linalg.norm(wall(2.01, 0.02).points, axis=1).max()
+    monkeypatch.setattr(scene_map, "MOST_BLOCKS", 300)
+    seen = wall(2.01, 0.02)
+    assert 2.0 < np.linalg.norm(seen.points, axis=1).max() < far - 0.1
+    assert "more than 300 blocks" in seen.left_out[0]

@@ -1,0 +1,46 @@
+"""Which blocks of voxels a frame touches, as Open3D finds them: it looks at one pixel of many, and a map has holes
+where these have no reading, or where several blocks lie between two of them.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+
+BLOCK = 8
+"""Voxels along the side of a block."""
+MOST_BLOCKS = 100_000
+"""Blocks that a map may have, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
+LOOKED_AT = 4
+"""Pixels along either axis of which Open3D looks at one to find the blocks that a frame touches."""
+MOST_ENLARGED = 16
+"""Factor by which an image is enlarged for that, at most."""
+
+
+def image_for_blocks(
+    metres: Float[np.ndarray, "h w"], camera: Camera, voxel: float
+) -> tuple[Float[np.ndarray, "h2 w2"], Float[np.ndarray, "3 3"]]:
+    """Return depth and camera matrix of an image in which Open3D finds all blocks of a frame.
+
+    Args:
+        metres: The frame's depth, 0 = no reading.
+        camera: The frame's, without distortion.
+        voxel: Side, metres.
+    """
+    filled = with_looked_at_filled(metres)
+    apart = LOOKED_AT * float(metres.max()) / min(float(camera.fx), float(camera.fy))
+    times = min(MOST_ENLARGED, max(1, int(np.ceil(apart / (BLOCK * voxel)))))
+    matrix = np.diag([times, times, 1.0]) @ camera.matrix
+    matrix[:2, 2] += 0.5 * (times - 1)
+    return np.repeat(np.repeat(filled, times, axis=0), times, axis=1), matrix
+
+
+def with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Depth with a reading in every pixel in which Open3D looks for blocks, each fourth of each fourth row, if there is
+    one near it: a sensor may leave out just those rows.
+    """
+    filled, looked_at = metres.copy(), np.s_[::LOOKED_AT, ::LOOKED_AT]
+    near = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[looked_at]
+    filled[looked_at] = np.where(metres[looked_at] > 0, metres[looked_at], near)
+    return filled
