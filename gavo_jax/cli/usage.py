@@ -23,6 +23,9 @@ HELP_OF_HELP = ("-h, --help", "show this help message and exit")
 VERSION = ("--version", "print the version and exit")
 """What a page of help says of an option, and `--version` likewise: tyro knows none beside subcommands."""
 
+USAGE_OF_ALL = "usage: gavo [-h] [--version] SUBCOMMAND ..."
+"""In place of tyro's, which names all subcommands on one line; they follow in a table."""
+
 
 class HelpPage(io.StringIO):
     """Takes what tyro prints in the place of a stream, whose colours and lines are those that the stream can show."""
@@ -51,8 +54,12 @@ class HelpPage(io.StringIO):
         is_of_all = any(line.strip(" ╭─╮") == "subcommands" for line in plain)
         fitted = []
         for line, words in zip(lines, plain, strict=True):
-            is_sentence = words[:1].isalpha() and not words.startswith("usage:")
-            fitted.append(textwrap.fill(line, width, break_long_words=False) if is_sentence else line)
+            if words.startswith("usage:"):
+                line = words = USAGE_OF_ALL if is_of_all else words
+            is_sentence = words[:1].isalpha()
+            indent = " " * 12 if words.startswith("usage:") else ""
+            filled = textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False)
+            fitted.append(filled if is_sentence else line)
             if is_of_all and HELP_OF_HELP[1] in words:
                 for told, ours in zip(HELP_OF_HELP, VERSION, strict=True):
                     words = words.replace(told, ours.ljust(len(told)))

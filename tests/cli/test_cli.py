@@ -734,11 +734,11 @@ def test_help_and_version(gavo):
         assert "--version" not in gavo(*words).out
 
 
-@pytest.mark.parametrize("command", ["", "run", "compare", "view", "experiment", "tune", "inspect", "calibrate"])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_pages_of_help_fit_the_screen(gavo, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "80")
     page = gavo(*command.split(), "--help").out
-    assert not [line for line in page.splitlines() if len(line) > 80 and not line.startswith("usage:")]
+    assert not [line for line in page.splitlines() if len(line) > 80]
     assert ("realsense" in page) == (command == "run")
 
 
