@@ -42,8 +42,8 @@ TRUNCATION = 6.0
 FARTHEST = 4.0
 """Metres: beyond, the noise of a structured-light or stereo camera exceeds several voxels."""
 
-OFF_THE_GRID = 1e-6
-"""Metres added to depth: a surface that lies exactly on voxels would have no side for Open3D."""
+OFF_THE_GRID = 1.000001
+"""Factor on depth: a surface that lies exactly on voxels would have no side for Open3D."""
 
 MIN_WEIGHT = 3.0
 """Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
@@ -157,7 +157,7 @@ class MapBuilder:
         self.frames += 1
         if not metres.any():
             return
-        metres = np.where(metres > 0, metres + np.float32(OFF_THE_GRID), metres)
+        metres *= np.float32(OFF_THE_GRID)
         seen, matrix = image_for_blocks(metres, self.camera, self.voxel)
         depth, seen, by = image(metres), image(seen), core.Tensor(matrix)
         rgb = np.repeat(grey_bytes(frame.grey)[..., None], 3, axis=2) if frame.color is None else frame.color
