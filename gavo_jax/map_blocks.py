@@ -2,6 +2,8 @@
 where these have no reading, or where several blocks lie between two of them.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -31,9 +33,11 @@ def image_for_blocks(
     filled = with_looked_at_filled(metres)
     apart = LOOKED_AT * float(metres.max()) / min(float(camera.fx), float(camera.fy))
     times = min(MOST_ENLARGED, max(1, int(np.ceil(apart / (BLOCK * voxel)))))
-    matrix = np.diag([times, times, 1.0]) @ camera.matrix
-    matrix[:2, 2] += 0.5 * (times - 1)
-    return np.repeat(np.repeat(filled, times, axis=0), times, axis=1), matrix
+    if times == 1:
+        return filled, camera.matrix
+    fx, fy, cx, cy = camera.scaled(times)
+    enlarged = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=times * camera.width, height=times * camera.height)
+    return np.repeat(np.repeat(filled, times, axis=0), times, axis=1), enlarged.matrix
 
 
 def with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -171,19 +171,18 @@ class MapBuilder:
 
     def _within_memory(self, blocks: Any, place: Float[np.ndarray, " 3"]) -> Any:
         """Blocks that may be touched: beyond the largest number those that are there, and of the others the nearest."""
-        table, core = self._grid.hashmap(), self._open3d.core
-        if table.size() + len(blocks) <= MOST_BLOCKS:
-            return blocks
-        known = table.find(blocks)[1].numpy()
+        table = self._grid.hashmap()
         room = MOST_BLOCKS - table.size()
-        if int((~known).sum()) <= room:
+        if len(blocks) <= room:
+            return blocks
+        numbers, known = blocks.numpy(), table.find(blocks)[1].numpy()
+        new = numbers[~known]
+        if len(new) <= room:
             return blocks
         self.is_full = True
-        numbers = blocks.numpy()
-        distances = np.linalg.norm((numbers + 0.5) * (BLOCK * self.voxel) - place, axis=1)
-        new = np.flatnonzero(~known)
-        kept = np.concatenate([np.flatnonzero(known), new[np.argsort(distances[new], kind="stable")[:room]]])
-        return core.Tensor(numbers[kept])
+        distances = np.linalg.norm((new + 0.5) * (BLOCK * self.voxel) - place, axis=1)
+        nearest = new[np.argsort(distances, kind="stable")[:room]]
+        return self._open3d.core.Tensor(np.concatenate([numbers[known], nearest]))
 
     def extract(self, shape: Shape = "cloud", left_out: Iterable[str] = ()) -> SceneMap:
         """The surface as a cloud or a mesh; empty where nothing was seen often enough.

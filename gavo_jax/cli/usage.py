@@ -54,12 +54,13 @@ class HelpPage(io.StringIO):
         is_of_all = any(line.strip(" ╭─╮") == "subcommands" for line in plain)
         fitted = []
         for line, words in zip(lines, plain, strict=True):
-            if words.startswith("usage:"):
-                line = words = USAGE_OF_ALL if is_of_all else words
-            is_sentence = words[:1].isalpha()
-            indent = " " * 12 if words.startswith("usage:") else ""
-            filled = textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False)
-            fitted.append(filled if is_sentence else line)
+            is_usage = words.startswith("usage:")
+            if is_usage:
+                line = USAGE_OF_ALL if is_of_all else words
+            if words[:1].isalpha():
+                indent = " " * 12 * is_usage
+                line = textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False)
+            fitted.append(line)
             if is_of_all and HELP_OF_HELP[1] in words:
                 for told, ours in zip(HELP_OF_HELP, VERSION, strict=True):
                     words = words.replace(told, ours.ljust(len(told)))
