@@ -6,15 +6,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol
 
+from gavo_jax.datasets import unrecognised
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.layouts.image_folders import (
-    COLOR_FOLDERS,
-    DEPTH_FOLDERS,
-    missing_folder,
-    missing_images,
-    missing_word,
-)
 from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.layouts.openloris import OpenLoris
 from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
@@ -26,37 +20,6 @@ from gavo_jax.errors import GavoError, blamed
 
 PLUGINS = "gavo_jax.datasets"
 """Group of entry points through which other packages bring kinds of sources."""
-
-PACKED = {
-    ".tar": "tar -xf",
-    ".tgz": "tar -xf",
-    ".zip": "unzip",
-    ".7z": "7z x",
-    ".rar": "unrar x",
-    ".gz": "gunzip",
-    ".bz2": "bunzip2",
-    ".xz": "unxz",
-    ".lz4": "unlz4",
-    ".zst": "zstd -d",
-    ".zstd": "zstd -d",
-}
-"""Endings of files from which a source is to be unpacked first, and by what."""
-
-RECORDINGS = {
-    ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
-    ".mkv": "a film, or a recording of Azure Kinect: write its images with Open3D's azure_kinect_mkv_reader.py",
-    ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
-    ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
-    ".klg": "a log of ElasticFusion's logger: write its images and depth first",
-}
-"""What holds a source in a form of its maker's alone."""
-
-FILMS = (".mp4", ".avi", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
-
-SHOWN = 5
-"""Names that a message lists."""
 
 
 class Dataset(Protocol):
@@ -195,11 +158,8 @@ def recognise(path: Path) -> Dataset:
     dataset, faults = _asked(path)
     if dataset is not None:
         return dataset
-    raise GavoError("; ".join([f"{path}: {_contents(path)}", *faults, *faulty_plugins()]))
-
-
-def _kind_of(path: Path) -> Dataset | None:
-    return _asked(path)[0]
+    there = unrecognised.describe(path, [dataset.kind for dataset in datasets()], is_source)
+    raise GavoError("; ".join([f"{path}: {there}", *faults, *faulty_plugins()]))
 
 
 def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
@@ -217,66 +177,11 @@ def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
     return None, faults
 
 
-def _contents(path: Path) -> str:
-    """What lies at a path where no source is, in a few words; folders in it that are sources are named."""
-    known = f"{', '.join(dataset.kind for dataset in datasets())} (SUN3D's, too)"
-    if not path.is_dir():
-        if path.is_file() and (source := source_around(path)):
-            return f"a file of a source: name its folder, {source}"
-        return _inside(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
-    inside = sorted(path.iterdir())
-    if len(inside) == 1 and inside[0].is_file() and (words := _inside(inside[0])):
-        return f"{inside[0].name}: {words}"
-    if not inside:
-        return f"an empty folder, not one of: {known}"
-    sources = [child.name for child in inside if not child.name.startswith(".") and _kind_of(child) is not None]
-    if sources:
-        names = (
-            f"{len(sources)}: name one of {_listed(sources)}" if len(sources) > 1 else f"one: name {sources[0][:60]}"
-        )
-        return f"no source itself, but a folder of {names}"
-    if (words := missing_images(path)) is not None:
-        return words
-    if stereo := next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data").is_dir()), None):
-        return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
-    if any(path.glob("d-*.pgm")) and any(path.glob("r-*.ppm")):
-        return (
-            "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
-            "dataset's toolbox first"
-        )
-    if film := next((child for child in inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None):
-        return f"{film.name}: {_inside(film)}"
-    if source := source_around(path):
-        return f"a folder inside a source: name the source, {source}"
-    there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in inside])}"
-    if (words := missing_folder(path) or missing_word(path)) is not None:
-        return f"{there}, and {words}"
-    here = f"{there}: not one of: {known}"
-    if not any(child.is_dir() for child in inside):
-        return here
-    return f"{here}; colour is looked for in {', '.join(COLOR_FOLDERS)}, depth in {', '.join(DEPTH_FOLDERS)}"
-
-
 def source_around(path: Path) -> Path | None:
     """The folder of the source that a file or folder is a part of; None where it is of none."""
-    return next((folder for folder in list(path.absolute().parents)[:2] if _kind_of(folder) is not None), None)
+    return unrecognised.source_around(path, is_source)
 
 
-def _inside(file: Path) -> str | None:
-    """How what a file holds becomes a source, where its name tells."""
-    endings = [suffix.lower() for suffix in file.suffixes]
-    if endings[-2:] == [".bag", ".active"]:
-        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
-    if endings and endings[-1] in RECORDINGS:
-        return RECORDINGS[endings[-1]]
-    if endings[-1:] and endings[-1] in FILMS:
-        return (
-            "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"
-        )
-    how = PACKED.get(endings[-1]) if endings else None
-    return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(name[:60] for name in names[:SHOWN]) + more
+def is_source(path: Path) -> bool:
+    """Whether a source of a known kind is at a path."""
+    return _asked(path)[0] is not None

@@ -1,0 +1,172 @@
+"""What lies at a path where no source is, in words that help: each guess says something, or leaves it to the next."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from gavo_jax.datasets.layouts.image_folders import (
+    COLOR_FOLDERS,
+    DEPTH_FOLDERS,
+    missing_folder,
+    missing_images,
+    missing_word,
+)
+
+PACKED = {
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".zip": "unzip",
+    ".7z": "7z x",
+    ".rar": "unrar x",
+    ".gz": "gunzip",
+    ".bz2": "bunzip2",
+    ".xz": "unxz",
+    ".lz4": "unlz4",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+}
+"""Endings of files from which a source is to be unpacked first, and by what."""
+
+RECORDINGS = {
+    ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
+    ".mkv": "a film, or a recording of Azure Kinect: write its images with Open3D's azure_kinect_mkv_reader.py",
+    ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
+    ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
+    ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
+    ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
+    ".klg": "a log of ElasticFusion's logger: write its images and depth first",
+}
+"""What holds a source in a form of its maker's alone."""
+
+FILMS = (".mp4", ".avi", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
+
+SHOWN = 5
+"""Names that a message lists."""
+
+
+class Place(NamedTuple):
+    """A path at which no source is."""
+
+    path: Path
+    inside: list[Path]
+    """What a folder holds, in the order of its names."""
+    kinds: str
+    """The kinds of sources that are known."""
+    is_source: Callable[[Path], bool]
+    """Whether a source is at another path."""
+
+
+def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]) -> str:
+    """What lies at a path where no source is, in a few words.
+
+    Args:
+        path: Of a file or folder.
+        kinds: The kinds of sources that are known.
+        is_source: Whether one of them is at another path.
+    """
+    known = f"{', '.join(kinds)} (SUN3D's, too)"
+    if not path.is_dir():
+        if path.is_file() and (source := source_around(path, is_source)):
+            return f"a file of a source: name its folder, {source}"
+        return _in_file(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
+    place = Place(path, sorted(path.iterdir()), known, is_source)
+    return next(words for guess in GUESSES if (words := guess(place)) is not None)
+
+
+def source_around(path: Path, is_source: Callable[[Path], bool]) -> Path | None:
+    """The folder of the source that a file or folder is a part of; None where it is of none."""
+    return next((folder for folder in list(path.absolute().parents)[:2] if is_source(folder)), None)
+
+
+def _lone_file(place: Place) -> str | None:
+    if len(place.inside) != 1 or not place.inside[0].is_file():
+        return None
+    words = _in_file(place.inside[0])
+    return words and f"{place.inside[0].name}: {words}"
+
+
+def _nothing(place: Place) -> str | None:
+    return None if place.inside else f"an empty folder, not one of: {place.kinds}"
+
+
+def _sources(place: Place) -> str | None:
+    names = [child.name for child in place.inside if not child.name.startswith(".") and place.is_source(child)]
+    if not names:
+        return None
+    there = f"{len(names)}: name one of {_listed(names)}" if len(names) > 1 else f"one: name {names[0][:60]}"
+    return f"no source itself, but a folder of {there}"
+
+
+def _images_missing(place: Place) -> str | None:
+    return missing_images(place.path)
+
+
+def _stereo(place: Place) -> str | None:
+    folders = (place.path / "mav0", place.path)
+    stereo = next((folder for folder in folders if (folder / "cam0" / "data").is_dir()), None)
+    if stereo is None:
+        return None
+    return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
+
+
+def _nyu(place: Place) -> str | None:
+    if not (any(place.path.glob("d-*.pgm")) and any(place.path.glob("r-*.ppm"))):
+        return None
+    return (
+        "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
+        "dataset's toolbox first"
+    )
+
+
+def _recording(place: Place) -> str | None:
+    film = next((child for child in place.inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None)
+    return None if film is None else f"{film.name}: {_in_file(film)}"
+
+
+def _part_of_source(place: Place) -> str | None:
+    source = source_around(place.path, place.is_source)
+    return source and f"a folder inside a source: name the source, {source}"
+
+
+def _folder(place: Place) -> str:
+    there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in place.inside])}"
+    if (words := missing_folder(place.path) or missing_word(place.path)) is not None:
+        return f"{there}, and {words}"
+    here = f"{there}: not one of: {place.kinds}"
+    if not any(child.is_dir() for child in place.inside):
+        return here
+    return f"{here}; colour is looked for in {', '.join(COLOR_FOLDERS)}, depth in {', '.join(DEPTH_FOLDERS)}"
+
+
+GUESSES: tuple[Callable[[Place], str | None], ...] = (
+    _lone_file,
+    _nothing,
+    _sources,
+    _images_missing,
+    _stereo,
+    _nyu,
+    _recording,
+    _part_of_source,
+    _folder,
+)
+"""What may be said of a folder, in the order in which it is tried; the last one always has words."""
+
+
+def _in_file(file: Path) -> str | None:
+    """How what a file holds becomes a source, where its name tells."""
+    endings = [suffix.lower() for suffix in file.suffixes]
+    if endings[-2:] == [".bag", ".active"]:
+        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+    if endings and endings[-1] in RECORDINGS:
+        return RECORDINGS[endings[-1]]
+    if endings[-1:] and endings[-1] in FILMS:
+        return (
+            "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"
+        )
+    how = PACKED.get(endings[-1]) if endings else None
+    return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(name[:60] for name in names[:SHOWN]) + more

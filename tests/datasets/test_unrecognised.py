@@ -1,0 +1,66 @@
+"""Where no source is, the message says what is there and what would help."""
+
+from pathlib import Path
+
+import pytest
+
+from gavo_jax.datasets import unrecognised
+from gavo_jax.datasets.registry import open_source, source_around
+from gavo_jax.errors import GavoError
+
+
+def made(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.mkdir(parents=True) if name.endswith("/") else path.parent.mkdir(parents=True, exist_ok=True)
+        if not name.endswith("/"):
+            path.write_bytes(b"x")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ((), "an empty folder, not one of: "),
+        (("walk.tar.xz",), r"walk\.tar\.xz: packed: unpack it first \(tar -xf\)"),
+        (("walk.oni", "notes.md"), r"walk\.oni: a recording of OpenNI: write its images and depth"),
+        (("walk.MP4", "notes.md"), r"walk\.MP4: a film: write its frames as images"),
+        (("mav0/cam0/data/1.png",), "cam0: a recording as EuRoC has it, of stereo images without depth"),
+        (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
+        (("rgb/",), "a folder of rgb/, and "),
+        (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
+        (("a/", "b.md"), "colour is looked for in "),
+        (tuple(f"{k}.md" for k in range(9)), r"a folder of 0\.md, 1\.md, 2\.md, 3\.md, 4\.md and 4 more"),
+    ],
+)
+def test_a_folder_is_described(tmp_path: Path, names: tuple[str, ...], words: str) -> None:
+    folder = made(tmp_path / "there", *names)
+    folder.mkdir(exist_ok=True)
+    with pytest.raises(GavoError, match=words) as caught:
+        open_source(folder)
+    assert str(caught.value).startswith(f"{folder}: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("walk.bag.active", "was never closed"), ("walk.txt", "a file of 1 bytes, not one of: ")]
+)
+def test_a_file_is_described(tmp_path: Path, name: str, words: str) -> None:
+    with pytest.raises(GavoError, match=words):
+        open_source(made(tmp_path, name) / name)
+
+
+def test_sources_nearby_are_named(tmp_path: Path) -> None:
+    scene = made(tmp_path / "scene", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
+    with pytest.raises(GavoError, match="no source itself, but a folder of one: name seq-01"):
+        open_source(scene)
+    image = scene / "seq-01" / "frame-000000.color.png"
+    assert source_around(image) == scene / "seq-01" and source_around(scene) is None
+    with pytest.raises(GavoError, match=f"a file of a source: name its folder, {scene / 'seq-01'}"):
+        open_source(image)
+    with pytest.raises(GavoError, match=f"a folder inside a source: name the source, {scene / 'seq-01'}"):
+        open_source(made(scene / "seq-01", "more/notes.md") / "more")
+
+
+def test_the_last_guess_always_has_words(tmp_path: Path) -> None:
+    place = unrecognised.Place(tmp_path, [], "", lambda _: False)
+    assert unrecognised.GUESSES[-1](place)
