@@ -17,8 +17,8 @@ from typing import Any
 
 import common
 
-from gavo_jax.cli.experiment import PLAN
 from gavo_jax.errors import GavoError
+from gavo_jax.experiments.record import FILE as PLAN
 from gavo_jax.experiments.summary import compare, summarise
 from gavo_jax.experiments.table import Table
 from gavo_jax.output.screen import number
