@@ -7,26 +7,14 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from typing import Any
 
 import jax
 import tyro
 
 from gavo_jax import interrupts
-from gavo_jax.cli.options import (
-    Align,
-    Calibrate,
-    Command,
-    Compare,
-    Doctor,
-    Download,
-    Evaluate,
-    Experiment,
-    Inspect,
-    Run,
-    Tune,
-    View,
-)
+from gavo_jax.cli.options import Command, Doctor
 from gavo_jax.cli.usage import HelpPage, asking_for_help, fault_of_usage
 from gavo_jax.compilation import compiler
 from gavo_jax.early import INTERRUPTED
@@ -129,7 +117,8 @@ def _open_streams() -> None:
 
 
 def _execute(command: Command) -> int:
-    """Import the subcommand only now, so that help and usage errors do not wait for JAX.
+    """Import the subcommand only now, so that help and usage errors do not wait for JAX: the function of its name, in
+    the module of its name.
 
     Raises:
         GavoError: this JAX is ruled out, and the subcommand is not the one that says what is wrong.
@@ -137,51 +126,8 @@ def _execute(command: Command) -> int:
     fault = compiler.unfit_compiler()
     if fault and not isinstance(command, Doctor):
         raise GavoError(fault)
-    match command:
-        case Run():
-            from gavo_jax.cli.run import run
-
-            return run(command)
-        case Compare():
-            from gavo_jax.cli.compare import compare
-
-            return compare(command)
-        case View():
-            from gavo_jax.cli.view import view
-
-            return view(command)
-        case Align():
-            from gavo_jax.cli.align import align
-
-            return align(command)
-        case Evaluate():
-            from gavo_jax.cli.evaluate import evaluate
-
-            return evaluate(command)
-        case Experiment():
-            from gavo_jax.cli.experiment import experiment
-
-            return experiment(command)
-        case Download():
-            from gavo_jax.cli.download import download
-
-            return download(command)
-        case Tune():
-            from gavo_jax.cli.tune import tune
-
-            return tune(command)
-        case Doctor():
-            from gavo_jax.cli.doctor import doctor
-
-            return doctor(command)
-        case Inspect():
-            from gavo_jax.cli.inspect import inspect
-
-            return inspect(command)
-        case Calibrate():
-            from gavo_jax.cli.calibrate import calibrate
-
-            return calibrate(command)
+    name = type(command).__name__.lower()
+    return getattr(import_module(f"{__name__}.{name}"), name)(command)
 
 
 def _parse(arguments: list[str]) -> Command | None:

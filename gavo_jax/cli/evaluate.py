@@ -1,6 +1,7 @@
 """`gavo evaluate`: errors of one trajectory file against another."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,15 +34,7 @@ ALIKE = 0.1
 
 def evaluate(options: Evaluate) -> int:
     """Print relative pose error, absolute trajectory error and distance error with their definitions, or as JSON."""
-    if not 0 < options.delta < np.inf:
-        raise GavoError(f"--delta: must be a positive number, not {options.delta:g}")
-    if options.unit == "frames" and options.delta != int(options.delta):
-        raise GavoError(f"--delta: must be a whole number of frames, not {options.delta:g}")
-    if options.plot is not None:
-        if not plots.available():
-            raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
-        for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
-            refuse_foreign(options.plot, file, what)
+    _check(options)
     paths = options.estimate, options.groundtruth
     (estimate, *_), (truth, *_) = read = _read(*paths)
     series, missing = _errors(estimate, truth, options)
@@ -52,13 +45,8 @@ def evaluate(options: Evaluate) -> int:
     else:
         _print(options, series)
     note = tell if options.json else say  # beside the JSON, not in it
-    for words in missing:
+    for words in (*missing, *_remarks(paths, read)):
         note(words)
-    for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
-        if unit in UNITS:
-            note(f"{path}: its stamps are taken for {UNITS[unit]}")
-        if is_w_first(one, other):
-            note(f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w")
     if options.plot is not None:
         folder = prepare_folder(options.plot)
         with waiting("drawing figures …"):
@@ -66,6 +54,29 @@ def evaluate(options: Evaluate) -> int:
         if not options.json:
             say(f"figures in {folder}")
     return 0
+
+
+def _check(options: Evaluate) -> None:
+    """Raise GavoError for a span that is none, and for figures that cannot be."""
+    if not 0 < options.delta < np.inf:
+        raise GavoError(f"--delta: must be a positive number, not {options.delta:g}")
+    if options.unit == "frames" and options.delta != int(options.delta):
+        raise GavoError(f"--delta: must be a whole number of frames, not {options.delta:g}")
+    if options.plot is None:
+        return
+    if not plots.available():
+        raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
+    for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
+        refuse_foreign(options.plot, file, what)
+
+
+def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:
+    """How each file was understood, where it was not as it is written."""
+    for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
+        if unit in UNITS:
+            yield f"{path}: its stamps are taken for {UNITS[unit]}"
+        if is_w_first(one, other):
+            yield f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w"
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")

@@ -1,5 +1,6 @@
 """`gavo run` over a camera's frames as they come, until Ctrl-C, the camera's end or `--frames`."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,39 +109,25 @@ def _track(
     settings: Settings,
     scene: LiveMap | None,
 ) -> _End:
-    """Track until there is no more. Images that are unlike the first ones make a lost frame."""
+    """Track until there is no more."""
     count, stopwatch = 0, Stopwatch()
     interrupted, fault = False, None
-    images: LiveImages
+    sequence = {"name": newest.device.name, "frames": None, "camera": camera}
     try:
-        for images in newest:
-            try:
-                frame = frame_of(images, camera, color=scene is not None or viewer.wants_populations)
-            except GavoError as error:
-                if count == 0:
-                    raise
-                frame = FrameError(str(error))
+        for timestamp, frame in _frames(newest, camera, color=scene is not None or viewer.wants_populations):
             if count == 0:
-                viewer.open(newest.device.name, odometry.camera, np.array([images.timestamp]), None)
-                folder.start(
-                    {
-                        "options": options,
-                        "sequence": {"name": newest.device.name, "frames": None, "camera": camera},
-                        **circumstances(settings),
-                    },
-                    images.timestamp,
-                )
+                viewer.open(newest.device.name, odometry.camera, np.array([timestamp]), None)
+                folder.start({"options": options, "sequence": sequence, **circumstances(settings)}, timestamp)
                 stopwatch = Stopwatch()
-            step = odometry.register(frame, images.timestamp)
+            step = odometry.register(frame, timestamp)
             viewer.watch(frame if isinstance(frame, Frame) else None, step, odometry.candidates)
             if scene is not None and isinstance(frame, Frame):
                 scene.watch(frame, step)
             if step is not None:
                 folder.add(step, odometry.progress)
             count += 1
-            if count == options.frames:
-                break
-            if step is not None and step.lost and settings.odometry.on_lost == "stop":
+            is_stopped = step is not None and step.lost and settings.odometry.on_lost == "stop"
+            if is_stopped or count == options.frames:
                 break
     except KeyboardInterrupt:
         if count < 2:
@@ -152,6 +139,21 @@ def _track(
             raise
         fault = error
     return _End(stopwatch.seconds, stopwatch.waited, interrupted, fault)
+
+
+def _frames(newest: Newest, camera: Camera, *, color: bool) -> Iterator[tuple[float, Frame | FrameError]]:
+    """Stamps and frames as they come. Images that are unlike the first ones make a lost frame."""
+    is_first = True
+    images: LiveImages
+    for images in newest:
+        try:
+            frame = frame_of(images, camera, color=color)
+        except GavoError as error:
+            if is_first:
+                raise
+            frame = FrameError(str(error))
+        yield images.timestamp, frame
+        is_first = False
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:

@@ -82,24 +82,12 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
             the farthest; or some images hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
-    clean = [without_invalid(image.raw) for image in samples]
     whole, floats = ([image.name for image in samples if _is_of_floats(image.raw) is kind] for kind in (False, True))
     if whole and floats and given is None:
         raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
+    clean = [without_invalid(image.raw) for image in samples]
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
-    median = float(np.median(readings)) if readings.size else METRES
-    is_open = given is None and not _states_unit(calibration)
-    if is_open and readings.size and readings.min() < readings.max() == 1:
-        raise GavoError(
-            f"{samples[0].name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "
-            "per metre: 0.1 where 1 stands for 10 m"
-        )
-    file = given or _likely_unit(median, calibration)
-    if file is None:
-        raise GavoError(
-            f"{samples[0].name}: depth of median {median:g}, in neither metres nor millimetres: say --depth-scale, "
-            "units per metre"
-        )
+    file = given or _likely_unit(readings, calibration, samples[0].name if samples else "")
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
     return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE, True if floats and given is None else None)
 
@@ -117,13 +105,22 @@ def _states_unit(calibration: Calibration) -> bool:
     return calibration.preset is None and calibration.states_depth_scale
 
 
-def _likely_unit(median: float, calibration: Calibration) -> float | None:
-    stated = calibration.color.depth_scale
-    if _states_unit(calibration) and _is_within(median / stated, STATED_MEDIANS):
-        return stated
-    if _is_within(median, METRE_MEDIANS):
-        return METRES
-    return MILLIMETRES if _is_within(median, MILLIMETRE_MEDIANS) else None
+def _likely_unit(readings: Float[np.ndarray, " n"], calibration: Calibration, name: str) -> float:
+    """The unit that readings are probably in; `name` is of a file, for messages."""
+    is_stated, median = _states_unit(calibration), float(np.median(readings)) if readings.size else METRES
+    if not is_stated and readings.size and readings.min() < readings.max() == 1:
+        raise GavoError(
+            f"{name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "
+            "per metre: 0.1 where 1 stands for 10 m"
+        )
+    if is_stated and _is_within(median / calibration.color.depth_scale, STATED_MEDIANS):
+        return calibration.color.depth_scale
+    for unit, medians in ((METRES, METRE_MEDIANS), (MILLIMETRES, MILLIMETRE_MEDIANS)):
+        if _is_within(median, medians):
+            return unit
+    raise GavoError(
+        f"{name}: depth of median {median:g}, in neither metres nor millimetres: say --depth-scale, units per metre"
+    )
 
 
 def _is_within(value: float, bounds: tuple[float, float]) -> bool:

@@ -102,21 +102,30 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
         is_kinect: whether the camera is known to be one of those.
     """
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
-    by_steps = sample.kinect_scale if is_kinect or looks_so else None
     every = (*COMMON, SHIFTED, TENTHS, CENTIMETRES)
-    far = [other for other in every if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
-    seen = [other for other in far if sample.near / other > KINECT_NEAREST]
-    if by_steps is not None:
-        nearest = min(seen, key=lambda other: abs(by_steps / other - 1), default=None)
-        if nearest is not None and abs(by_steps / nearest - 1) < STEP_TOLERANCE:
-            return nearest
+    others = [other for other in every if not 0.5 < other / scale < 2 and sample.median / other < USUAL[1]]
+    seen = [other for other in others if sample.near / other > KINECT_NEAREST]
+    if (is_kinect or looks_so) and (by_steps := _nearest_to_steps(sample, seen)) is not None:
+        return by_steps
     if is_kinect and sample.median / scale < KINECT_NEAREST:
         return max((other for other in seen if other in (*COMMON, CENTIMETRES)), default=None)
-    if PLAUSIBLE[0] < sample.median / scale < PLAUSIBLE[1]:
+    return None if PLAUSIBLE[0] < sample.median / scale < PLAUSIBLE[1] else _most_usual(sample, others)
+
+
+def _nearest_to_steps(sample: DepthSample, units: list[float]) -> float | None:
+    """That of some units which the steps of the depth speak for."""
+    by_steps = sample.kinect_scale
+    if by_steps is None or not units:
         return None
-    usual = [other for other in far if sample.median / other > USUAL[0]]
-    likely = [other for other in usual if other in COMMON] or [other for other in usual if other == CENTIMETRES]
-    return min(likely, key=lambda other: abs(np.log(sample.median / other / USUAL_MEDIAN)), default=None)
+    nearest = min(units, key=lambda unit: abs(by_steps / unit - 1))
+    return nearest if abs(by_steps / nearest - 1) < STEP_TOLERANCE else None
+
+
+def _most_usual(sample: DepthSample, units: list[float]) -> float | None:
+    """That of some units in which the depth is as far away as is usual."""
+    usual = [unit for unit in units if sample.median / unit > USUAL[0]]
+    likely = [unit for unit in usual if unit in COMMON] or [unit for unit in usual if unit == CENTIMETRES]
+    return min(likely, key=lambda unit: abs(np.log(sample.median / unit / USUAL_MEDIAN)), default=None)
 
 
 def fault_of_scale(sequence: FrameSequence) -> str | None:

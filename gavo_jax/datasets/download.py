@@ -98,34 +98,50 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
 
     def fetch(url: str, output_file: Any, pooch: Any, check_only: bool | None = False) -> None:
         """Pooch's downloader: whatever a try brings stays in `partial`."""
-        for attempt in range(ATTEMPTS):
-            try:
-                _fetch(url, partial, progress)
-                break
-            except requests.HTTPError:
-                raise
-            except requests.RequestException:
-                if attempt + 1 == ATTEMPTS:
-                    raise
-                time.sleep(PAUSE)
+        _fetch_patiently(url, partial, progress)
         os.replace(partial, output_file)
 
     downloader: Any = fetch
     try:
         return Path(pooch.retrieve(url, known_hash=None, fname=name, path=to, downloader=downloader))
-    except requests.HTTPError as error:
-        raise GavoError(f"{url}: the server says: {' '.join(str(error).split())[:200]}") from None
-    except (requests.ConnectionError, requests.Timeout) as error:
-        kind = "no answer in time" if isinstance(error, requests.Timeout) else "no connection"
-        there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
-        raise GavoError(f"{url}: {kind} (is there a network?){there}") from None
-    except requests.RequestException as error:
-        there = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
-        raise GavoError(f"{url}: broke off {ATTEMPTS} times: {' '.join(str(error).split())[:200]}{there}") from None
-    except ValueError as error:
-        if isinstance(error, GavoError):
+    except GavoError:
+        raise
+    except (requests.RequestException, ValueError) as error:
+        kept = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
+        raise GavoError(_told(error, url, kept)) from None
+
+
+def _told(error: Exception, url: str, kept: str) -> str:
+    """Why a download came to nothing; `kept` says what is there of it."""
+    import requests
+
+    words = " ".join(str(error).split())[:200]
+    match error:
+        case requests.HTTPError():
+            return f"{url}: the server says: {words}"
+        case requests.Timeout():
+            return f"{url}: no answer in time (is there a network?){kept}"
+        case requests.ConnectionError():
+            return f"{url}: no connection (is there a network?){kept}"
+        case requests.RequestException():
+            return f"{url}: broke off {ATTEMPTS} times: {words}{kept}"
+        case _:
+            return f"{url[:200]}: not an address to download from: {words}"
+
+
+def _fetch_patiently(url: str, partial: Path, progress: Progress) -> None:
+    """Some tries, each going on from what the one before has brought."""
+    import requests
+
+    for attempt in range(ATTEMPTS):
+        try:
+            return _fetch(url, partial, progress)
+        except requests.HTTPError:
             raise
-        raise GavoError(f"{url[:200]}: not an address to download from: {' '.join(str(error).split())[:200]}") from None
+        except requests.RequestException:
+            if attempt + 1 == ATTEMPTS:
+                raise
+            time.sleep(PAUSE)
 
 
 def _fetch(url: str, partial: Path, progress: Progress) -> None:

@@ -101,30 +101,12 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
     """
     expected, structure = jax.tree.flatten(blank)
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > 2**20 + sum(leaf.nbytes for leaf in expected):
-                raise GavoError(f"{path}: larger than a checkpoint of this camera")
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = dict(stored)
-        if str(arrays.pop(SEAL)) != _seal(arrays):
-            raise ValueError("altered")
+        arrays = _sealed_arrays(path, most=2**20 + sum(leaf.nbytes for leaf in expected))
         numbers = json.loads(str(arrays[NUMBERS]))
-        history: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in numbers["history"].items()}
-        leap, came = numbers.pop("leap"), numbers.pop("arrival", None)
         files = {name: Mark(*mark) for name, mark in numbers.pop("files").items()}
         images = numbers.pop("images")
-        poses = {name: arrays[name] for name in POSES}
         leaves = [arrays[_leaf(i)] for i in range(len(expected))] if _leaf(0) in arrays else None
-        numbers |= {"history": History(**history), "leap": leap and Leap(np.array(leap[0]), *leap[1:])}
-        numbers["arrival"] = came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:])
-        numbers["way"] = Way(tuple(Fix(seconds, tuple(xi)) for seconds, xi in numbers["way"]))
-        beginning = numbers.get("beginning")
-        numbers["beginning"] = beginning and Beginning(*beginning)
-        if depth := numbers.get("depth"):
-            (delay, *known), seen, told = depth
-            change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
-            numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
-        progress = Progress(**numbers, **poses)
+        progress = _progress_of(numbers, arrays)
     except GavoError:
         raise
     except Exception:  # what the readers of damaged archives, arrays and numbers raise has no end
@@ -135,6 +117,37 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         raise GavoError(f"{path}: of another camera")
     progress = progress._replace(tracker=jax.tree.unflatten(structure, map(jax.numpy.asarray, leaves)))
     return Checkpoint(progress, files, images)
+
+
+def _sealed_arrays(path: Path, most: int) -> dict[str, np.ndarray]:
+    """The arrays of a file of at most so many bytes, as they were sealed."""
+    with zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > most:
+            raise GavoError(f"{path}: larger than a checkpoint of this camera")
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    if str(arrays.pop(SEAL)) != _seal(arrays):
+        raise ValueError("altered")
+    return arrays
+
+
+def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Progress:
+    """A progress without its tracker's state: the records in `numbers` become what they were written from."""
+    history: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in numbers["history"].items()}
+    leap, came, beginning = numbers["leap"], numbers.get("arrival"), numbers.get("beginning")
+    numbers |= {
+        "history": History(**history),
+        "leap": leap and Leap(np.array(leap[0]), *leap[1:]),
+        "arrival": came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:]),
+        "way": Way(tuple(Fix(seconds, tuple(xi)) for seconds, xi in numbers["way"])),
+        "beginning": beginning and Beginning(*beginning),
+    }
+    if depth := numbers.get("depth"):
+        (delay, *known), seen, told = depth
+        change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
+        numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
+    poses: dict[str, Any] = {name: arrays[name] for name in POSES}
+    return Progress(**numbers, **poses)
 
 
 def _seal(arrays: dict[str, np.ndarray]) -> str:

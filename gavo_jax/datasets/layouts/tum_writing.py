@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mask, write_truth
 from gavo_jax.errors import GavoError
 
@@ -31,34 +31,44 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        stamps, depth_stamps, rows = [], [], []
         bodies = getattr(sequence, "bodies_truth", ())
         if bodies:
             (folder / MASKS).mkdir(exist_ok=True)
+        stamps, depth_stamps, rows = [], [], []
         for index, frame in enumerate(sequence):
-            for name, pixels in (("grey", frame.grey), ("depth", frame.depth)):
-                if pixels.dtype != (np.uint8 if name == "grey" else np.uint16):
-                    raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
-            delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
-            for written, stamp in ((stamps, frame.timestamp), (depth_stamps, delayed)):
-                written.append(np.format_float_positional(stamp, unique=True, min_digits=6))
-            image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
-            if frame.color is not None:
-                image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
-            _write_png(folder / "rgb" / f"{stamps[-1]}.png", image)
-            _write_png(folder / "depth" / f"{depth_stamps[-1]}.png", frame.depth)
+            stamp, depth_stamp = _write_frame(frame, folder)
+            stamps.append(stamp)
+            depth_stamps.append(depth_stamp)
             if bodies:
-                rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamps[-1], folder)
+                rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamp, folder)
         (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
         if sequence.ground_truth is not None:
             sequence.ground_truth.write_tum(folder / "groundtruth.txt")
         if bodies:
             write_truth(rows, folder)
         for part, own in (("depth", depth_stamps), ("rgb", stamps)):
-            rows = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in own)]
-            (folder / f"{part}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+            lines = [f"# {part} images of {sequence.name}: timestamp filename", *(f"{s} {part}/{s}.png" for s in own)]
+            (folder / f"{part}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
+
+
+def _write_frame(frame: Frame, folder: Path) -> tuple[str, str]:
+    """Write both images; their stamps, as they are written."""
+    for name, pixels, dtype in (("grey", frame.grey, np.uint8), ("depth", frame.depth, np.uint16)):
+        if pixels.dtype != dtype:
+            raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
+    delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
+    stamp, depth_stamp = (
+        np.format_float_positional(seconds, unique=True, min_digits=6) for seconds in (frame.timestamp, delayed)
+    )
+    if frame.color is None:
+        image = cv2.cvtColor(frame.grey, cv2.COLOR_GRAY2BGR)
+    else:
+        image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+    _write_png(folder / "rgb" / f"{stamp}.png", image)
+    _write_png(folder / "depth" / f"{depth_stamp}.png", frame.depth)
+    return stamp, depth_stamp
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
