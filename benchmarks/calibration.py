@@ -101,8 +101,8 @@ def main(
         every += parts
         rows.append(summarise(f"synthetic, {name}", *map(np.concatenate, zip(*parts, strict=True))))
     rows.append(summarise("synthetic, all", *map(np.concatenate, zip(*every, strict=True))))
-    for clip in common.names(clips) if clips else []:
-        rows.append(summarise(clip, *normalised_errors(common.open_clip(clip), method, 0)))
+    named = common.names(clips) if clips else []
+    rows += [summarise(clip, *normalised_errors(common.open_clip(clip), method, 0)) for clip in named]
     columns = ("", "pairs", "mean", "median", "share within 95 %", "mm", "mrad")
     keys = ("mean", "median", "share_within", "millimetres", "milliradians")
     cells = [[row["sequence"], row["pairs"], *(number(row[key], 2) for key in keys)] for row in rows]

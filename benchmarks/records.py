@@ -208,8 +208,9 @@ def section(records: Sequence[Record]) -> str:
     """The tables of a benchmark's records, each with where it comes from."""
     parts = []
     for record in records:
-        for table in record.tables:
-            parts.append(f"**{table.title}**\n\n{markdown(table)}" if table.title else markdown(table))
+        parts += [
+            f"**{table.title}**\n\n{markdown(table)}" if table.title else markdown(table) for table in record.tables
+        ]
         parts.append(f"*`{record.command}`. {record.date}; {record.machine}; {record.versions}.*")
         if remark := ruled_out(record):
             parts.append(remark)

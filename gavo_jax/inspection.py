@@ -118,7 +118,9 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
         "delay": _spread(delays),
         "image": {"mean": mean, "standard_deviation": deviation},
         "depth": {
-            **{"near_m": low, "median_m": median, "far_m": high},
+            "near_m": low,
+            "median_m": median,
+            "far_m": high,
             "coverage": float(np.mean(coverages)) if coverages else None,
             "lies": edges.fault or None,
         },

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.aligner import BodyAware, deviation, mistrusted
-from gavo_jax.bodies.contest import BEGUN, DROPPED_AFTER, EXACT, OVER, Contest, Motions, Span, leads
+from gavo_jax.bodies.duel import BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
 from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.scene import AwareState
@@ -140,30 +140,28 @@ class WithRival:
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span) -> Attempt:
         """Which of two attempts at a frame stands for it, and whether the rival, of the age it has then, is kept."""
-        contest = self._contest(attempt, other, rival)
+        duel = self._duel(attempt, other, rival)
         open_after = OVER if rival.stands_before else open_for
-        if contest.is_won:
+        if duel.is_won:
             return self._taken(other, rival, open_for, open_after)
-        if contest.casts_doubt:
+        if duel.casts_doubt:
             attempt = mistrusted(attempt)
-        if contest.is_lost:
+        if duel.is_lost:
             return attempt._replace(state=self._alone(attempt.state, open_after))
-        if contest.is_given_up:
+        if duel.is_given_up:
             return attempt._replace(state=self._alone(attempt.state, open_for))
-        kept = rival._replace(state=other.state, motions=contest.motions.stored(), ahead=np.int32(contest.ahead))
+        kept = rival._replace(state=other.state, motions=duel.motions.stored(), ahead=np.int32(duel.ahead))
         return attempt._replace(state=RivalledState(attempt.state, kept, open_for))
 
-    def _contest(self, attempt: Attempt, other: Attempt, rival: Rival) -> Contest:
+    def _duel(self, attempt: Attempt, other: Attempt, rival: Rival) -> Duel:
         """How the two stand; the pixels of the anchor are asked only where it matters."""
         motions = rival.motions.after(attempt.result, other.result)
-        contest = Contest.of(
-            motions, attempt.result, deviation(other), rival.age, stands_before=bool(rival.stands_before)
-        )
-        if not contest.asks_for_votes:
-            return contest
+        duel = Duel.of(motions, attempt.result, deviation(other), rival.age, stands_before=bool(rival.stands_before))
+        if not duel.asks_for_votes:
+            return duel
         both = np.stack([motions.first_T_anchor, motions.rival_T_anchor]).astype(np.float32)
         margin = vote(rival.anchor, _view(attempt.state), both, rival.near, self.first.segmenter.camera)
-        return replace(contest, margin=margin, ahead=int(rival.ahead) + 1 if leads(margin) else 0)
+        return replace(duel, margin=margin, ahead=int(rival.ahead) + 1 if leads(margin) else 0)
 
     def _taken(
         self, other: Attempt, rival: Rival, open_for: Span, open_after: Span, *, clearly: bool = False

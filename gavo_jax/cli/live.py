@@ -70,7 +70,8 @@ def run_live(options: Run) -> int:
             **run_identity(device.name, method, preset, options.seed),
             "complete": end.fault is None,
             **finish_run(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
-            **{"frames_received": newest.received, "frames_dropped": newest.dropped},
+            "frames_received": newest.received,
+            "frames_dropped": newest.dropped,
         }
         folder.finish(metrics)
         write_trajectories(trajectory, folder.path, trajectory_formats)

@@ -135,7 +135,8 @@ def _fetch_patiently(url: str, partial: Path, progress: Progress) -> None:
 
     for attempt in range(ATTEMPTS):
         try:
-            return _fetch(url, partial, progress)
+            _fetch(url, partial, progress)
+            return
         except requests.HTTPError:
             raise
         except requests.RequestException:

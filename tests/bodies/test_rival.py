@@ -13,7 +13,7 @@ import pytest
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.contest import OVER, Span
+from gavo_jax.bodies.duel import OVER, Span
 from gavo_jax.bodies.rival import RivalledState, WithRival
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.bodies.votes import vote

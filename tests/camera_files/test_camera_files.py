@@ -88,8 +88,14 @@ OTHER = {"K": "K", "D": "D", "width": "width", "height": "height"}
 OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": MATRIX.T.ravel().tolist()}
 REPLICA = {"camera": {"w": 640, "h": 480, "fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5, "scale": 6553.5}}
 REALSENSE = {
-    **{"width": 640, "height": 480, "fx": 500.0, "fy": 510.0, "ppx": 319.5, "ppy": 239.5},
-    **{"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5},
+    "width": 640,
+    "height": 480,
+    "fx": 500.0,
+    "fy": 510.0,
+    "ppx": 319.5,
+    "ppy": 239.5,
+    "model": "distortion.inverse_brown_conrady",
+    "coeffs": [0.0] * 5,
 }
 NERF = {"fl_x": 500.0, "fl_y": 510.0, "cx": 319.5, "cy": 239.5, "w": 640, "h": 480.0, "k1": 0.0}
 LENS = dict(zip(("k1", "k2", "p1", "p2"), RADTAN, strict=True))

@@ -44,8 +44,10 @@ def test_a_cell_gives_its_steepest_point_with_a_reading(cell: int) -> None:
 def test_several_levels_give_the_points_of_each_alone() -> None:
     levels = [PyramidLevel(*(jnp.asarray(i, jnp.float32) for i in random_pair(6)[1:3]))]
     rng = np.random.default_rng(2)
-    for size in ((9, 12), (4, 6)):
-        levels.append(PyramidLevel(*(jnp.asarray(rng.uniform(0.1, 200.0, size), jnp.float32) for _ in range(2))))
+    levels += [
+        PyramidLevel(*(jnp.asarray(rng.uniform(0.1, 200.0, size), jnp.float32) for _ in range(2)))
+        for size in ((9, 12), (4, 6))
+    ]
     points = (48, 30, 48)
     together = jax.jit(lambda levels: make_references(levels, SMALL, Levels.of(SMALL, (2, 1, 0), points)))(
         tuple(levels)

@@ -105,7 +105,7 @@ class Motions(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Contest:
+class Duel:
     """How the two motions stand at a frame.
 
     Attributes:
@@ -127,8 +127,8 @@ class Contest:
     ahead: int = 0
 
     @classmethod
-    def of(cls, motions: Motions, first: Alignment, deviation: float, age: Span, *, stands_before: bool) -> "Contest":
-        """A contest in which nobody has voted, by the first one's last result."""
+    def of(cls, motions: Motions, first: Alignment, deviation: float, age: Span, *, stands_before: bool) -> "Duel":
+        """A duel in which nobody has voted, by the first one's last result."""
         return cls(motions, motions.contradiction(_in_target(first)), deviation, age, stands_before)
 
     @property
