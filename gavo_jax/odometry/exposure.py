@@ -26,8 +26,8 @@ class Exposure(NamedTuple):
         return cls(jnp.mean(grey), jnp.maximum(jnp.std(grey), 0.1))
 
 
-def relight(reference: Reference, before: Exposure, after: Exposure) -> Reference:
-    """Return points as they would be with another exposure, if it differs so much that a search would not find it."""
+def in_exposure(reference: Reference, before: Exposure, after: Exposure) -> Reference:
+    """Points as they would be with another exposure, if it differs so much that a search would not find it."""
     gain = after.spread / jnp.maximum(before.spread, 0.1)
     differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
     gain = jnp.where(differs, gain, 1.0)

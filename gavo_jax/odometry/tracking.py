@@ -22,7 +22,7 @@ from gavo_jax.image.sampling import Target
 from gavo_jax.image.synchronisation import synchronise_depth
 from gavo_jax.image.warp import Points, warp
 from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
-from gavo_jax.odometry.exposure import Exposure, relight
+from gavo_jax.odometry.exposure import Exposure, in_exposure
 from gavo_jax.odometry.plausibility import Usual, judge_by_history
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
@@ -189,7 +189,7 @@ def track_frame(
     target = _synchronised(raw, camera, delay * guess, finest) if options.synchronise else raw
     packed = prepare_target(target, levels)
     readout = _readout(camera, clock) if options.rolling_shutter else None
-    previous, keyframe = (relight(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
+    previous, keyframe = (in_exposure(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
     exchanged = None
     if alignment.symmetric:
         exchanged = Exchanged(make_references(target, camera, levels), state.previous_image)
