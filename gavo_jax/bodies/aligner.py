@@ -136,30 +136,48 @@ class BodyAware:
 
     def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:
         """Align, and look what moves."""
-        scene = state.scene
-        before = np.asarray(scene.tracks.labels) > 0
-        known, covered = bool(np.any(before)), float(np.mean(before))
+        before = np.asarray(state.scene.tracks.labels) > 0
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
         depth_disagrees = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
-        attempt, found, carried = seen, _bodies(look.belief, before, depth_disagrees), 0.0
-        arisen = np.mean((found > 0) & ~_near(before))
-        is_lost = not attempt.usable and (known or np.any(found))
-        is_asked = (arisen > SUSPICIOUS and attempt is first) or is_lost
-        is_depth_wrong = covered < LARGE and depth_alone_disagrees(first.result.explained)
-        if is_asked and not self.is_eager and not is_depth_wrong:
-            attempt = self._share_out(state, frame, clock, attempt)
-            if not attempt.usable and scene.carried < MAX_CARRIED:
-                found_none = attempt
-                attempt = self._helped_by_prediction(state, clock, found_none, covered)
-                carried = 0.0 if attempt is found_none else float(scene.carried + clock.elapsed)
+        found = _bodies(look.belief, before, depth_disagrees)
+        attempt, carried = seen, 0.0
+        if not self.is_eager and self._asks(first, seen, found, before):
+            attempt, carried = self._asked(state, frame, clock, seen)
         is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
-        if is_vague and known and not self.is_eager:
+        if not self.is_eager and is_vague and np.any(before):
             attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
             look = self._look(state, attempt)
             found = _bodies(look.belief, before, depth_disagrees)
         return self._remember(state, frame, clock, attempt, look, found, carried)
+
+    def _asks(
+        self, first: Attempt, seen: Attempt, found: Integer[np.ndarray, "h w"], before: Bool[np.ndarray, "h w"]
+    ) -> bool:
+        """Whether other motions are asked: where bodies appear away from those before, or beside bodies none was found.
+
+        Args:
+            first: The first attempt.
+            seen: What stands for it, where most of the image's area asked for another motion.
+            found: Bodies by that.
+            before: Where bodies were in the frame before.
+        """
+        has_arisen = np.mean((found > 0) & ~_near(before)) > SUSPICIOUS and seen is first
+        is_lost = not seen.usable and (np.any(before) or np.any(found))
+        is_depth_wrong = np.mean(before) < LARGE and depth_alone_disagrees(first.result.explained)
+        return bool(has_arisen or is_lost) and not is_depth_wrong
+
+    def _asked(self, state: AwareState, frame: Frame, clock: Clock, seen: Attempt) -> tuple[Attempt, float]:
+        """What other motions come to, and the seconds for which the last one has stood for those that were not found:
+        0 where one was.
+        """
+        attempt, before = self._share_out(state, frame, clock, seen), state.scene.carried
+        if attempt.usable or not before < MAX_CARRIED:
+            return attempt, 0.0
+        covered = float(np.mean(np.asarray(state.scene.tracks.labels) > 0))
+        helped = self._helped_by_prediction(state, clock, attempt, covered)
+        return helped, 0.0 if helped is attempt else float(before + clock.elapsed)
 
     def _remember(
         self,
