@@ -1,10 +1,11 @@
 """From a mask to bodies: which parts of it hang together, and which body of the frame before each one is."""
 
+import itertools
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Int32, Integer
 
 LEAST = 0.008
 """Share of the image that a body covers at least."""
@@ -95,28 +96,35 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
         found: Of `body_components`, in the new frame.
         tracks: Of the frame before, its labels moved to where they are expected in the new one.
     """
+    given = _numbers(found, tracks)
+    seen = given[1:]
+    labels = given[found]
+    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < UNSEEN]
+    for i in lasting:  # hidden, or at rest for a moment: where it was seen it is expected
+        labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
+    last = np.int32(max(int(tracks.last), *given))
+    after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels, last=last)  # pyright: ignore[reportArgumentType]
+    entries = [(n, 0) for n in seen] + [(tracks.numbers[i], tracks.ages[i] + 1) for i in lasting]
+    for place, (number, age) in enumerate(entries[:MOST]):
+        after.numbers[place], after.ages[place] = number, age
+        for old in np.flatnonzero(tracks.numbers == number):
+            after.motions[place], after.seconds[place] = tracks.motions[old], tracks.seconds[old]
+    return after
+
+
+def _numbers(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> Int32[np.ndarray, " parts"]:
+    """The number of each part of a mask, and 0 for what is none: those that overlap most are one body, and no two parts
+    are the same one.
+    """
+    parts = range(1, int(found.max(initial=0)) + 1)
     overlaps = sorted(
-        (-int(np.sum((found == part) & (tracks.labels == number))), part, number)
-        for part in range(1, int(found.max(initial=0)) + 1)
+        (-int(np.sum((found == part) & (tracks.labels == number))), part, int(number))
+        for part in parts
         for number in tracks.numbers[tracks.numbers > 0]
     )
     given: dict[int, int] = {}
     for overlap, part, number in overlaps:
         if overlap < 0 and part not in given and number not in given.values():
-            given[part] = int(number)
-    last = int(tracks.last)
-    for part in range(1, int(found.max(initial=0)) + 1):
-        if part not in given:
-            last += 1
-            given[part] = last
-    labels = np.array([0, *(given[part] for part in range(1, len(given) + 1))], np.int32)[found]
-    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in given.values() and tracks.ages[i] < UNSEEN]
-    for i in lasting:  # hidden, or at rest for a moment: where it was seen it is expected
-        labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
-    after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels)
-    entries = [(n, 0) for n in given.values()] + [(int(tracks.numbers[i]), int(tracks.ages[i]) + 1) for i in lasting]
-    for place, (number, age) in enumerate(entries[:MOST]):
-        after.numbers[place], after.ages[place] = number, age
-        for old in np.flatnonzero(tracks.numbers == number):
-            after.motions[place], after.seconds[place] = tracks.motions[old], tracks.seconds[old]
-    return after._replace(last=np.int32(last))  # pyright: ignore[reportArgumentType]
+            given[part] = number
+    new = itertools.count(int(tracks.last) + 1)
+    return np.array([0, *(given[part] if part in given else next(new) for part in parts)], np.int32)
