@@ -21,6 +21,8 @@ MOST = 8
 """Bodies at a time; the largest ones count."""
 UNSEEN = 15
 """Frames after which a body that is not seen is forgotten."""
+UNKNOWN = 1.0
+"""Seconds that stand for those of a motion that is not known: whatever comes next is possible after so many."""
 
 
 class BodyTracks(NamedTuple):
@@ -33,8 +35,9 @@ class BodyTracks(NamedTuple):
     ages: Integer[np.ndarray, " n"]
     """Frames since each was seen."""
     motions: Float[np.ndarray, "n 6"]
-    """Twist of each one's last motion in the camera, and `seconds` the time it took."""
+    """Twist of each one's last motion in the camera; 0 where it is not known."""
     seconds: Float[np.ndarray, " n"]
+    """Time that it took; `UNKNOWN` where it is not known."""
     last: Integer[np.ndarray, ""]
     """The largest number given so far."""
 
@@ -46,7 +49,7 @@ class BodyTracks(NamedTuple):
             np.zeros(MOST, np.int32),
             np.zeros(MOST, np.int32),
             np.zeros((MOST, 6), np.float32),
-            np.ones(MOST, np.float32),
+            np.full(MOST, UNKNOWN, np.float32),
             np.int32(0),  # pyright: ignore[reportArgumentType]
         )
 

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Integer
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import VelocityChange
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.identity import BodyTracks, associate
+from gavo_jax.bodies.identity import UNKNOWN, BodyTracks, associate
 from gavo_jax.bodies.records import Seen
 from gavo_jax.bodies.scene import AwareState, MotionSegmenter
 from gavo_jax.camera import to_ray
@@ -54,7 +54,8 @@ def find_motions(
         if aware.finds_motions and np.any(before.labels == number):
             alignment = _align(aware, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
-            tracks.motions[place], tracks.seconds[place] = alignment.xi if is_known else 0.0, clock.elapsed
+            tracks.motions[place] = alignment.xi if is_known else 0.0
+            tracks.seconds[place] = clock.elapsed if is_known else UNKNOWN
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
         centroid = _centroid(part, inverse_depth, aware.segmenter)
         seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))

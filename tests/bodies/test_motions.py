@@ -13,7 +13,7 @@ from carded import BOX, CAMERA, TRACKED, field
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.identity import BodyTracks, associate
+from gavo_jax.bodies.identity import UNKNOWN, BodyTracks, associate
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
@@ -66,7 +66,7 @@ def test_a_bodys_motion_is_its_own_under_a_rolling_shutter() -> None:
 def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     status: AlignmentStatus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next motion is judged by it, and its search begins there."""
+    """The next motion is judged by it, and its search begins there. Where it is not known the body was not at rest."""
     xi = np.full(6, 0.01, np.float32)
     found = no_alignment(status)._replace(xi=xi)
     monkeypatch.setattr(motions, "_align", lambda *_: found)
@@ -83,5 +83,14 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     nearness = np.ones(part.shape)
     tracks, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
     assert seen[0].alignment is found
-    kept = tracks.motions[list(tracks.numbers).index(seen[0].number)]
-    np.testing.assert_array_equal(kept, xi if status is AlignmentStatus.OK else np.zeros(6))
+    place = list(tracks.numbers).index(seen[0].number)
+    is_known = status is AlignmentStatus.OK
+    np.testing.assert_array_equal(tracks.motions[place], xi if is_known else np.zeros(6))
+    assert tracks.seconds[place] == (clock.elapsed if is_known else UNKNOWN)
+
+
+def test_a_body_whose_motion_was_once_in_doubt_is_known_again() -> None:
+    """It was taken to have been at rest, so that no motion of half a metre a second was possible after that."""
+    bodies = [body for step in track(SyntheticSequence(14, camera=CAMERA, bodies=2), TRACKED) for body in step.bodies]
+    statuses = [body.status for body in bodies]
+    assert statuses.count("ok") > len(bodies) // 2 and "implausible_motion" not in statuses
