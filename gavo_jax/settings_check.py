@@ -1,6 +1,7 @@
 """What settings may hold, wherever they come from: Python, a file or the command line."""
 
 import dataclasses
+import operator
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -16,6 +17,23 @@ from gavo_jax.solvers.base import Schedule
 
 MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
 """What the device's numbers hold."""
+MAX_SEED = 2**32 - 1
+"""JAX's keys take no larger one in 32 bits: of a larger one the rest would be lost, and two seeds be the same."""
+
+
+def as_seed(seed: Any, name: str = "seed") -> int:
+    """A seed as a number of Python.
+
+    Raises:
+        GavoError: It is no whole number from 0 to `MAX_SEED`.
+    """
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if not 0 <= number <= MAX_SEED:
+        raise GavoError(f"{name}: must be a whole number from 0 to {MAX_SEED}, not {shown(seed)}")
+    return number
 
 
 def require_settings(settings: Any, place: str = "settings") -> None:
@@ -38,6 +56,8 @@ def require_settings(settings: Any, place: str = "settings") -> None:
     for name, part, field in _fields(settings):
         _require_kind(f"{place}: {name}", getattr(part, field.name), kind_of(type(part), field.name), field.default)
     _require_kind(f"{place}: solver.iterations", settings.solver.iterations, tuple[int, ...], ())
+    if min(settings.solver.iterations) < 0:
+        raise GavoError(f"{place}: solver.iterations: must be at least 0, not {min(settings.solver.iterations)}")
     if not any(settings.solver.iterations):
         raise GavoError(f"{place}: solver.iterations: every level has 0")
     for name, part, field in _fields(settings):

@@ -10,6 +10,7 @@ import pytest
 
 import gavo_jax as gavo
 from gavo_jax.settings import as_settings
+from gavo_jax.settings_check import as_seed
 
 NEWTON = gavo.GaussNewton()
 ROBUST = gavo.AlignmentOptions(depth=False)
@@ -52,6 +53,7 @@ def test_old_names_still_work_and_warn(old, new):
         ("solver", "iterations", 10, "solver.iterations: must be a list of 5 whole numbers, not 10"),
         ("solver", "iterations", [0, 0, 0, 0, 3], "a tuple is needed"),
         ("solver", "iterations", (0,) * 5, "solver.iterations: every level has 0"),
+        ("solver", "iterations", (-1, 0, 0, 6, 8), "solver.iterations: must be at least 0, not -1"),
         ("solver", "patience", 0, "solver.patience: must be at least 1, not 0"),
         ("solver", "mutants", 1.5, "solver.mutants: must be at most 1, not 1.5"),
         ("solver", "mutation_rate", None, "solver.mutation_rate: must be a number, not None"),
@@ -84,3 +86,11 @@ def test_numbers_of_arrays_and_what_is_traced_are_numbers():
 
     assert all(same(rate) for rate in (np.float32(0.2), jnp.float32(0.2), 1))
     assert jax.jit(lambda rate: rate * same(rate))(0.2) == jnp.float32(0.2)
+
+
+def test_a_seed_is_a_whole_number_that_keys_take():
+    """Of a larger one JAX took the last 32 bits: 2**32 was seed 0. Others ended in words of arrays."""
+    assert [as_seed(seed) for seed in (0, np.int64(3), jnp.int32(4), 2**32 - 1)] == [0, 3, 4, 2**32 - 1]
+    for wrong in ("1", 1.5, None, -1, 2**32, 2**70, float("nan"), np.array([1, 2]), jax.random.key(3)):
+        with pytest.raises(gavo.GavoError, match="seed: must be a whole number from 0 to 4294967295, not"):
+            as_seed(wrong)

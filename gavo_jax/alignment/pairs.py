@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.review import review
 from gavo_jax.alignment.search import align_views
-from gavo_jax.alignment.stacking import Images, stacked_pairs, stacked_sides
+from gavo_jax.alignment.stacking import Images, require_untraced, stacked_pairs, stacked_sides, typed_keys
 from gavo_jax.alignment.visits import levels_of, prepare_pair
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
@@ -20,6 +20,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
+from gavo_jax.se3 import rigid
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -91,13 +92,15 @@ def starts_of(
     not-a-number where there is none.
 
     Raises:
-        GavoError: The guesses are no matrices, or not as many as there are pairs.
+        GavoError: The guesses are no rigid motions, or not as many as there are pairs.
     """
     shape = (len(sides[0].grey), 4, 4)
     if guesses is None:
         guesses = np.broadcast_to(np.eye(4, dtype=np.float32), shape)
-    if np.shape(guesses) != shape:
+    elif np.shape(guesses) != shape:
         raise GavoError(f"guesses are of shape {np.shape(guesses)}: target_T_reference is needed, {shape}")
+    else:
+        guesses = _rigid_guesses(np.asarray(guesses, np.float64))
     kinds = FEATURE_KINDS[settings.alignment.features] if settings.alignment.refine else ()
     found = np.full((len(sides[0].grey), len(kinds), 4, 4), np.nan, np.float32)
     for row, pair in enumerate(zip(*sides[0], *sides[1], strict=True) if kinds else ()):
@@ -107,6 +110,25 @@ def starts_of(
             if motion is not None:
                 found[row, place] = motion.target_T_reference
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
+
+
+ROUNDED = 0.01
+"""Largest entry of RᵀR − I of a guess whose numbers have been rounded."""
+
+
+def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray, "b 4 4"]:
+    """The rigid motions that guesses stand for: a search starts from each, and its result would be none otherwise.
+
+    Raises:
+        GavoError: One is no rigid motion, or not finite.
+    """
+    for row, guess in enumerate(guesses):
+        rotation, last = guess[:3, :3], guess[3]
+        near = np.isfinite(guess).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() <= ROUNDED
+        if not (near and np.linalg.det(rotation) > 0 and np.array_equal(last, [0.0, 0.0, 0.0, 1.0])):
+            which = f"guess {row}" if len(guesses) > 1 else "the guess"
+            raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")
+    return rigid(guesses)
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
@@ -163,15 +185,15 @@ def align(
         `Alignment`; the camera's own motion is the inverse of its `target_T_reference`.
 
     Raises:
-        GavoError: The images are not of the camera's size, or of a wrong shape.
+        GavoError: The images are not of the camera's size, or hold no numbers of grey levels; the key is none, the
+            guess no rigid motion; or the call is traced, by `jax.jit` for instance.
     """
+    require_untraced(reference, target, camera, settings, solver, key, guess)
     settings = as_settings(settings, solver, alignment=options)
     sides = stacked_sides([reference], [target], camera)
-    key = jax.random.key(0) if key is None else key
-    if not isinstance(key, jax.Array):
-        raise GavoError(f"a key is needed, jax.random.key(seed), not {type(key).__name__}")
+    keys = (jax.random.key(0) if key is None else typed_keys(key, ()))[None]
     expected = None if guess is None else np.asarray(guess, np.float32)[None]
-    found = align_rows(sides, camera, settings, key[None], starts_of(expected, sides, camera, settings))
+    found = align_rows(sides, camera, settings, keys, starts_of(expected, sides, camera, settings))
     result = review(found, ([reference], [target]), sides, camera, settings, expected)
     row = jax.tree.map(lambda leaf: leaf[0], result)
     return row._replace(status=AlignmentStatus(int(row.status)))
@@ -206,8 +228,9 @@ def align_batch(
         An `Alignment` of NumPy arrays with a leading axis B; `status` is an integer array.
 
     Raises:
-        GavoError: The images are not of the camera's size, the two sides differ in number, or there are none.
+        GavoError: As of `align`, or the two sides differ in number, or there are none.
     """
+    require_untraced(references, targets, camera, settings, solver, keys, guesses)
     settings = as_settings(settings, solver, alignment=options)
     sides, keys = stacked_pairs(references, targets, camera, keys)
     found = align_rows(sides, camera, settings, keys, starts_of(guesses, sides, camera, settings))

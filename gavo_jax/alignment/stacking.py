@@ -1,16 +1,18 @@
 """Frames as they are given, of many kinds, stacked into arrays without lens distortion, as the program takes them."""
 
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.bars import without_bars
-from gavo_jax.datasets.base import Frame, require_grey_levels, what_helps
-from gavo_jax.errors import GavoError
+from gavo_jax.datasets.base import TRACED, Frame, require_grey_levels, require_image
+from gavo_jax.errors import GavoError, shown
 from gavo_jax.image.numbers import as_array, with_zeros
 
 
@@ -19,6 +21,16 @@ class Images(NamedTuple):
 
     grey: Any
     depth: Any
+
+
+def require_untraced(*values: Any) -> None:
+    """Refuse to work within `jax.jit`, and on what it, `jax.vmap` or `jax.grad` traces.
+
+    Raises:
+        GavoError: One of the values, or what is made here, has no number yet.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((values, jnp.zeros(())))):
+        raise GavoError(TRACED)
 
 
 def stacked_pairs(
@@ -33,10 +45,25 @@ def stacked_pairs(
     count, others = (len(side.grey) for side in sides)
     if others != count:
         raise GavoError(f"{count} references but {others} targets")
-    keys = jax.random.split(jax.random.key(0), count) if keys is None else keys
-    if np.shape(keys)[:1] != (count,):
-        raise GavoError(f"keys are of shape {np.shape(keys)}: one per pair is needed, jax.random.split(key, {count})")
-    return sides, keys
+    return sides, jax.random.split(jax.random.key(0), count) if keys is None else typed_keys(keys, (count,))
+
+
+def typed_keys(keys: Any, shape: tuple[int, ...]) -> PRNGKeyArray:
+    """Random keys of a shape, () for one, as `jax.random.key` makes them; as `jax.random.PRNGKey` does they are the
+    same ones, of another type, for which the search would be compiled anew.
+
+    Raises:
+        GavoError: They are none, or of another shape.
+    """
+    if isinstance(keys, jax.Array) and keys.dtype == np.uint32:
+        with suppress(TypeError, ValueError):  # numbers of another shape are no keys
+            keys = jax.random.wrap_key_data(keys)
+    if not isinstance(keys, jax.Array) or not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
+        raise GavoError(f"a key is needed, jax.random.key(seed), not {shown(keys)}")
+    if keys.shape != shape:
+        example = f"one per pair is needed, jax.random.split(key, {shape[0]})" if shape else "a single one is needed"
+        raise GavoError(f"keys are of shape {keys.shape}: {example}")
+    return keys
 
 
 def _plain(image: Any) -> Any:
@@ -48,11 +75,8 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
         raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
     grey, depth = map(_plain, (frame.grey, frame.depth) if isinstance(frame, Frame) else frame)
-    expected = (camera.height, camera.width)
     for name, image in (("grey", grey), ("depth", depth)):
-        if np.shape(image) != expected:
-            fault = f"{name} image is of shape {np.shape(image)}, the camera's is {expected}"
-            raise GavoError(fault + what_helps(name, image))
+        require_image(name, image, (camera.height, camera.width))
     require_grey_levels(grey)
     depth = with_zeros(depth)
     if isinstance(grey, np.ndarray) and isinstance(depth, np.ndarray):
@@ -86,8 +110,8 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         side = tuple(map(_plain, side))
         if camera.is_distorted:
             return stacked_images(list(zip(*side, strict=True)), camera)
-        if np.shape(side[0])[1:] != (camera.height, camera.width) or np.shape(side[0]) != np.shape(side[1]):
-            raise GavoError(f"images are of shape {np.shape(side[0])} and {np.shape(side[1])}, not [B, H, W] alike")
+        for name, images in zip(("grey", "depth"), side, strict=True):
+            require_image(name, images, (len(side[0]), camera.height, camera.width))
         require_grey_levels(side[0])
         if all(isinstance(images, np.ndarray) for images in side):
             side = tuple(map(np.stack, zip(*map(without_bars, *side), strict=True)))

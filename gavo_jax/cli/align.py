@@ -12,7 +12,7 @@ from gavo_jax.alignment.pairs import align as align_pair
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
-from gavo_jax.cli.selection import check_positive, check_seed, choose_settings
+from gavo_jax.cli.selection import check_positive, choose_settings
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import (
@@ -30,6 +30,7 @@ from gavo_jax.evaluation import rotation_angle
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
+from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import inverse
 
 MATRIX_DIGITS, TWIST_DIGITS = 7, 4
@@ -38,7 +39,7 @@ MATRIX_DIGITS, TWIST_DIGITS = 7, 4
 
 def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance`, `status` and more of one pair."""
-    check_seed(options.seed)
+    as_seed(options.seed, "--seed")
     check_positive("--depth-scale", options.depth_scale, 1e6)
     settings = choose_settings(options).settings
     images = [(options.rgb0, options.depth0), (options.rgb1, options.depth1)]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from gavo_jax import presets
 from gavo_jax.cli.options import Compare
 from gavo_jax.cli.run_table import covered_in_part, path_and_end, why_no_drift
-from gavo_jax.cli.selection import MAX_SEED, open_sequence
+from gavo_jax.cli.selection import open_sequence
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
@@ -46,6 +46,7 @@ from gavo_jax.output.screen import DASH, known_columns, number, print_table, say
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.peers.comparison import peer_odometry
 from gavo_jax.peers.registry import PEERS, make_peer
+from gavo_jax.settings_check import MAX_SEED
 from gavo_jax.trajectory import Trajectory
 
 COLUMNS = (

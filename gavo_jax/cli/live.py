@@ -12,7 +12,7 @@ from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_positive, check_seed, choose_settings, with_shortcuts
+from gavo_jax.cli.selection import check_positive, choose_settings, with_shortcuts
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
@@ -30,6 +30,7 @@ from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.scene_map import LiveMap, MapBuilder
 from gavo_jax.settings import Settings
+from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
@@ -39,7 +40,7 @@ NOT_LIVE = "not with the live source '{}': record it and run over that"
 
 def run_live(options: Run) -> int:
     """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
-    check_seed(options.seed)
+    as_seed(options.seed, "--seed")
     _refuse_what_cannot_be(options)
     trajectory_formats = formats(options.trajectory_format)
     shape = check_map_options(options.map, options.map_shape, options.voxel)

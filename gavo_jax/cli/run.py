@@ -9,7 +9,6 @@ from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import (
-    check_seed,
     choose_settings,
     open_sequence,
     settings_line,
@@ -42,6 +41,7 @@ from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.tracked import track_visibly
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
 from gavo_jax.settings import Settings
+from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
@@ -56,7 +56,7 @@ def run(options: Run) -> int:
         from gavo_jax.cli.live import run_live
 
         return run_live(options)
-    check_seed(options.seed)
+    as_seed(options.seed, "--seed")
     trajectory_formats = formats(options.trajectory_format)
     shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)

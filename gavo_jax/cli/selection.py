@@ -17,8 +17,6 @@ from gavo_jax.output.files import describe, read_json
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
-MAX_SEED = 2**32 - 1
-
 
 def open_sequence(source: Source, force: bool = False, color: bool = False) -> Sequence:
     """Return the chosen frames, checked as far as that is possible before a run.
@@ -128,12 +126,6 @@ def with_whole_paths(options: Run) -> Run:
         if place is not None and Path(place).exists()
     }
     return replace(options, **places)  # pyright: ignore[reportArgumentType]
-
-
-def check_seed(seed: int) -> None:
-    """Raise GavoError for a seed that JAX's keys do not take."""
-    if not 0 <= seed <= MAX_SEED:
-        raise GavoError(f"--seed: must be from 0 to {MAX_SEED}, not {seed}")
 
 
 def check_positive(option: str, value: float | None, most: float) -> None:

@@ -16,9 +16,11 @@ USUAL: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "jax_numpy_dtype_promotion": ("standard", jax.numpy_dtype_promotion),
     "jax_debug_nans": (False, jax.debug_nans),
     "jax_debug_infs": (False, jax.debug_infs),
+    "jax_debug_key_reuse": (False, jax.debug_key_reuse),
+    "jax_transfer_guard": (None, lambda _: jax.transfer_guard("allow")),
 }
 """Modes, what they are as JAX comes, and what sets them. Here not-a-number and infinity are no errors: they stand for
-what is not known, or worth nothing."""
+what is not known, or worth nothing. Images come from the host, and what is found goes there."""
 
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:

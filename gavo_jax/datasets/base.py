@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol, overload
 
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float, UInt8, UInt16
 
 from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
+from gavo_jax.image.numbers import is_real
 from gavo_jax.trajectory import Trajectory
 
 
@@ -16,9 +18,22 @@ class FrameError(GavoError):
     """A single frame that cannot be read: a fault of that frame, not of the whole sequence."""
 
 
-def what_helps(name: str, image: Any) -> str:
-    """The end of a sentence that refuses a frame's image for its shape: what to do with colour in the place of grey."""
-    return "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
+TRACED = "gavo_jax looks at its numbers on the host: call it outside jax.jit, jax.vmap and jax.grad"
+
+
+def require_image(name: str, image: Any, size: tuple[int, ...]) -> None:
+    """Refuse what is no image of real numbers of a size.
+
+    Raises:
+        FrameError: It is of another shape, holds something else, or is being traced.
+    """
+    if isinstance(image, Tracer):
+        raise FrameError(TRACED)
+    kind = image.dtype if hasattr(image, "dtype") else np.asarray(image).dtype
+    if np.shape(image) != size or not is_real(kind):
+        helps = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
+        fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
+        raise FrameError(fault + helps)
 
 
 BRIGHTEST = 400.0
@@ -26,18 +41,22 @@ BRIGHTEST = 400.0
 
 
 def require_grey_levels(grey: Any) -> None:
-    """Refuse grey images whose levels reach to 1, or far beyond 255.
+    """Refuse grey images whose levels reach to 1, far beyond 255, or as far below 0 as above.
 
     Raises:
-        FrameError: They are floats, none above 1, and not all black; or some are above `BRIGHTEST`.
+        FrameError: They are floats, none above 1, and not all black; or some are above `BRIGHTEST`; or the least is
+            below 0 by more than half of the greatest, which sharpening does not do.
     """
     values = np.asarray(grey)
-    if values.dtype == np.uint8 or values.dtype.kind not in "uif" or not values.size:
+    values = values if values.dtype == np.uint8 else values[np.isfinite(values)]
+    if values.dtype == np.uint8 or not values.size:
         return
-    most = np.max(values)
-    if values.dtype.kind == "f" and 0.0 < most <= 1.0:
+    least, most = float(np.min(values)), float(np.max(values))
+    if least < 0.0 and -least > 0.5 * most:
+        raise FrameError(f"grey levels reach from 0 to 255, not from {least:g}: add what was taken from them")
+    if not np.issubdtype(values.dtype, np.integer) and 0.0 < most <= 1.0:
         raise FrameError("grey levels reach from 0 to 255, not from 0 to 1: multiply by 255")
-    if BRIGHTEST < most < np.inf:
+    if most > BRIGHTEST:
         raise FrameError(f"grey levels reach from 0 to 255, not to {most:g}: scale the image")
 
 
@@ -120,6 +139,18 @@ class Frame:
         if depth is not None and not abs(timestamp - self.timestamp) < SAME_STAMP:
             depth = timestamp + self.depth_delay
         return replace(self, timestamp=timestamp, depth_timestamp=depth)
+
+
+def require_sequence(sequence: Any) -> None:
+    """Refuse what is no sequence: a list of frames, a generator, a path.
+
+    Raises:
+        GavoError: It lacks what a `Sequence` has.
+    """
+    needed = ("camera", "timestamps", "check", "__len__", "__getitem__")
+    if isinstance(sequence, type) or not all(hasattr(sequence, name) for name in needed):
+        fault = f"a Sequence is needed, not {type(sequence).__name__}"
+        raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
 
 
 class Sequence(Protocol):

@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.bars import without_bars
-from gavo_jax.datasets.base import Frame, FrameError, Sequence, what_helps
+from gavo_jax.datasets.base import Frame, Sequence, require_image
+from gavo_jax.errors import GavoError
 from gavo_jax.image.numbers import as_array, as_depth
 from gavo_jax.trajectory import Trajectory
 
@@ -19,13 +20,12 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
 
     Raises:
         FrameError: An image is not of the camera's size, or not one number per pixel.
+        GavoError: It is no frame.
     """
-    size = (camera.height, camera.width)
+    if not isinstance(frame, Frame):
+        raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
     for name, image in (("grey", frame.grey), ("depth", frame.depth)):
-        kind = np.asarray(image).dtype
-        if np.shape(image) != size or kind.kind not in "uif":
-            fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
-            raise FrameError(fault + what_helps(name, image))
+        require_image(name, image, (camera.height, camera.width))
     grey, depth = camera.undistort(*without_bars(as_array(frame.grey), as_depth(frame.depth)))
     color = None if frame.color is None else camera.undistort_image(frame.color)
     return replace(frame, grey=grey, depth=depth, color=color)

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from gavo_jax.errors import GavoError, shown
-from gavo_jax.settings_check import MAX_REAL
+from gavo_jax.settings_check import MAX_REAL, MAX_SEED
 
-MAX_SEED = 2**32 - 1
 MAX_RUNS = 1_000_000
 
 

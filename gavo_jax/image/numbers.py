@@ -11,6 +11,11 @@ Depth = UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
 """Of 16 bits, or float32 where it came as anything else: it may be in metres."""
 
 
+def is_real(kind: Any) -> bool:
+    """Whether a type of NumPy's or JAX's is one of real numbers, not of truth values, text or objects."""
+    return any(jnp.issubdtype(kind, family) for family in (jnp.integer, jnp.floating))
+
+
 KNOWN = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 """What OpenCV and the programs take."""
 
@@ -20,9 +25,10 @@ def as_array(image: Any) -> np.ndarray:
     there is no reading. What holds no real numbers stays as it is.
     """
     array = np.asarray(image.filled(0) if isinstance(image, np.ma.MaskedArray) else image)
-    if array.dtype in KNOWN or array.dtype.kind not in "iuf":
+    if array.dtype in KNOWN or not is_real(array.dtype):
         return array
-    return array.astype(np.uint16 if array.dtype == ">u2" else np.float32)
+    with np.errstate(over="ignore"):  # what is too large for 32 bits is infinite there: no reading
+        return array.astype(np.uint16 if array.dtype == ">u2" else np.float32)
 
 
 NO_READING = np.iinfo(np.uint16).max

@@ -26,7 +26,7 @@ from gavo_jax.datasets.base import (
     require_seconds,
 )
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.errors import GavoError, GavoWarning
+from gavo_jax.errors import GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
@@ -38,6 +38,7 @@ from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.way import Way
 from gavo_jax.settings import Settings, as_settings
+from gavo_jax.settings_check import as_seed
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
@@ -158,7 +159,7 @@ class Odometry:
         candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
 
     Raises:
-        GavoError: The camera's images are too small.
+        GavoError: The camera's images are too small, or the seed is none.
     """
 
     @in_32_bits
@@ -179,7 +180,7 @@ class Odometry:
         if self.settings.odometry.loops and relocaliser is None:
             fault = "a driver that is fed frame by frame keeps no map and closes no loops: run_odometry does"
             warnings.warn(f"odometry.loops: {fault}", GavoWarning, stacklevel=3)
-        self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(seed), record)
+        self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(as_seed(seed)), record)
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
 
@@ -267,12 +268,10 @@ class Odometry:
     def _accepted(self, frame: Frame | FrameError | None, timestamp: float) -> Frame | FrameError | None:
         """What is given, if it may be: a frame without distortion and at its stamp, or why there is none."""
         is_first = self.progress.last_index < 0
-        if isinstance(frame, Frame):
+        if not (frame is None or isinstance(frame, FrameError)):
             frame = rectified(frame, self.recorded)
             if is_first:  # later a dark image may be a covered lens
                 require_grey_levels(frame.grey)
-        elif not (frame is None or isinstance(frame, FrameError)):
-            raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
         require_seconds("timestamp", timestamp)
         timestamp = float(timestamp)
         if is_first:

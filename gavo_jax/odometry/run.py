@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.waits import Stopwatch
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import Sequence, require_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
@@ -23,6 +22,7 @@ from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before
 from gavo_jax.odometry.stream import track, unwatched
 from gavo_jax.presets import names_of
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
+from gavo_jax.settings_check import as_seed
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
@@ -95,14 +95,13 @@ def run_odometry(
     Raises:
         GavoError: It is no sequence, has fewer than two frames, or its own check refuses it.
     """
-    if isinstance(sequence, list | tuple | str | Path):
-        fault = f"a Sequence is needed, not {type(sequence).__name__}"
-        raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
+    require_sequence(sequence)
     if len(sequence) < 2:
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
     sequence = without_distortion(sequence)
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
+    seed = as_seed(seed)
     mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
     odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
     compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
@@ -111,7 +110,7 @@ def run_odometry(
     for step in track(sequence, odometry=odometry, watch=mapper.watch if mapper else unwatched):
         steps.append(step)
         if on_step is not None:
-            on_step(step)
+            on_step(replace(step, world_T_camera=step.world_T_camera.copy()))  # the run's own stays as it is
     seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     outcome = finish_run(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
-from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.settings import Settings
@@ -35,8 +35,10 @@ def track(
         watch: Is shown every frame (None: it could not be read) with its step (None: it is the first).
 
     Raises:
+        GavoError: It is no sequence, or gives what is no frame.
         FrameError: The first frame cannot be read.
     """
+    require_sequence(sequence)
     if odometry is None:
         odometry = Odometry(sequence.camera, settings, seed=seed)
 

@@ -200,9 +200,20 @@ def test_what_does_not_belong_to_the_frames_is_refused_by_name(small_frames: dic
         ("guesses are of shape", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.zeros(6))),
         ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.eye(4))),
         ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.tile(np.eye(4), (3, 1, 1)))),
+        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([2.0, 2.0, 2.0, 1.0]))),
+        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([-1.0, 1.0, 1.0, 1.0]))),
+        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.full((4, 4), np.nan))),
+        ("guess 1 is no", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.stack([np.eye(4), 0 * np.eye(4)]))),
         ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=key)),
         ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=jax.random.split(key, 3))),
     ]
     for words, call in calls:
         with pytest.raises(GavoError, match=words):
             call()
+
+
+def test_a_guess_of_rounded_numbers_is_a_motion(small_frames: dict[int, Frame]) -> None:
+    """The result was `not_rigid`, which says that the machine computes wrong numbers."""
+    guess = np.array(exp(jnp.array([0.01, 0.0, 0.02, 0.03, 0.02, -0.01])), np.float64)
+    found = align(small_frames[0], small_frames[1], CAMERA, NEWTON, guess=guess.round(3))
+    assert AlignmentStatus.NOT_RIGID not in found.statuses

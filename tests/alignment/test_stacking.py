@@ -1,8 +1,10 @@
 """Frames of any kind are stacked; what is none is refused."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from small import CAMERA, NEWTON
 
 from gavo_jax import presets
 from gavo_jax.alignment.pairs import align, align_batch
-from gavo_jax.alignment.stacking import stacked_images
+from gavo_jax.alignment.stacking import stacked_images, typed_keys
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -48,6 +50,83 @@ def test_images_too_small_for_a_pyramid_are_refused(width: int, height: int) -> 
             align(frame, frame, camera, presets.preset("ga", name))
     with pytest.raises(GavoError, match="16 pixels"):
         Odometry(camera)
+
+
+@pytest.mark.parametrize("kind", [bool, complex, object, str, "datetime64[s]"])
+@pytest.mark.parametrize("name", ["grey", "depth"])
+def test_what_holds_no_real_numbers_is_no_image(kind: Any, name: str, small_frames: dict[int, Frame]) -> None:
+    """Truth values and complex numbers were aligned without a word."""
+    frame = small_frames[0]
+    wrong = replace(frame, **{name: getattr(frame, name).astype(kind)})
+    pair = wrong.grey, wrong.depth
+    stack = wrong.grey[None], wrong.depth[None]
+    calls: list[Callable[[], Any]] = [
+        lambda: align(pair, frame, CAMERA, NEWTON),
+        lambda: align_batch(stack, [frame], CAMERA, NEWTON),
+        lambda: Odometry(CAMERA, NEWTON).register(wrong, 0.0),
+    ]
+    for call in calls:
+        with pytest.raises(GavoError, match=f"{name} image is .*: numbers of shape .* are needed"):
+            call()
+
+
+@pytest.mark.parametrize("shift", [-128.0, -100.0])
+def test_grey_levels_about_zero_are_refused(shift: float, small_frames: dict[int, Frame]) -> None:
+    """Images without their mean were aligned as if they were dark, and were off by two per cent of the way."""
+    frame = small_frames[0]
+    shifted = replace(frame, grey=frame.grey.astype(np.float32).clip(0, 200) + np.float32(shift))
+    shifted.grey[0, 0] = np.nan
+    for call in (
+        lambda: align(shifted, frame, CAMERA, NEWTON),
+        lambda: Odometry(CAMERA, NEWTON).register(shifted, 0.0),
+    ):
+        with pytest.raises(GavoError, match="grey levels reach from 0 to 255, not from -"):
+            call()
+
+
+def test_sharpening_may_go_below_zero(small_frames: dict[int, Frame]) -> None:
+    frame = small_frames[0]
+    sharp = frame.grey.astype(np.float32)
+    sharp[:2], sharp[2:4] = -90.0, 320.0
+    stacked_images([replace(frame, grey=sharp)], CAMERA)
+
+
+def test_numbers_beyond_32_bits_are_no_reading(small_frames: dict[int, Frame]) -> None:
+    frame = small_frames[0]
+    depth = frame.depth.astype(np.float64)
+    depth[0] = np.finfo(np.float64).max
+    assert not np.asarray(stacked_images([replace(frame, depth=depth)], CAMERA).depth)[0, 0].any()
+
+
+def test_a_traced_call_is_told(small_frames: dict[int, Frame]) -> None:
+    """It ended in a traceback from the middle of the checks."""
+    first, second = small_frames[0], small_frames[0]
+    grey, depth = jnp.asarray(first.grey), jnp.asarray(first.depth)
+    for call in (
+        lambda: jax.jit(lambda grey: align((grey, depth), second, CAMERA, NEWTON).error)(grey),
+        lambda: jax.jit(lambda x: x + align(first, second, CAMERA, NEWTON).error)(1.0),
+        lambda: jax.vmap(lambda grey: align((grey, depth), second, CAMERA, NEWTON).error)(grey[None]),
+        lambda: jax.vmap(lambda grey: align(Frame(grey, depth, 0.0), second, CAMERA, NEWTON).error)(grey[None]),  # pyright: ignore
+        lambda: jax.grad(lambda guess: align(first, second, CAMERA, NEWTON, guess=guess).error)(jnp.eye(4)),
+        lambda: jax.grad(lambda fx: align(first, second, replace(CAMERA, fx=fx), NEWTON).error)(131.0),
+        lambda: jax.jit(lambda grey: align_batch((grey, depth[None]), [second], CAMERA, NEWTON).error)(grey[None]),
+    ):
+        with pytest.raises(GavoError, match="outside jax.jit, jax.vmap and jax.grad"):
+            call()
+
+
+def test_keys_of_both_kinds_are_the_same() -> None:
+    """For those of the old kind the search was compiled anew."""
+    one, two = jax.random.key(5), jax.random.split(jax.random.key(5), 2)
+    assert typed_keys(jax.random.PRNGKey(5), ()) == typed_keys(one, ()) == one
+    assert (typed_keys(jax.random.split(jax.random.PRNGKey(5), 2), (2,)) == two).all()
+    for wrong in (5, np.zeros(2, np.uint32), jnp.zeros(3, jnp.uint32), jnp.zeros(2), jnp.uint32(3)):
+        with pytest.raises(GavoError, match="a key is needed"):
+            typed_keys(wrong, ())
+    with pytest.raises(GavoError, match="a single one is needed"):
+        typed_keys(two, ())
+    with pytest.raises(GavoError, match="one per pair is needed"):
+        typed_keys(jax.random.PRNGKey(5), (2,))
 
 
 def test_wrong_sizes_are_refused(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:

@@ -66,11 +66,15 @@ def test_where_it_is_switched_off_nothing_changes() -> None:
         partial(jax.numpy_dtype_promotion, "strict"),
         partial(jax.debug_nans, True),
         partial(jax.debug_infs, True),
+        partial(jax.debug_key_reuse, True),
+        partial(jax.transfer_guard, "disallow"),
     ],
-    ids=["ranks", "types", "not-a-number", "infinity"],
+    ids=["ranks", "types", "not-a-number", "infinity", "keys", "transfers"],
 )
 def test_modes_that_look_for_errors_do_not_look_here(mode: Callable[[], Any], wanted: list[np.ndarray]) -> None:
-    """They ended in tracebacks: ours leaves promotion to JAX, and not-a-number stands for what is not known."""
+    """They ended in tracebacks: ours leaves promotion to JAX, and not-a-number stands for what is not known. Images
+    come from the host.
+    """
     with mode():
         found = results()
     for one, other in zip(found, wanted, strict=True):

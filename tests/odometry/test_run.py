@@ -1,7 +1,9 @@
 """A run over a sequence: what it is given is checked, the seed decides its bits, a real clip is followed."""
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,16 +14,18 @@ from small import Rendered
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import OdometryRun, run_odometry
+from gavo_jax.odometry.stream import track
 from gavo_jax.status import AlignmentStatus
 
 
 def test_what_is_no_sequence_is_refused_by_name():
     frames = list(SyntheticSequence(frames=2, camera=small.CAMERA))
-    for wrong in (frames, "fr1_xyz"):
-        with pytest.raises(GavoError, match="a Sequence is needed, not (list|str)"):
-            run_odometry(wrong)  # pyright: ignore[reportArgumentType]
+    for wrong in (frames, "fr1_xyz", iter(frames), {}, None, np.zeros(3), SyntheticSequence):
+        for call in (run_odometry, lambda wrong: list(track(wrong, small.NEWTON))):
+            with pytest.raises(GavoError, match="a Sequence is needed, not [a-zA-Z_]+: "):
+                call(wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="Camera is needed"):
         Odometry("fr1")  # pyright: ignore[reportArgumentType]
     odometry = Odometry(small.CAMERA, small.NEWTON)
@@ -31,6 +35,34 @@ def test_what_is_no_sequence_is_refused_by_name():
     odometry.register(frames[0], 0.0)
     step = odometry.register(replace(frames[1], grey=dark), 1 / 30)  # a covered lens is no reason to end a run
     assert step is not None and step.alignment.status is not AlignmentStatus.OK
+
+
+@pytest.mark.parametrize("wrong", [None, "rgb/1.png", (np.zeros((120, 160), np.uint8),) * 2])
+def test_a_sequence_of_what_is_no_frame_is_told(wrong: Any) -> None:
+    """It ended in an AttributeError in a thread."""
+    altered = Altered(Rendered(3, camera=small.CAMERA), lambda index, frame: wrong if index == 1 else frame)
+    with pytest.raises(GavoError, match="a Frame is needed, not (NoneType|str|tuple)"):
+        run_odometry(altered, small.NEWTON)
+
+
+def test_who_is_shown_a_step_may_change_its_pose() -> None:
+    """In millimetres, say: the trajectory was in millimetres, too, but for its first pose."""
+
+    def in_millimetres(step: Step) -> None:
+        step.world_T_camera[:3, 3] *= 1000.0
+
+    part = Rendered(3, camera=small.CAMERA)
+    shown = run_odometry(part, small.NEWTON, on_step=in_millimetres).trajectory
+    np.testing.assert_array_equal(shown.world_T_camera, run_odometry(part, small.NEWTON).trajectory.world_T_camera)
+
+
+def test_a_run_over_the_room_goes_to_another_process() -> None:
+    """Of its sequence's kept frames pickle knew nothing."""
+    done = run_odometry(SyntheticSequence(3, camera=small.CAMERA)[1:], small.NEWTON, seed=np.uint8(1))  # pyright: ignore
+    same = pickle.loads(pickle.dumps(done))
+    np.testing.assert_array_equal(same.trajectory.world_T_camera, done.trajectory.world_T_camera)
+    assert done.sequence is not None
+    np.testing.assert_array_equal(same.sequence[1].grey, done.sequence[1].grey)
 
 
 def test_follows_the_camera(sequence: SyntheticSequence, plain_run: OdometryRun) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, overload
+from typing import Any, ClassVar, overload
 
 import cv2
 import numpy as np
@@ -112,8 +112,20 @@ class SyntheticSequence:
             bodies = builtin_bodies(bodies, seed, self._truth.world_T_camera[0], self._half_extent)
         self._bodies = tuple(bodies)
         self._bodies_truth = truths(self._bodies, self._truth.timestamps)
+        self._keep_last()
+
+    def _keep_last(self) -> None:
         self._render: Callable[[int], Frame] = lru_cache(maxsize=2)(self._render_frame)
         self._expose: Callable[[int], tuple[np.ndarray, ...]] = lru_cache(maxsize=2)(self._expose_frame)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the frames that are kept, which another process renders again."""
+        return {name: value for name, value in vars(self).items() if name not in ("_render", "_expose")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """What was pickled, or copied, with no frame kept."""
+        vars(self).update(state)
+        self._keep_last()
 
     @property
     def name(self) -> str:
@@ -164,6 +176,7 @@ class SyntheticSequence:
         if isinstance(index, slice):
             part = copy.copy(self)
             part._selection = self._selection[index]
+            part._render, part._expose = self._render, self._expose
             return part
         return self._render(int(self._selection[index]))
 
