@@ -23,6 +23,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.se3 import exp
+from gavo_jax.settings_file import save_settings
 from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer import colors, live, pictures, search_space
 from gavo_jax.viewer.scene import NOTHING
@@ -341,23 +342,15 @@ def test_missing_package_and_missing_screen_are_said(tmp_path, monkeypatch):
         live.make_viewer("save", tmp_path / "run.rrd")
 
 
-def test_a_window_that_does_not_open_is_said_in_one_line(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "gavo_jax",
-        "run",
-        "--viewer",
-        "spawn",
-        "--frames",
-        "3",
-        "--method",
-        "gauss-newton",
-    ]
+def test_a_window_that_does_not_open_is_said_in_one_line(tmp_path, forty_frames, run):
+    del run  # has compiled what the command starts
+    save_settings(tmp_path / "settings.toml", GENETIC)
+    source = [str(forty_frames), "--camera", str(forty_frames / "camera.toml"), "--settings", "settings.toml"]
+    command = [sys.executable, "-m", "gavo_jax", "run", *source, "--viewer", "spawn", "--frames", "3"]
     outside = {**os.environ, "DISPLAY": ":4711"}
     outside.pop("WAYLAND_DISPLAY", None)
-    run = subprocess.run(command, cwd=tmp_path, env=outside, capture_output=True, text=True, timeout=60, check=False)
-    assert run.returncode == 2 and run.stderr.startswith("gavo: --viewer spawn: ") and run.stderr.count("\n") == 1
+    done = subprocess.run(command, cwd=tmp_path, env=outside, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2 and done.stderr.startswith("gavo: --viewer spawn: ") and done.stderr.count("\n") == 1
 
 
 def test_a_fault_in_the_thread_reaches_the_user(tmp_path):
