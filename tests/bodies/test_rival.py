@@ -1,6 +1,5 @@
 """A motion that only seems to be the camera's loses against what stands behind: from the first frame on, and told."""
 
-import importlib
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -73,13 +72,6 @@ def error_mm(sequence: Any, steps: list[Step]) -> float:
     truth = sequence.camera_at(np.array([sequence.timestamps[0], steps[-1].timestamp]))
     between = inverse(inverse(truth[0]) @ truth[1]) @ steps[-1].world_T_camera
     return 1e3 * float(np.linalg.norm(between[:3, 3]))
-
-
-@pytest.fixture
-def clips(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The benchmark's, with a card put in."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    return importlib.import_module("moving_clips")
 
 
 @pytest.mark.parametrize(("share", "seed"), [(0.25, 2), (0.33, 5)])
