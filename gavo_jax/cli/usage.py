@@ -94,7 +94,10 @@ def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: 
     if not command and (not arguments or not arguments[0].startswith("-")):
         return _no_command(arguments)
     if found := re.match(r"Unrecognized (?:or misplaced )?options: (\S+)", said):
-        return _unknown(found[1].rstrip(","), lines, f"gavo {command} --help")
+        name = found[1].rstrip(",")
+        if name in itertools.dropwhile(lambda word: word != "--", arguments):
+            return f"{name}: stands after --, where options end"
+        return _unknown(name, lines, f"gavo {command} --help")
     if said.startswith("Missing from"):
         names = [words[1] for line in first if (words := re.match(r" {4}(\S+)", line))]
         return f"missing: {', '.join(names)}"

@@ -355,6 +355,7 @@ USAGE = {
     "runn": ("unknown command 'runn'; did you mean 'run'?",),
     "help": ("unknown command 'help'; one of run, compare,",),
     "run --frame 3": ("unknown option --frame; did you mean --frames? (see gavo run --help)",),
+    "run -- FOLDER --frames 3": ("--frames: stands after --, where options end (see gavo run --help)",),
     "run --xyzzy": ("unknown option --xyzzy (see",),
     "doctor --json": ("unknown option --json (see gavo doctor --help)",),
     "run one two": ("one argument too many: 'two'",),
