@@ -15,7 +15,7 @@ import tyro
 
 from gavo_jax import interrupts
 from gavo_jax.cli.options import Command, Doctor
-from gavo_jax.cli.usage import HelpPage, asking_for_help, fault_of_usage
+from gavo_jax.cli.usage import HelpPage, asking_for_help, empty_argument, fault_of_usage
 from gavo_jax.compilation import compiler
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, GavoWarning, shown, tell
@@ -136,6 +136,8 @@ def _parse(arguments: list[str]) -> Command | None:
     Raises:
         GavoError: unknown or missing arguments.
     """
+    if fault := empty_argument(arguments):
+        raise GavoError(fault)
     messages, page = io.StringIO(), HelpPage(sys.stdout)
     try:
         with contextlib.redirect_stderr(messages), contextlib.redirect_stdout(page):

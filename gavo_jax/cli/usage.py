@@ -75,6 +75,15 @@ def asking_for_help(arguments: Sequence[str]) -> list[str]:
     return list(arguments)
 
 
+def empty_argument(arguments: Sequence[str]) -> str | None:
+    """What is wrong where an argument, or an option's value, is empty: as a path it would be the current folder."""
+    for before, argument in itertools.pairwise(("", *arguments)):
+        if argument == "" or re.fullmatch(r"--[\w-]+=", argument):
+            place = argument.removesuffix("=") or before
+            return f"{place}: an empty argument: is a variable not set?".removeprefix(": ")
+    return None
+
+
 def fault_of_usage(box: str, arguments: Sequence[str]) -> str:
     """Return one line on what is wrong with the arguments.
 

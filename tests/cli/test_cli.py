@@ -1,6 +1,7 @@
 """The command `gavo`, in process: files, exit statuses, refusals."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -375,8 +376,29 @@ def test_usage_error_says_what_would_help(gavo, arguments):
     assert is_refused(gavo(*arguments.split()), *USAGE[arguments])
 
 
+@pytest.mark.parametrize(
+    ("arguments", "where"),
+    [
+        (("run", "synthetic", "--output", ""), "--output"),
+        (("run", "synthetic", "--output="), "--output"),
+        (("view", ""), "view"),
+    ],
+)
+def test_an_empty_argument_is_not_the_current_folder(gavo, arguments, where):
+    """A variable that is not set wrote a run's files wherever the user was."""
+    assert is_refused(gavo(*arguments), f"{where}: an empty argument: is a variable not set?")
+
+
 def test_every_command_is_one_that_usage_knows():
     assert set(COMMANDS) == {get_args(one)[1].name for one in get_args(options.Command)}
+
+
+@pytest.mark.parametrize(
+    "command", [get_args(one)[0] for one in get_args(options.Command)], ids=lambda one: one.__name__
+)
+def test_every_command_is_a_function_of_its_name(command):
+    name = command.__name__.lower()
+    assert callable(getattr(importlib.import_module(f"gavo_jax.cli.{name}"), name))
 
 
 @pytest.mark.parametrize("arguments", [(), ("nonsense",), ("align", "a.png"), ("evaluate", "one.txt")], ids=str)
