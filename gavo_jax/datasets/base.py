@@ -145,9 +145,9 @@ def require_sequence(sequence: Any) -> None:
     """Refuse what is no sequence: a list of frames, a generator, a path.
 
     Raises:
-        GavoError: It lacks what a `Sequence` has.
+        GavoError: It lacks what tracking needs of a `Sequence`.
     """
-    needed = ("camera", "timestamps", "check", "__len__", "__getitem__")
+    needed = ("camera", "timestamps", "__len__", "__getitem__")
     if isinstance(sequence, type) or not all(hasattr(sequence, name) for name in needed):
         fault = f"a Sequence is needed, not {type(sequence).__name__}"
         raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
