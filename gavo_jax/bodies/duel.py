@@ -74,13 +74,18 @@ class Motions(NamedTuple):
         still = np.eye(4, dtype=np.float32)
         return cls(still, still, np.zeros((6, 6), np.float32))
 
+    def exact(self) -> "Motions":
+        """The same, in double precision."""
+        return Motions(*(np.asarray(leaf, np.float64) for leaf in self))
+
     def after(self, first: Alignment, rival: Alignment) -> "Motions":
         """Both with one more frame's."""
+        before = self.exact()
         onward = np.asarray(rival.target_T_reference, np.float64)
         return Motions(
-            np.asarray(first.target_T_reference) @ np.asarray(self.first_T_anchor, np.float64),
-            onward @ np.asarray(self.rival_T_anchor, np.float64),
-            transport_covariance(onward, np.asarray(self.covariance, np.float64)) + _in_target(rival),
+            np.asarray(first.target_T_reference) @ before.first_T_anchor,
+            onward @ before.rival_T_anchor,
+            transport_covariance(onward, before.covariance) + _in_target(rival),
         )
 
     def stored(self) -> "Motions":
@@ -89,15 +94,15 @@ class Motions(NamedTuple):
 
     def exceed(self, limits: tuple[float, float]) -> bool:
         """Whether there are more than so many metres, or radians, between the two."""
-        first, rival = (np.asarray(motion, np.float64) for motion in (self.first_T_anchor, self.rival_T_anchor))
+        first, rival, _ = self.exact()
         length, angle = length_and_angle(inverse(first) @ rival)
         return float(length) > limits[0] or float(angle) > limits[1]
 
     def contradiction(self, beside: Float64[np.ndarray, "6 6"] | float = 0.0) -> float:
         """Squared Mahalanobis distance of the two, by the rival's covariance and another one `beside` it."""
-        first, rival = (np.asarray(motion, np.float64) for motion in (self.first_T_anchor, self.rival_T_anchor))
+        first, rival, covariance = self.exact()
         step = log(first @ inverse(rival))
-        return float(step @ np.linalg.solve(beside + np.asarray(self.covariance, np.float64), step))
+        return float(step @ np.linalg.solve(beside + covariance, step))
 
     def have_parted(self, *, clearly: bool = False) -> bool:
         """Whether they differ; `clearly`: by more than the rival's errors, too."""

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int32, Integer
 
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
+
 LEAST = 0.008
 """Share of the image that a body covers at least."""
 SHOWS = 0.03
@@ -21,8 +23,6 @@ MOST = 8
 """Bodies at a time; the largest ones count."""
 UNSEEN = 15
 """Frames after which a body that is not seen is forgotten."""
-UNKNOWN = 1.0
-"""Seconds that stand for those of a motion that is not known: whatever comes next is possible after so many."""
 
 
 class BodyTracks(NamedTuple):
@@ -37,7 +37,7 @@ class BodyTracks(NamedTuple):
     motions: Float[np.ndarray, "n 6"]
     """Twist of each one's last motion in the camera; 0 where it is not known."""
     seconds: Float[np.ndarray, " n"]
-    """Time that it took; `UNKNOWN` where it is not known."""
+    """Time that it took; `UNKNOWN_SECONDS` where it is not known."""
     last: Integer[np.ndarray, ""]
     """The largest number given so far."""
 
@@ -49,7 +49,7 @@ class BodyTracks(NamedTuple):
             np.zeros(MOST, np.int32),
             np.zeros(MOST, np.int32),
             np.zeros((MOST, 6), np.float32),
-            np.full(MOST, UNKNOWN, np.float32),
+            np.full(MOST, UNKNOWN_SECONDS, np.float32),
             np.int32(0),  # pyright: ignore[reportArgumentType]
         )
 

@@ -8,13 +8,13 @@ from jaxtyping import Float64, Integer
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import VelocityChange
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.identity import UNKNOWN, BodyTracks, associate
+from gavo_jax.bodies.identity import BodyTracks, associate
 from gavo_jax.bodies.records import Seen
 from gavo_jax.bodies.scene import AwareState, MotionSegmenter
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.points import Reference, apply_rolling_shutter
-from gavo_jax.odometry.plausibility import Usual
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS, Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.status import AlignmentStatus
 
@@ -55,7 +55,7 @@ def find_motions(
             alignment = _align(aware, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
             tracks.motions[place] = alignment.xi if is_known else 0.0
-            tracks.seconds[place] = clock.elapsed if is_known else UNKNOWN
+            tracks.seconds[place] = clock.elapsed if is_known else UNKNOWN_SECONDS
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
         centroid = _centroid(part, inverse_depth, aware.segmenter)
         seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))

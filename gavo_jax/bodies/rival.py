@@ -176,7 +176,7 @@ class WithRival:
             clearly: Whether motions that differ by no more than the rival's errors are the same: nothing speaks for
                 the rival but that it goes on.
         """
-        first_T_anchor, rival_T_anchor = (np.asarray(motion, np.float64) for motion in rival.motions[:2])
+        first_T_anchor, rival_T_anchor, _ = rival.motions.exact()
         onward = np.asarray(other.result.target_T_reference) @ rival_T_anchor
         result = _returned(other.result, onward @ inverse(first_T_anchor))
         taken = other._replace(state=self._alone(other.state, open_after), result=result)

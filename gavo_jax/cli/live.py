@@ -145,17 +145,15 @@ def _track(
 
 def _frames(newest: Newest, camera: Camera, *, color: bool) -> Iterator[tuple[float, Frame | FrameError]]:
     """Stamps and frames as they come. Images that are unlike the first ones make a lost frame."""
-    is_first = True
     images: LiveImages
-    for images in newest:
+    for index, images in enumerate(newest):
         try:
             frame = frame_of(images, camera, color=color)
         except GavoError as error:
-            if is_first:
+            if index == 0:
                 raise
             frame = FrameError(str(error))
         yield images.timestamp, frame
-        is_first = False
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:

@@ -82,19 +82,21 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
             the farthest; or some images hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
-    whole, floats = ([image.name for image in samples if _is_of_floats(image.raw) is kind] for kind in (False, True))
+    clean = [without_invalid(image.raw) for image in samples]
+    kinds = [_is_of_floats(image) for image in clean]
+    whole, floats = (
+        [image.name for image, own in zip(samples, kinds, strict=True) if own is kind] for kind in (False, True)
+    )
     if whole and floats and given is None:
         raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
-    clean = [without_invalid(image.raw) for image in samples]
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     file = given or _likely_unit(readings, calibration, samples[0].name if samples else "")
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
     return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE, True if floats and given is None else None)
 
 
-def _is_of_floats(raw: np.ndarray) -> bool | None:
+def _is_of_floats(readings: np.ndarray) -> bool | None:
     """Whether depth is in fractions; None where it has no reading. Whole numbers beyond 16 bits come as floats, too."""
-    readings = without_invalid(raw)
     if not readings.any():
         return None
     return readings.dtype != np.uint16 and bool((readings % 1).any())

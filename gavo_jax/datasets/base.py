@@ -48,8 +48,10 @@ def require_grey_levels(grey: Any) -> None:
             below 0 by more than half of the greatest, which sharpening does not do.
     """
     values = np.asarray(grey)
-    values = values if values.dtype == np.uint8 else values[np.isfinite(values)]
-    if values.dtype == np.uint8 or not values.size:
+    if values.dtype == np.uint8:
+        return
+    values = values[np.isfinite(values)]
+    if not values.size:
         return
     least, most = float(np.min(values)), float(np.max(values))
     if least < 0.0 and -least > 0.5 * most:

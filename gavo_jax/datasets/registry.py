@@ -158,7 +158,7 @@ def recognise(path: Path) -> Dataset:
     dataset, faults = _asked(path)
     if dataset is not None:
         return dataset
-    there = unrecognised.describe(path, [dataset.kind for dataset in datasets()], is_source)
+    there = unrecognised.describe(path, [dataset.kind for dataset in datasets()], _is_source)
     raise GavoError("; ".join([f"{path}: {there}", *faults, *faulty_plugins()]))
 
 
@@ -179,9 +179,9 @@ def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
 
 def source_around(path: Path) -> Path | None:
     """The folder of the source that a file or folder is a part of; None where it is of none."""
-    return unrecognised.source_around(path, is_source)
+    return unrecognised.source_around(path, _is_source)
 
 
-def is_source(path: Path) -> bool:
+def _is_source(path: Path) -> bool:
     """Whether a source of a known kind is at a path."""
     return _asked(path)[0] is not None

@@ -154,17 +154,17 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
 
 def _in_file(file: Path) -> str | None:
     """How what a file holds becomes a source, where its name tells."""
-    endings = [suffix.lower() for suffix in file.suffixes]
-    if endings[-2:] == [".bag", ".active"]:
+    before, last = ["", "", *(suffix.lower() for suffix in file.suffixes)][-2:]
+    if (before, last) == (".bag", ".active"):
         return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
-    if endings and endings[-1] in RECORDINGS:
-        return RECORDINGS[endings[-1]]
-    if endings[-1:] and endings[-1] in FILMS:
+    if last in RECORDINGS:
+        return RECORDINGS[last]
+    if last in FILMS:
         return (
             "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"
         )
-    how = PACKED.get(endings[-1]) if endings else None
-    return f"packed: unpack it first ({'tar -xf' if endings[-2:-1] == ['.tar'] else how})" if how else None
+    how = PACKED.get(last)
+    return f"packed: unpack it first ({'tar -xf' if before == '.tar' else how})" if how else None
 
 
 def _listed(names: list[str]) -> str:

@@ -25,6 +25,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.tracking import Clock, TrackerState, blank_state, track_frame
 from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions, Settings
@@ -217,7 +218,7 @@ def expecting(state: Any, xi: Float64[np.ndarray, " 6"], seconds: float) -> Any:
 def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)
-    return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(1.0))
+    return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(UNKNOWN_SECONDS))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:

@@ -28,6 +28,8 @@ MAX_SPEED = (5.0, 12.0)
 """m/s and rad/s: images of a faster camera are smeared."""
 STAMP_JITTER = 0.02
 """Seconds that two stamps may be off against each other; a moving camera then seems faster or slower, on its way."""
+UNKNOWN_SECONDS = 1.0
+"""Seconds that stand for those of a motion that is not known: whatever comes next is possible after so many."""
 TOLERANCE = (0.015, 0.01)
 """Metres and radians that an estimate may be off by itself."""
 MAX_ERROR_RATIO = 6.0
@@ -98,7 +100,7 @@ def judge_by_history(
         contrast: Of the new image, grey levels.
         predicted: Twist of the motion if the camera had gone on as before.
         elapsed: Since the reference, seconds.
-        last_elapsed: The time that the motion before took; a second where there was none.
+        last_elapsed: The time that the motion before took; `UNKNOWN_SECONDS` where there was none.
     """
     motion = result.target_T_reference
     change = _change(log(motion), predicted, STAMP_JITTER / elapsed)

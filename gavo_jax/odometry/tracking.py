@@ -23,7 +23,7 @@ from gavo_jax.image.synchronisation import synchronise_depth
 from gavo_jax.image.warp import Points, warp
 from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
 from gavo_jax.odometry.exposure import Exposure, in_exposure
-from gavo_jax.odometry.plausibility import Usual, judge_by_history
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS, Usual, judge_by_history
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
 from gavo_jax.solvers.base import Solver
@@ -46,7 +46,7 @@ class TrackerState(NamedTuple):
     velocity_change: VelocityChange
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
-    """Time that the last motion took, seconds."""
+    """Time that the last motion took, seconds; `UNKNOWN_SECONDS` where it is not known."""
     share: Float[Array, ""]
     """Share of the image whose points take part in the next search: less where those of bodies are left out."""
     exposure: Exposure
@@ -246,7 +246,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         guess=jnp.zeros(6),
         instant_motion=jnp.zeros(6),
         velocity_change=VelocityChange.unknown(),
-        seconds=jnp.float32(1.0),
+        seconds=jnp.float32(UNKNOWN_SECONDS),
         share=jnp.float32(1.0),
         exposure=Exposure.of(pyramid),
         usual=Usual.unknown(),
@@ -269,7 +269,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         guess=still,
         instant_motion=still,
         velocity_change=VelocityChange.unknown(),
-        seconds=np.float32(1.0),  # pyright: ignore[reportArgumentType]
+        seconds=np.float32(UNKNOWN_SECONDS),  # pyright: ignore[reportArgumentType]
         share=np.float32(1.0),  # pyright: ignore[reportArgumentType]
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),

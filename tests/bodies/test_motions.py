@@ -13,11 +13,12 @@ from carded import BOX, CAMERA, TRACKED, field
 from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import BodyAware
-from gavo_jax.bodies.identity import UNKNOWN, BodyTracks, associate
+from gavo_jax.bodies.identity import BodyTracks, associate
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
@@ -86,7 +87,7 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     place = list(tracks.numbers).index(seen[0].number)
     is_known = status is AlignmentStatus.OK
     np.testing.assert_array_equal(tracks.motions[place], xi if is_known else np.zeros(6))
-    assert tracks.seconds[place] == (clock.elapsed if is_known else UNKNOWN)
+    assert tracks.seconds[place] == (clock.elapsed if is_known else UNKNOWN_SECONDS)
 
 
 def test_a_body_whose_motion_was_once_in_doubt_is_known_again() -> None:
