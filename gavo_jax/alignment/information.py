@@ -46,8 +46,13 @@ class Information(NamedTuple):
         return (self.directions * values) @ self.directions.T
 
 
-def measure_information(problem: Problem, r: Residuals, terms: list[Term]) -> Information:
-    """What the frames tell at the problem's origin, of which these are the residuals and the `weighted_terms`."""
+def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_body: Bool[Array, ""]) -> Information:
+    """What the frames tell at the problem's origin, of which these are the residuals and the `weighted_terms`.
+
+    Few points that are steep tell of a motion with a large variance, which would hide what depth tells. Of a body,
+    grey and depth are therefore asked each alone, too. Of the whole image they are not: where grey goes by a wrong
+    match, depth that tells the other directions would confirm it.
+    """
     objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // ENOUGH)
     factor = 2.0 * every / objective.divisor(jnp.sum(r.inside))
     reference, r, terms = jax.tree.map(lambda leaf: leaf[..., ::every], (objective.reference, r, terms))
@@ -59,25 +64,28 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term]) -> In
         return pixel_jacobian(Slopes(along_u, along_v, along_inverse_depth), here, plane)
 
     flow_u, flow_v, flow_q = step(one, nothing, nothing), step(nothing, one, nothing), step(nothing, nothing, one)
-    confirmed, possible, noise = jnp.zeros((6, 6)), jnp.zeros((6, 6)), []
+    possible, products, noise = jnp.zeros((6, 6)), [], []
     for seen, (target, _, weight) in zip(_slopes(reference, r, objective.use_depth), terms, strict=True):
         before, after = seen
         weight = factor * weight
         first = step(before.along_u, before.along_v, before.along_inverse_depth)
         second = problem.tangent.T @ target
         product = (first * weight) @ second.T
-        confirmed += 0.5 * (product + product.T)
+        products.append(0.5 * (product + product.T))
         across = weight * (_steepness(before) * _steepness(after)).reshape(-1)
         possible += (flow_u * across) @ flow_u.T + (flow_v * across) @ flow_v.T
         along = weight * (before.along_inverse_depth**2).reshape(-1)
         possible += (flow_q * along) @ flow_q.T
         noise.append((weight, first, second))
     directions = _whitening(possible + LEAST * jnp.eye(6))
-    values, turn = jnp.linalg.eigh(directions.T @ confirmed @ directions)
+    values, turn = jnp.linalg.eigh(directions.T @ sum(products) @ directions)
     directions = directions @ turn
-    variance = sum(jnp.sum((weight * (directions.T @ a) * (directions.T @ b)) ** 2, axis=1) for weight, a, b in noise)
-    determined = values > jnp.maximum(SIGNIFICANCE * jnp.sqrt(variance), MIN_ALIGNED_SHARE)
-    return Information(directions, values, determined)
+    told = jnp.stack([jnp.sum(directions * (product @ directions), axis=0) for product in products])
+    variances = [jnp.sum((weight * (directions.T @ a) * (directions.T @ b)) ** 2, axis=1) for weight, a, b in noise]
+    variance = jnp.stack(variances)
+    is_told = values > SIGNIFICANCE * jnp.sqrt(jnp.sum(variance, axis=0))
+    is_told |= is_body & jnp.any(told > SIGNIFICANCE * jnp.sqrt(variance), axis=0)
+    return Information(directions, values, is_told & (values > MIN_ALIGNED_SHARE))
 
 
 def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[Slopes, Slopes]]:

@@ -54,6 +54,20 @@ LARGEST_STEP = 0.01
 images leave open; it is not taken."""
 
 
+class Part(NamedTuple):
+    """The part of the image whose points take part."""
+
+    share: Float[Array, ""]
+    """Of the image: less than 1 where the points of bodies are left out."""
+    is_body: Bool[Array, ""]
+    """Whether it is one body, whose outline is known in both frames."""
+
+    @classmethod
+    def whole(cls) -> "Part":
+        """Take all of the image."""
+        return cls(jnp.float32(1.0), jnp.array(False))
+
+
 class Winner(NamedTuple):
     """What a search ended with."""
 
@@ -73,11 +87,10 @@ def conclude(
     finest: Level,
     options: AlignmentOptions,
     swaying: Swaying | None = None,
-    share: Float[Array, ""] | float = 1.0,
+    part: Part | None = None,
 ) -> Alignment:
-    """Make the result of what the search ended with: estimate, refine, judge. Points of a share of the image take
-    part.
-    """
+    """Make the result of what the search ended with on a part of the image: estimate, refine, judge."""
+    part = Part.whole() if part is None else part
     residuals = objective.residuals(winner.motion)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
@@ -90,8 +103,8 @@ def conclude(
         problem, residuals, added = _last_step(problem, residuals, swaying, points)
         objective = problem.objective
     motion = problem.origin
-    examination, covariance, chosen_by = _weigh(_examine(problem, residuals), objective, winner.judge, added)
-    against = find_against(examination, covariance, objective, winner.rival, share * points, chosen_by)
+    examination, covariance, chosen_by = _weigh(_examine(problem, residuals, part), objective, winner.judge, added)
+    against = find_against(examination, covariance, objective, winner.rival, part.share * points, chosen_by)
     if options.precondition:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
         # along a way that the images leave open any motion is as good, that at the edge, too
@@ -159,15 +172,15 @@ class Examination(NamedTuple):
     explained: ExplainedShare
 
 
-def _examine(problem: Problem, r: Residuals) -> Examination:
-    """What the images say of the problem's origin, of which these are the residuals."""
+def _examine(problem: Problem, r: Residuals, part: Part) -> Examination:
+    """What a part of the images says of the problem's origin, of which these are the residuals."""
     model, scatter, terms = problem.examine(r)
     return Examination(
         motion=problem.origin,
         inside=jnp.sum(r.inside),
         model=model,
         scatter=scatter,
-        information=measure_information(problem, r, terms),
+        information=measure_information(problem, r, terms, part.is_body),
         explained=explained_share(r),
     )
 

@@ -19,7 +19,7 @@ from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
 from gavo_jax.alignment.evidence import evidence
 from gavo_jax.alignment.fitting import comparable_objective, fit_objective, level_objective, unchanged_brightness
-from gavo_jax.alignment.judgement import Winner, conclude
+from gavo_jax.alignment.judgement import Part, Winner, conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.sway import Swaying
@@ -133,7 +133,7 @@ def align_views(
     readout: Float[Array, ""] | None = None,
     hypotheses: Float[Array, "h 4 4"] | None = None,
     swaying: Swaying | None = None,
-    share: Float[Array, ""] | float = 1.0,
+    part: Part | None = None,
 ) -> tuple[Alignment, Population | None]:
     """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
@@ -156,7 +156,7 @@ def align_views(
             there is none.
         swaying: Under a rolling shutter what is known of the target's own velocity, which is then refined with the
             motion at the end; None where it is taken for the mean since the anchor.
-        share: Of the image, whose points take part: less where those of bodies are left out.
+        part: Of the image, whose points take part; None for all of it.
 
     Returns:
         The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
@@ -191,7 +191,7 @@ def align_views(
     motion, rival = ended.search.islands[0], ended.search.rival
     winner = Winner(motion, rival, centre=ended.centre, history=history, judge=ended.judge)
     objective = level_objective(finest, target, options, ended.search.brightness).merged()
-    return conclude(objective, winner, finest, options, swaying, share), ended.populations
+    return conclude(objective, winner, finest, options, swaying, part), ended.populations
 
 
 def _search_in_contest(

@@ -37,8 +37,8 @@ def without_points(
         q = np.where(hidden, np.float32(0.0), np.asarray(points.q))
         return reference._replace(points=points._replace(q=q))  # pyright: ignore[reportArgumentType]
 
-    share = np.float32(1.0 - np.mean(moving))
-    return state._replace(previous=masked(state.previous), keyframe=masked(state.keyframe), share=share)  # pyright: ignore[reportArgumentType]
+    part = state.part._replace(share=np.float32(1.0 - np.mean(moving)))  # pyright: ignore[reportArgumentType]
+    return state._replace(previous=masked(state.previous), keyframe=masked(state.keyframe), part=part)
 
 
 def _widened(mask: Bool[np.ndarray, "h w"], seen: int, number: int) -> Bool[np.ndarray, "h w"]:

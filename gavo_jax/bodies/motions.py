@@ -79,6 +79,7 @@ def _align(
         velocity_change=VelocityChange.unknown(),
         seconds=np.float32(before.seconds[place]),
         usual=Usual.unknown(),
+        part=state.tracker.part._replace(is_body=np.array(True)),  # pyright: ignore[reportArgumentType]
     )
     return aware.search.plain.align(aware.segmenter.without(tracker, before.labels != number), frame, clock).result
 

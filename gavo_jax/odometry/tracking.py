@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from gavo_jax.alignment.judgement import Part
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.search import Population, align_views
 from gavo_jax.alignment.sway import Swaying, VelocityChange
@@ -47,8 +48,8 @@ class TrackerState(NamedTuple):
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
     """Time that the last motion took, seconds; `UNKNOWN_SECONDS` where it is not known."""
-    share: Float[Array, ""]
-    """Share of the image whose points take part in the next search: less where those of bodies are left out."""
+    part: Part
+    """Of the image, whose points take part in the next search."""
     exposure: Exposure
     """Exposure of the previous frame; the keyframe's points are as if taken with it."""
     usual: Usual
@@ -206,7 +207,7 @@ def track_frame(
         exchanged=exchanged,
         readout=readout,
         swaying=Swaying(clock.elapsed, state.velocity_change) if options.sway else None,
-        share=state.share,
+        part=state.part,
     )
     result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
     moved = Moved.by(result, is_first=~jnp.any(state.previous.points.q > 0))
@@ -225,7 +226,7 @@ def track_frame(
         instant_motion=moved.instant_motion,
         velocity_change=_velocity_change_after(state, moved, clock.elapsed),
         seconds=clock.elapsed,
-        share=jnp.float32(1.0),
+        part=Part.whole(),
         exposure=exposure,
         usual=_usual_after(state.usual, result, exposure, moved.is_first),
     )
@@ -247,7 +248,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
         instant_motion=jnp.zeros(6),
         velocity_change=VelocityChange.unknown(),
         seconds=jnp.float32(UNKNOWN_SECONDS),
-        share=jnp.float32(1.0),
+        part=Part.whole(),
         exposure=Exposure.of(pyramid),
         usual=Usual.unknown(),
     )
@@ -270,7 +271,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         instant_motion=still,
         velocity_change=VelocityChange.unknown(),
         seconds=np.float32(UNKNOWN_SECONDS),  # pyright: ignore[reportArgumentType]
-        share=np.float32(1.0),  # pyright: ignore[reportArgumentType]
+        part=Part(np.float32(1.0), np.array(False)),  # pyright: ignore[reportArgumentType]
         exposure=Exposure(zero, zero),
         usual=Usual.unknown(),
     )

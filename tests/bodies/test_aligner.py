@@ -193,4 +193,4 @@ def test_points_that_are_left_out_are_not_asked_for() -> None:
     mask = np.ones(segmenter.size, bool)
     mask[: segmenter.size[0] // 4] = False
     state = blank_state(CAMERA, TRACKED.solver, TRACKED.alignment)
-    assert float(state.share) == 1 and float(segmenter.without(state, mask).share) == pytest.approx(0.25)
+    assert float(state.part.share) == 1 and float(segmenter.without(state, mask).part.share) == pytest.approx(0.25)

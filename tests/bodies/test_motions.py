@@ -1,7 +1,8 @@
 """Bodies' motions: in the world, under a rolling shutter, and where images do not tell them."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ from gavo_jax.bodies import motions
 from gavo_jax.bodies.aligner import BodyAware
 from gavo_jax.bodies.identity import BodyTracks, associate
 from gavo_jax.bodies.records import Seen, in_world
+from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Search
 from gavo_jax.odometry.driver import Step
@@ -22,6 +24,7 @@ from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output.bodies import BODY_COLUMNS, body_rows
+from gavo_jax.presets import preset
 from gavo_jax.status import AlignmentStatus
 
 
@@ -94,4 +97,15 @@ def test_a_body_whose_motion_was_once_in_doubt_is_known_again() -> None:
     """It was taken to have been at rest, so that no motion of half a metre a second was possible after that."""
     bodies = [body for step in track(SyntheticSequence(14, camera=CAMERA, bodies=2), TRACKED) for body in step.bodies]
     statuses = [body.status for body in bodies]
-    assert statuses.count("ok") > len(bodies) // 2 and "implausible_motion" not in statuses
+    assert statuses.count("ok") > len(bodies) // 2
+    against = [list(body.alignment.statuses) for body in bodies if body.alignment is not None]
+    assert [AlignmentStatus.IMPLAUSIBLE_MOTION] not in against, "what the images tell well was not believed"
+
+
+def test_depth_may_tell_by_itself_how_a_body_moves(data_dir: Path, clips: ModuleType) -> None:
+    """A few steep points hid it: two of three motions of the card were `low_texture`."""
+    card = clips.CardClip(TumSequence(data_dir / "fr1_rpy")[:32], 0.1, 0, clips.LOOKS[0])
+    settings = preset("ga", "fast")
+    settings = replace(settings, odometry=replace(settings.odometry, bodies="track"))
+    statuses = [body.status for step in track(card, settings) for body in step.bodies if body.alignment is not None]
+    assert len(statuses) > 10 and statuses.count("ok") > 0.75 * len(statuses), statuses
