@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any
 
-import jax
 import tyro
 
 from gavo_jax import interrupts
 from gavo_jax.cli.options import Command, Doctor
 from gavo_jax.cli.usage import HelpPage, asking_for_help, empty_argument, fault_of_usage
 from gavo_jax.compilation import compiler
+from gavo_jax.compilation.precision import choose_usual
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, GavoWarning, shown, tell
 from gavo_jax.version import __version__
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
-    jax.config.update("jax_enable_x64", False)  # in every thread; see `compilation.precision`
+    choose_usual()
     with interrupts.raised(), _told_warnings():
         try:
             status = _run(arguments)

@@ -18,9 +18,20 @@ USUAL: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "jax_debug_infs": (False, jax.debug_infs),
     "jax_debug_key_reuse": (False, jax.debug_key_reuse),
     "jax_transfer_guard": (None, lambda _: jax.transfer_guard("allow")),
+    "jax_default_prng_impl": ("threefry2x32", jax.default_prng_impl),
+    "jax_threefry_partitionable": (True, jax.threefry_partitionable),
 }
 """Modes, what they are as JAX comes, and what sets them. Here not-a-number and infinity are no errors: they stand for
-what is not known, or worth nothing. Images come from the host, and what is found goes there."""
+what is not known, or worth nothing. Images come from the host, and what is found goes there. What a seed draws is up to
+the generator."""
+
+
+def choose_usual() -> None:
+    """Have every thread of this process in the usual modes: for the command, whose process it is. What environment
+    variables choose is for other programs.
+    """
+    for name, (usual, _) in USUAL.items():
+        jax.config.update(name, usual)
 
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:

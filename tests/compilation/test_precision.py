@@ -15,7 +15,8 @@ import pytest
 from small import CAMERA, GENETIC
 
 import gavo_jax as gavo
-from gavo_jax.compilation.precision import in_32_bits
+from gavo_jax.cli import main
+from gavo_jax.compilation.precision import USUAL, in_32_bits
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 
 FRAMES = SyntheticSequence(frames=4, camera=CAMERA)
@@ -79,3 +80,29 @@ def test_modes_that_look_for_errors_do_not_look_here(mode: Callable[[], Any], wa
         found = results()
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    "mode", [partial(jax.default_prng_impl, "rbg"), partial(jax.threefry_partitionable, False)], ids=["rbg", "parts"]
+)
+def test_a_seed_draws_the_same_numbers_whatever_generator_is_chosen_outside(
+    mode: Callable[[], Any], wanted: list[np.ndarray]
+) -> None:
+    with mode():
+        found = results()
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_command_has_the_usual_modes_in_every_thread() -> None:
+    """Environment variables choose others for the whole process: `gavo run` ended in a traceback as it drew figures."""
+    unusual = {"jax_numpy_rank_promotion": "raise", "jax_transfer_guard": "disallow", "jax_default_prng_impl": "rbg"}
+    try:
+        for name, value in unusual.items():
+            jax.config.update(name, value)
+        main(["--version"])
+        assert not [name for name, (usual, _) in USUAL.items() if getattr(jax.config, name) != usual]
+        assert (jax.numpy.ones((2, 3)) + np.ones(3)).shape == (2, 3)
+    finally:
+        for name in unusual:
+            jax.config.update(name, USUAL[name][0])
