@@ -12,8 +12,8 @@ from gavo_jax.alignment.pairs import align as align_pair
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import (
     Entry,
@@ -51,7 +51,7 @@ def align(options: Align) -> int:
     (reference, target), camera = pair, pair.camera
     if not options.force and (fault := lack_of_depth(pair) or fault_of_scale(pair)):
         raise GavoError(f"{options.depth0}: {fault}, or go on with --force")
-    enable_compilation_cache()
+    be_ready()
     with waiting("compiling and aligning …"):
         key = jax.random.key(options.seed)
         found = interruptible(lambda: align_pair(reference, target, camera, settings, key=key))

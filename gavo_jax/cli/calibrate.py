@@ -8,8 +8,8 @@ from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted,
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.cli.options import Calibrate
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.interrupts import interruptible
@@ -34,7 +34,7 @@ def calibrate(options: Calibrate) -> int:
     if options.principal_point:
         wanted.append("principal_point")
     sequence = open_sequence(options, force=True)
-    enable_compilation_cache()
+    be_ready()
     with waiting("looking at the frames …"):
         estimate = interruptible(lambda: estimate_camera(sequence, wanted))
     calibration = calibration_of(sequence, estimate)

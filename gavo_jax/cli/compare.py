@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Compare
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.run_table import covered_in_part, path_and_end, why_no_drift
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
@@ -101,7 +101,7 @@ def compare(options: Compare) -> int:
     if not 1 <= options.seeds <= MAX_SEED:
         raise GavoError(f"--seeds: must be from 1 to {MAX_SEED}, not {options.seeds}")
     sequence = open_sequence(options)
-    enable_compilation_cache()
+    be_ready()
     peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):

@@ -12,8 +12,9 @@ from packaging.requirements import Requirement
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Doctor
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.compilation import compiler
-from gavo_jax.compilation.cache import cache_folder, enable_compilation_cache, why_not_private
+from gavo_jax.compilation.cache import cache_folder, why_not_private
 from gavo_jax.datasets import registry
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.screen import say
@@ -29,7 +30,6 @@ PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
 def doctor(command: Doctor) -> int:
     """Print versions, machine, cache, extras, faulty plugins, checks and speed; 0 if all is well."""
     del command
-    enable_compilation_cache()
     faults = []
     say(f"gavo-jax: {__version__}")
     for name in PACKAGES:
@@ -37,6 +37,7 @@ def doctor(command: Doctor) -> int:
     say(f"python: {platform.python_version()} ({platform.python_implementation()})")
     say(f"system: {platform.platform()}")
     say(f"processor: {compiler.processor()}, {os.cpu_count()} cores, {_usable_cores()} of them for this process")
+    be_ready()
     say(f"devices: {', '.join(_device(device.platform, device.device_kind) for device in jax.devices())}")
     fault = compiler.unfit_compiler()
     if fault:

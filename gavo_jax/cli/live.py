@@ -11,9 +11,9 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import check_positive, choose_settings, with_shortcuts
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.live.devices import open_device
@@ -52,7 +52,7 @@ def run_live(options: Run) -> int:
     camera = _camera(options, device)
     name = f"{device.name}-{method}-{preset}"
     path = options.output or Path("runs") / name
-    enable_compilation_cache()
+    be_ready()
     with Newest(device) as newest, RunFolder(path) as folder, make_viewer(options.viewer, path / RECORDING) as viewer:
         odometry = Odometry(camera.rectified(), settings, seed=options.seed, record=viewer.wants_populations)
         with waiting(f"{device.name}: compiling …"):

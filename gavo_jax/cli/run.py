@@ -7,6 +7,7 @@ from typing import Any
 
 from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.run_table import print_run
 from gavo_jax.cli.selection import (
     choose_settings,
@@ -15,7 +16,6 @@ from gavo_jax.cli.selection import (
     with_shortcuts,
     with_whole_paths,
 )
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.live.devices import is_live
@@ -65,7 +65,7 @@ def run(options: Run) -> int:
     name = f"{sequence.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
-    enable_compilation_cache()
+    be_ready()
     mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
     poses = ODOMETRY if mapper else TRAJECTORY
     with RunFolder(path, getattr(sequence, "files", ()), poses) as folder, viewer:

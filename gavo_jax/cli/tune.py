@@ -9,7 +9,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.cli.options import Tune
-from gavo_jax.compilation.cache import enable_compilation_cache
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.tuning import Choice, Tuning, read_tuning, without_password
 from gavo_jax.experiments.tuning import tune as search
@@ -38,7 +38,7 @@ def tune(options: Tune) -> int:
 
 def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     storage = options.storage or f"sqlite:///{(folder / STUDY).resolve()}"
-    enable_compilation_cache()
+    be_ready()
     say(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {without_password(storage)}")
 
     def show(trial: int, drift: float, milliseconds: float) -> None:

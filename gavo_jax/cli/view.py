@@ -9,8 +9,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.cli.options import Source, View
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.errors import GavoError, tell
 from gavo_jax.interrupts import interruptible
@@ -67,7 +67,7 @@ def _show_with_search(
     run: RecordedRun, bodies: RecordedBodies, sequence: Sequence, odometry: Odometry, viewer: Viewer
 ) -> None:
     """Track the frames once more for the particles; what is shown of the poses is what the run found."""
-    enable_compilation_cache()
+    be_ready()
     recorded = {step.index: step for step in run.steps}
     apart = 0.0
 

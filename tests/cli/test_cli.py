@@ -629,7 +629,7 @@ def test_view_compares_motions_of_the_search_alone(monkeypatch, capsys, lost, or
         for alignment in (no_alignment(AlignmentStatus.OK), found)
     ]
     monkeypatch.setattr(view, "track", lambda *_, **__: iter([now]))
-    monkeypatch.setattr(view, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(view, "be_ready", lambda: None)
     run: Any = SimpleNamespace(steps=[recorded])
     driver: Any = SimpleNamespace(warm_up=lambda: 0.0)
     unmoved: Any = None
@@ -746,6 +746,18 @@ def test_a_closed_stream_is_no_fault(closed, words, status):
     command = f"'{sys.executable}' -m gavo_jax {words} {closed}"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
     assert done.returncode == status and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("variable", ["JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"])
+@pytest.mark.parametrize(("command", "told"), [("run", ""), ("doctor", "gavo-jax: ")])
+def test_without_a_device_nothing_is_begun_and_one_line_says_so(variable, command, told, tmp_path):
+    """A device that is asked for and not there was a traceback. The versions are for an issue."""
+    environment = {**os.environ, variable: "tpu"}
+    words = [sys.executable, "-m", "gavo_jax", command]
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert bool(done.stdout) == bool(told) and done.stdout.startswith(told)
+    assert is_refused(Done(done.returncode, "", done.stderr), "JAX has no device", f"{variable}='tpu'")
+    assert not list(tmp_path.iterdir())
 
 
 def test_help_and_version(gavo):

@@ -1,0 +1,23 @@
+"""What a subcommand that computes does before it begins."""
+
+import os
+
+import jax
+
+from gavo_jax.compilation.cache import enable_compilation_cache
+from gavo_jax.errors import blamed
+
+CHOICES = ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE")
+"""Environment variables that choose JAX's device."""
+
+
+def be_ready() -> None:
+    """Keep what is compiled, and see that JAX has a device.
+
+    Raises:
+        GavoError: it has none, as where a GPU is asked for that is not there, or whose memory is somebody else's.
+    """
+    enable_compilation_cache()
+    chosen = "".join(f", with {name}={os.environ[name]!r}" for name in CHOICES if os.environ.get(name))
+    with blamed(f"JAX has no device to compute on{chosen}"):
+        jax.block_until_ready(jax.numpy.zeros(1))
