@@ -1,11 +1,17 @@
-"""JAX in 32 bits and its usual modes, whatever the program around it has chosen: what is compiled here needs them."""
+"""JAX in 32 bits and its usual modes, whatever the program around it has chosen: what is compiled here needs them.
 
+Whatever computes begins here, so here it is seen, too, whether it can.
+"""
+
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+
+from gavo_jax.errors import GavoError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -38,11 +44,13 @@ def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
     """The function as it is in a process that has switched on neither JAX's 64 bits (`jax_enable_x64`) nor another mode
     of `USUAL`.
 
-    The switches are those of each thread: what is handed to another one has to be wrapped, too.
+    The switches are those of each thread: what is handed to another one has to be wrapped, too. What it raises in a
+    process that was forked is `refuse_fork`'s.
     """
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_fork()
         changed = [(usual, switch) for name, (usual, switch) in USUAL.items() if getattr(jax.config, name) != usual]
         with ExitStack() as modes:
             for usual, switch in changed:
@@ -50,3 +58,22 @@ def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return call
+
+
+_process: int | None = None
+"""The one that came here first."""
+
+
+def refuse_fork() -> None:
+    """Refuse a process that was forked from one that has computed.
+
+    Raises:
+        GavoError: it was. JAX's threads are not in it, and it would wait for them for ever.
+    """
+    global _process
+    _process = _process or os.getpid()
+    if _process != os.getpid():
+        raise GavoError(
+            "this process was forked from one in which JAX has computed, and would wait for ever: start processes with "
+            "multiprocessing.get_context('spawn')"
+        )

@@ -106,3 +106,21 @@ def test_the_command_has_the_usual_modes_in_every_thread() -> None:
     finally:
         for name in unusual:
             jax.config.update(name, USUAL[name][0])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_process_that_was_forked_after_the_first_result_is_told_and_does_not_wait_for_ever() -> None:
+    program = (
+        "import os; from gavo_jax.compilation.precision import in_32_bits; from gavo_jax import GavoError\n"
+        "import jax; compute = in_32_bits(lambda: float(jax.numpy.zeros(1)[0])); compute()\n"
+        "if os.fork():\n"
+        "    os.wait(); print('parent:', compute())\n"
+        "else:\n"
+        "    try: compute()\n"
+        "    except GavoError as fault: print('child:', fault, flush=True)\n"
+        "    os._exit(0)"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    child, parent = done.stdout.splitlines()
+    assert child.startswith("child: this process was forked") and "spawn" in child and parent == "parent: 0.0"
