@@ -50,9 +50,10 @@ def open_part(
     whole = _synthetic(camera, stop, moving, reading.color) if source == SYNTHETIC else open_source(source, reading)
     chosen = whole[start:stop:stride]
     if len(chosen) < 2:
+        left_out = "".join(f"; {line}" for line in getattr(whole, "left_out", ()))
         raise GavoError(
             f"{source}: {len(chosen)} of its {len(whole)} frames chosen by start, frames and stride: "
-            "at least 2 are needed"
+            f"at least 2 are needed{left_out}"
         )
     chosen.check()
     if source != SYNTHETIC and not force and (fault := lack_of_depth(chosen) or fault_of_scale(chosen)):

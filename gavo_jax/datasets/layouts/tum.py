@@ -60,7 +60,7 @@ class TumSequence(FileSequence):
 
     Lists need not be sorted. But where all but a few stamps of a list increase (`MAX_MISPLACED`), those few are in
     doubt: a frame of such a colour or depth stamp has its place by it, but reading it raises `TimestampError`. In an
-    unsorted list the first of rows with equal stamps is kept.
+    unsorted list the first of rows with equal stamps is kept, and the images of others are left out.
 
     Attributes:
         name: the folder's name, unless given.
@@ -126,7 +126,7 @@ class TumSequence(FileSequence):
             ),
             truth,
             reading,
-            unpaired((len(lists.color), len(lists.depth)), len(entries), why) + unread,
+            unpaired((len(lists.color), len(lists.depth)), len(entries), why) + lists.repeated + unread,
         )
         self.times_guessed = "stamps are numbers" if rate is None and lists.unit == 1 / INDEX_RATE else ""
 
@@ -180,6 +180,8 @@ class _Row(NamedTuple):
     written: str
     """The stamp, as it stands there."""
     misplaced: bool = False
+    repeated: bool = False
+    """Whether the stamp is that of another image, which is taken."""
 
 
 class _Entry(NamedTuple):
@@ -207,6 +209,8 @@ class _Lists(NamedTuple):
     """Seconds of what the stamps counted; those of the rows are in seconds."""
     are_paired: bool
     """Whether one list has both images of a frame in a row."""
+    repeated: list[str]
+    """What was left out for the stamp of another image, a line each kind."""
 
 
 def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | None) -> _Lists:
@@ -218,6 +222,13 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
         color, depth = (_read_list(root, folder / name) for name in names)
     else:
         color, depth = _read_pairs(root, both)
+    counts = (sum(row.repeated for row in rows) for rows in (color, depth))
+    repeated = [
+        f"{count} {kind} images: the stamp of another one"
+        for count, kind in zip(counts, ("colour", "depth"), strict=True)
+        if count
+    ]
+    color, depth = ([row for row in rows if not row.repeated] for rows in (color, depth))
     are_whole = all(WHOLE.fullmatch(row.written) for row in (*color, *depth))
     if rate and not are_whole:
         raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
@@ -227,7 +238,7 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
         if not abs(unit * row.stamp) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
     color, depth = ([row._replace(stamp=unit * row.stamp) for row in rows] for rows in (color, depth))
-    return _Lists(color, depth, unit, are_paired=both is not None)
+    return _Lists(color, depth, unit, are_paired=both is not None, repeated=repeated)
 
 
 WHOLE = re.compile(r"-?\d+")
@@ -293,7 +304,7 @@ def _back(root: Path, image: str) -> str:
 
 
 def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
-    """Rows in the order of their stamps, marked where that is in doubt."""
+    """Rows in the order of their stamps, each once, marked where the stamp is in doubt or another's."""
     if not rows:
         raise GavoError(f"{path}: lists no images")
     if all(re.fullmatch(r"\d+\.\d+", row.written) for row in rows):
@@ -301,7 +312,9 @@ def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
     trusted = _in_order([row.stamp for row in rows])
     if trusted.count(False) > MAX_MISPLACED * len(rows):
         first = {row.stamp: row for row in reversed(rows)}
-        return [first[stamp] for stamp in sorted(first)]
+        others = [row._replace(repeated=True) for row in rows if row.path != first[row.stamp].path]
+        once = {(row.stamp, row.path): row for row in (*others, *first.values())}
+        return sorted(once.values(), key=lambda row: row.stamp)
     rows = [row._replace(misplaced=not good) for row, good in zip(rows, trusted, strict=True)]
     return sorted(rows, key=lambda row: row.stamp)
 

@@ -111,6 +111,16 @@ def test_association_is_one_to_one_and_in_the_order_of_colour_stamps(folder):
     np.testing.assert_array_equal(sequence[1].depth, depth_image(3))
 
 
+def test_images_of_stamps_that_were_cut_short_are_left_out_and_counted(folder):
+    """Two of three images went without a word where stamps had one decimal. A row that is there twice is no image."""
+    for kind in ("rgb", "depth"):
+        rows = [f"{100 + i // 3 / 10:.1f} {kind}/{i}.png" for i in range(6)]
+        (folder / f"{kind}.txt").write_text("\n".join(rows + rows) + "\n")
+    sequence = TumSequence(folder, CAMERA)
+    np.testing.assert_allclose(sequence.timestamps, [100.0, 100.1])
+    assert sequence.left_out == tuple(f"4 {kind} images: the stamp of another one" for kind in ("colour", "depth"))
+
+
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
 @pytest.mark.parametrize(
     ("stamps", "in_doubt"),
