@@ -3,6 +3,7 @@
 import os
 
 import jax
+import numpy as np
 
 from gavo_jax.compilation.cache import enable_compilation_cache
 from gavo_jax.errors import blamed
@@ -20,4 +21,4 @@ def be_ready() -> None:
     enable_compilation_cache()
     chosen = "".join(f", with {name}={os.environ[name]!r}" for name in CHOICES if os.environ.get(name))
     with blamed(f"JAX has no device to compute on{chosen}"):
-        jax.block_until_ready(jax.numpy.zeros(1))
+        jax.block_until_ready(jax.device_put(np.zeros(1, np.float32)))  # a number there, and no program for it
