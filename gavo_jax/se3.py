@@ -83,6 +83,28 @@ def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
     return result
 
 
+def rigid_of(matrix: Float[np.ndarray, "4 4"], tolerance: float) -> Float64[np.ndarray, "4 4"] | None:
+    """The rigid motion that rounded numbers stand for.
+
+    Args:
+        matrix: Of a motion as somebody wrote it down.
+        tolerance: Largest entry of RᵀR − I that rounding may leave, and largest departure of the last row.
+
+    Returns:
+        None where the numbers are no rotation and translation, or not finite.
+    """
+    if not np.isfinite(matrix).all():
+        return None
+    rotation = np.asarray(matrix[:3, :3], np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        turns = np.abs(rotation.T @ rotation - np.eye(3)).max() <= tolerance and np.linalg.det(rotation) > 0
+    if not turns or np.abs(matrix[3] - np.eye(4)[3]).max() > tolerance:
+        return None
+    result = rigid(matrix)
+    result[3] = np.eye(4)[3]
+    return result
+
+
 def departure_from_rigid(transform: Float[Array, "*batch 4 4"]) -> Float[Array, " *batch"]:
     """Largest entry of RᵀR − I: rounding leaves some 1e-6."""
     rotation = transform[..., :3, :3]

@@ -3,11 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.linalg
 from hypothesis import given
 from twists import hat, twists
 
-from gavo_jax.se3 import GENERATORS, adjoint, departure_from_rigid, exp, log, right_jacobian, rigid
+from gavo_jax.se3 import GENERATORS, adjoint, departure_from_rigid, exp, log, right_jacobian, rigid, rigid_of
 
 TURN = scipy.linalg.expm(np.array([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]]))
 jit_exp, jit_log, jit_jacobian = jax.jit(exp), jax.jit(log), jax.jit(right_jacobian)
@@ -36,6 +37,31 @@ def test_what_is_not_finite_stays_so_alone() -> None:
     found = rigid(np.stack([broken, motion(TURN)]))
     np.testing.assert_array_equal(found[0], broken)
     np.testing.assert_allclose(found[1], motion(TURN), atol=1e-15)
+
+
+def test_numbers_printed_with_few_digits_are_a_motion() -> None:
+    found = rigid_of(np.round(motion(TURN), 3), 0.01)
+    assert found is not None
+    np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(found, motion(TURN), atol=1e-3)
+    assert rigid_of(np.round(motion(TURN), 3), 1e-5) is None
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.zeros((4, 4)),
+        motion(TURN).T,
+        motion(1.02 * TURN),
+        motion(TURN @ np.diag([1.0, 1.0, -1.0])),
+        motion(np.full((3, 3), np.nan)),
+        motion(np.full((3, 3), 1e200)),
+        2.0 * motion(TURN),
+    ],
+    ids=["zeros", "transposed", "scaled", "mirrored", "not finite", "too large to square", "all of it doubled"],
+)
+def test_other_numbers_are_none(matrix: np.ndarray) -> None:
+    assert rigid_of(matrix, 0.01) is None
 
 
 def test_departure_tells_rounding_from_garbage() -> None:

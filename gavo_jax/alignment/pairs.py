@@ -20,7 +20,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
-from gavo_jax.se3 import rigid
+from gavo_jax.se3 import rigid_of
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -122,13 +122,14 @@ def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray,
     Raises:
         GavoError: One is no rigid motion, or not finite.
     """
+    result = np.empty_like(guesses)
     for row, guess in enumerate(guesses):
-        rotation, last = guess[:3, :3], guess[3]
-        near = np.isfinite(guess).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() <= ROUNDED
-        if not (near and np.linalg.det(rotation) > 0 and np.array_equal(last, [0.0, 0.0, 0.0, 1.0])):
+        motion = rigid_of(guess, ROUNDED)
+        if motion is None:
             which = f"guess {row}" if len(guesses) > 1 else "the guess"
             raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")
-    return rigid(guesses)
+        result[row] = motion
+    return result
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:

@@ -12,6 +12,7 @@ from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, 
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
+from gavo_jax.se3 import rigid_of
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
 """Largest camera file, bytes; one of JSON may hold the pose of every frame, too."""
@@ -267,12 +268,9 @@ def _rigid(place: str, rows: Any) -> np.ndarray:
             raise ValueError
     except (ValueError, TypeError, OverflowError):
         raise GavoError(f"{place}: must be four rows of four numbers") from None
-    rotation = matrix[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+    pose = rigid_of(matrix, ROTATION_TOLERANCE)
+    if pose is None:
         raise GavoError(f"{place}: no rigid transform (a rotation and a shift, last row 0 0 0 1)")
-    if np.abs(matrix[:3, 3]).max() > LARGEST_SHIFT:
+    if np.abs(pose[:3, 3]).max() > LARGEST_SHIFT:
         raise GavoError(f"{place}: a shift of more than {LARGEST_SHIFT:g} m: not in metres?")
-    u, _, vt = np.linalg.svd(rotation)
-    matrix[:3, :3] = u @ vt
-    return matrix
+    return pose
