@@ -4,7 +4,7 @@ from contextlib import closing, nullcontext
 
 from gavo_jax.cli.experiment_report import report, report_held
 from gavo_jax.cli.options import Experiment
-from gavo_jax.compilation.cache import enable_compilation_cache
+from gavo_jax.cli.readiness import be_ready
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, programs
@@ -32,8 +32,8 @@ def experiment(options: Experiment) -> int:
     if options.dry_run:
         _print_plan(plan, table, missing(plan, table), 1)
         return 0
+    be_ready()
     prepare_folder(plan.folder)
-    enable_compilation_cache()
     with hold(plan.folder):
         _run_missing(plan, table, options.executor)
         return report_held(plan.folder, options.markdown)

@@ -17,9 +17,9 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 def cache_folder() -> Path | None:
     """Return `GAVO_CACHE_DIR`, else the user's cache folder for this package; None where there is no home."""
-    if named := os.environ.get("GAVO_CACHE_DIR"):
-        return Path(named)
     try:
+        if named := os.environ.get("GAVO_CACHE_DIR"):
+            return Path(named).expanduser()  # files of variables have no shell that does it
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gavo-jax"
     except RuntimeError:
         return None

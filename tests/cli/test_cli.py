@@ -749,15 +749,19 @@ def test_a_closed_stream_is_no_fault(closed, words, status):
 
 
 @pytest.mark.parametrize("variable", ["JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"])
-@pytest.mark.parametrize(("command", "told"), [("run", ""), ("doctor", "gavo-jax: ")])
+@pytest.mark.parametrize(
+    ("command", "told"), [("run", ""), ("experiment plan.toml --output out", ""), ("doctor", "gavo-jax: ")]
+)
 def test_without_a_device_nothing_is_begun_and_one_line_says_so(variable, command, told, tmp_path):
     """A device that is asked for and not there was a traceback. The versions are for an issue."""
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[sequences]]\npath = "synthetic"\n[[methods]]\nname = "ga"\n')
     environment = {**os.environ, variable: "tpu"}
-    words = [sys.executable, "-m", "gavo_jax", command]
+    words = [sys.executable, "-m", "gavo_jax", *command.split()]
     done = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=tmp_path)
     assert bool(done.stdout) == bool(told) and done.stdout.startswith(told)
     assert is_refused(Done(done.returncode, "", done.stderr), "JAX has no device", f"{variable}='tpu'")
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [plan]
 
 
 def test_help_and_version(gavo):

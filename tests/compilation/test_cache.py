@@ -13,7 +13,7 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.compilation import programs
-from gavo_jax.compilation.cache import enable_compilation_cache, why_not_private
+from gavo_jax.compilation.cache import cache_folder, enable_compilation_cache, why_not_private
 from gavo_jax.compilation.programs import keep_programs_in
 from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -105,6 +105,12 @@ def test_a_link_to_ones_own_folder_will_do(tmp_path):
     assert why_not_private(tmp_path / "link") is None
     (tmp_path / "real").chmod(0o777)
     assert why_not_private(tmp_path / "link") == "others can write to it"
+
+
+def test_a_folder_in_ones_home_needs_no_shell(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("GAVO_CACHE_DIR", "~/kept")
+    assert cache_folder() == tmp_path / "kept"
 
 
 def test_no_folder_is_no_warning(tmp_path):
