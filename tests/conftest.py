@@ -38,29 +38,34 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 TRACED = Path(os.environ["GAVO_CACHE_DIR"]) / "traced"
 
 LONGEST = (
-    "alignment/test_review.py",
-    "alignment/test_pairs.py",
-    "alignment/test_search.py",
-    "cli/test_contract.py",
-    "cli/test_cli.py",
     "test_benchmarks.py",
+    "bodies/test_rival.py",
+    "alignment/test_search.py",
+    "alignment/test_review.py",
+    "cli/test_cli.py",
+    "alignment/test_pairs.py",
+    "cli/test_contract.py",
     "output/test_resume.py",
     "experiments/test_together.py",
-    "calibration/test_calibration.py",
-    "test_examples.py",
-    "bodies/test_rival.py",
-    "odometry/test_driver.py",
-    "odometry/test_tracking.py",
     "bodies/test_aligner.py",
-    "objective/test_error.py",
-    "objective/test_derivatives.py",
-    "datasets/test_forms.py",
-    "selfcheck/test_selfcheck.py",
-    "experiments/test_sharding.py",
+    "test_examples.py",
     "compilation/test_precision.py",
+    "calibration/test_calibration.py",
+    "experiments/test_sharding.py",
+    "selfcheck/test_selfcheck.py",
     "cli/test_shared_folders.py",
+    "cli/test_sources.py",
+    "datasets/test_forms.py",
+    "odometry/test_tracking.py",
+    "objective/test_error.py",
+    "alignment/test_sway.py",
+    "bodies/test_consensus.py",
+    "solvers/test_solve.py",
 )
-"""Files that take longest, in the order in which they begin: one that began last would keep a process waiting."""
+"""Files that take longest, in the order in which they begin: one that began last would keep a process waiting. Those
+that need the same large program begin at different times, as both processes would compile it: the benchmarks and the
+command, the rival and the aligner, single pairs and their review.
+"""
 
 MOST_MAPS = 20_000
 """Maps of memory: a process has 65,530 by default, and each compiled program holds some."""
