@@ -24,6 +24,7 @@ from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
+from gavo_jax.se3 import is_rigid
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -143,12 +144,12 @@ class MapBuilder:
 
         Raises:
             FrameError: an image is not of the camera's size.
-            GavoError: the pose is no 4x4 matrix of finite numbers.
+            GavoError: the pose is no 4x4 matrix of a rigid motion.
         """
         image, core = self._open3d.t.geometry.Image, self._open3d.core
         world_T_camera = np.asarray(world_T_camera)
-        if world_T_camera.shape != (4, 4) or not np.isfinite(world_T_camera).all():
-            raise GavoError("world_T_camera: a 4x4 matrix of finite numbers is needed")
+        if world_T_camera.shape != (4, 4) or not is_rigid(world_T_camera):
+            raise GavoError("world_T_camera: a 4x4 matrix is needed, of a rotation and a translation")
         if frame.color is not None and np.shape(frame.color) != (*np.shape(frame.grey), 3):
             raise FrameError(f"color image is of shape {np.shape(frame.color)}: {(*np.shape(frame.grey), 3)} is needed")
         frame = rectified(frame, self._recorded)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Bool, Float, Float64
 
 
 def exp(xi: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
@@ -83,22 +83,25 @@ def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
     return result
 
 
-def rigid_of(matrix: Float[np.ndarray, "4 4"], tolerance: float) -> Float64[np.ndarray, "4 4"] | None:
-    """The rigid motion that rounded numbers stand for.
+ROUNDED = 0.01
+"""Largest entry of RᵀR − I that numbers of two or three digits leave, and largest departure of the last row."""
 
-    Args:
-        matrix: Of a motion as somebody wrote it down.
-        tolerance: Largest entry of RᵀR − I that rounding may leave, and largest departure of the last row.
 
-    Returns:
-        None where the numbers are no rotation and translation, or not finite.
-    """
-    if not np.isfinite(matrix).all():
-        return None
-    rotation = np.asarray(matrix[:3, :3], np.float64)
+def is_rigid(
+    matrices: Float[np.ndarray, "*batch 4 4"], tolerance: float = ROUNDED
+) -> Bool[np.ndarray, " *batch"] | np.bool_:
+    """Whether numbers, rounded as they may be, are those of a rotation and a translation, and finite."""
+    matrices = np.asarray(matrices, np.float64)
+    rotations, last = matrices[..., :3, :3], matrices[..., 3, :]
     with np.errstate(over="ignore", invalid="ignore"):
-        turns = np.abs(rotation.T @ rotation - np.eye(3)).max() <= tolerance and np.linalg.det(rotation) > 0
-    if not turns or np.abs(matrix[3] - np.eye(4)[3]).max() > tolerance:
+        departures = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max(axis=(-2, -1))
+        turns = (departures <= tolerance) & (np.linalg.det(rotations) > 0)
+    return turns & (np.abs(last - np.eye(4)[3]) <= tolerance).all(axis=-1) & np.isfinite(matrices).all(axis=(-2, -1))
+
+
+def rigid_of(matrix: Float[np.ndarray, "4 4"], tolerance: float = ROUNDED) -> Float64[np.ndarray, "4 4"] | None:
+    """The rigid motion that rounded numbers stand for; None where they are none (`is_rigid`)."""
+    if not is_rigid(matrix, tolerance):
         return None
     result = rigid(matrix)
     result[3] = np.eye(4)[3]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gavo_jax.errors import GavoError, GavoWarning, number, read_text, rows_of, without_heading, write_bytes
+from gavo_jax.se3 import is_rigid
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -84,11 +85,19 @@ class Trajectory:
     segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Hold all as arrays; raise ValueError where their shapes do not belong together."""
+        """Hold all as arrays; raise ValueError where their shapes do not belong together, or a pose that is finite is
+        no rigid transform.
+        """
         timestamps = np.asarray(self.timestamps, np.float64)
         world_T_camera = np.asarray(self.world_T_camera, np.float64)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
             raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
+        broken = np.flatnonzero(np.isfinite(world_T_camera).all(axis=(1, 2)) & ~is_rigid(world_T_camera))
+        if len(broken):
+            raise ValueError(
+                f"pose {broken[0]} of {len(timestamps)} is no rigid transform: a rotation, a column of metres beside "
+                "it, and 0 0 0 1 below"
+            )
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_camera", world_T_camera)
         segments = np.zeros(len(timestamps), int) if self.segments is None else np.asarray(self.segments, int)

@@ -112,10 +112,6 @@ def starts_of(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
-ROUNDED = 0.01
-"""Largest entry of RᵀR − I of a guess whose numbers have been rounded."""
-
-
 def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray, "b 4 4"]:
     """The rigid motions that guesses stand for: a search starts from each, and its result would be none otherwise.
 
@@ -124,7 +120,7 @@ def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray,
     """
     result = np.empty_like(guesses)
     for row, guess in enumerate(guesses):
-        motion = rigid_of(guess, ROUNDED)
+        motion = rigid_of(guess)
         if motion is None:
             which = f"guess {row}" if len(guesses) > 1 else "the guess"
             raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")

@@ -12,7 +12,7 @@ from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, 
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
-from gavo_jax.se3 import rigid_of
+from gavo_jax.se3 import is_rigid, rigid_of
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
 """Largest camera file, bytes; one of JSON may hold the pose of every frame, too."""
@@ -67,6 +67,14 @@ class Calibration:
     states_depth_scale: bool = True
     preset: str | None = None
     depth_delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise GavoError where the depth camera's place is missing, or is none."""
+        if (self.depth is None) != (self.color_T_depth is None):
+            raise GavoError("a calibration has a depth camera and color_T_depth, or neither: depth is registered then")
+        place = self.color_T_depth
+        if place is not None and not (np.shape(place) == (4, 4) and is_rigid(place)):
+            raise GavoError("color_T_depth: a 4x4 matrix is needed, of a rotation and a translation")
 
     def with_depth_scale(self, scale: float) -> "Calibration":
         """The same with a depth scale that is known."""

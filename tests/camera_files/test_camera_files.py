@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files.calibration import load_calibration, load_camera
+from gavo_jax.camera_files.calibration import Calibration, load_calibration, load_camera
 from gavo_jax.errors import GavoError
 
 MATRIX = np.array([[500.0, 0, 319.5], [0, 510.0, 239.5], [0, 0, 1]])
@@ -523,3 +523,20 @@ def test_undistortion_of_every_model_samples_where_the_lens_put_the_light(camera
     found = camera.undistort_depth(columns)
     kept = found > 0
     assert kept.mean() > 0.5 and np.abs(found - 1 - source[..., 0])[kept].max() < 0.55
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (None, "or neither"),
+        (COLOR_T_DEPTH.T, "a rotation and a translation"),
+        (TURN, "4x4"),
+        (np.full((4, 4), np.nan), "a rotation and a translation"),
+    ],
+    ids=["none", "transposed", "without a shift", "not finite"],
+)
+def test_a_calibration_of_two_cameras_says_where_they_are(place, words):
+    """Depth went to other pixels without a word, or a run ended in a traceback."""
+    assert Calibration(PINHOLE, PINHOLE, COLOR_T_DEPTH).depth is PINHOLE
+    with pytest.raises(GavoError, match=words):
+        Calibration(PINHOLE, PINHOLE, place)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from gavo_jax.datasets.rendered.room import Box, Faces, Room, box_faces, build_room, shine
 from gavo_jax.datasets.rendered.textures import TEXTURES, Atlas, paint
 from gavo_jax.errors import GavoError
-from gavo_jax.se3 import rigid_of
+from gavo_jax.se3 import is_rigid
 from gavo_jax.trajectory import Trajectory
 
 Path = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]
@@ -56,7 +56,7 @@ class MovingPart:
             poses = np.asarray(self.path(seconds), np.float64)
         if poses.shape != (len(seconds), 4, 4):
             raise GavoError(f"synthetic: bodies: a path gives {poses.shape} for {len(seconds)} moments, not [n, 4, 4]")
-        if any(rigid_of(pose, 1e-6) is None for pose in poses):
+        if not np.all(is_rigid(poses, 1e-6)):
             raise GavoError("synthetic: bodies: a path gives matrices that are no rigid motions, or not finite")
         return poses
 
