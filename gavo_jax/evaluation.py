@@ -109,6 +109,7 @@ def relative_pose_error(
     Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is as
     printed in the paper: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations
     differ by about the rotation error times the distance travelled. Neither kind pairs poses of different segments.
+    Poses that are not finite are left out.
 
     Args:
         estimate: what was found, camera to world.
@@ -123,6 +124,7 @@ def relative_pose_error(
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
             (for frames: not a whole number).
     """
+    estimate, truth = _known(estimate), _known(truth)
     if not np.isfinite(delta) or delta <= 0:
         raise GavoError(f"relative pose error: delta must be positive and finite, not {delta}")
     if unit == "s":
@@ -141,12 +143,12 @@ def absolute_trajectory_error(
 
     Association is `associate` by time; the alignment minimises the sum of squared distances (Horn 1987, Umeyama 1991).
     Each segment of the estimate is aligned by itself, as nothing is known of how they lie to each other; one of a
-    single pose says nothing and is left out.
+    single pose says nothing and is left out. So are poses that are not finite.
 
     Raises:
         GavoError: fewer than two poses associate, or no two of one segment.
     """
-    estimated, true = _associated(estimate, truth, max_difference, "absolute trajectory error")
+    estimated, true = _associated(_known(estimate), _known(truth), max_difference, "absolute trajectory error")
     segments, counts = np.unique(estimated.segments, return_counts=True)
     told = np.isin(estimated.segments, segments[counts > 1])
     if not told.any():
@@ -170,11 +172,13 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
 
     The paper plots it, and cites its equation without printing it. The truth is interpolated (slerp) at the estimate's
     stamps; poses it does not cover (outside it, or in a gap longer than `max_gap` seconds) are left out, and the first
-    covered one is the common origin; each segment of the estimate has one of its own.
+    covered one is the common origin; each segment of the estimate has one of its own. Poses that are not finite are
+    left out.
 
     Raises:
         GavoError: the truth covers no pose of the estimate.
     """
+    estimate, truth = _known(estimate), _known(truth)
     estimate = estimate[np.argsort(estimate.timestamps, kind="stable")]
     true, valid = truth.interpolate(estimate.timestamps, max_gap)
     if not valid.any():
@@ -186,6 +190,12 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     distances = np.linalg.norm((from_first - true_from_first)[:, :3, 3], axis=1)
     definition = "distance between estimated and true position, both relative to the first pose; truth interpolated"
     return ErrorSeries(distances, estimate.timestamps[valid], "m", definition)
+
+
+def _known(trajectory: Trajectory) -> Trajectory:
+    """The poses that are finite, and so are their stamps."""
+    known = np.isfinite(trajectory.world_T_camera).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
+    return trajectory if known.all() else trajectory[known]
 
 
 def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:

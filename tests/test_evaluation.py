@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import (
+    ErrorSeries,
     absolute_trajectory_error,
     distance_error,
     is_w_first,
@@ -255,6 +256,31 @@ def test_results_say_what_they_are():
     assert summary["count"] == len(error.translation.values) == len(error.translation.timestamps)
     assert "translation" in error.translation.definition and "rotation" in error.rotation.definition
     assert summary["max"] == error.translation.max >= error.translation.rmse >= error.translation.mean > 0
+
+
+@pytest.mark.parametrize("which", ["estimate", "truth"])
+def test_poses_that_are_not_known_are_left_out(which):
+    """They ended in a traceback or in a drift that is not-a-number; unknown stamps alone in no drift at all."""
+    truth = smooth_truth()
+    both = {"estimate": perturbed(truth, truth.timestamps[::3], 0), "truth": truth}
+    whole = both[which]
+    lost = np.arange(len(whole)) % 7 == 3
+    stamps, poses = whole.timestamps.copy(), whole.world_T_camera.copy()
+    poses[lost], stamps[5] = np.nan, np.nan
+    lost[5] = True
+    holed, cut, unknown = (
+        both | {which: Trajectory(*of)}
+        for of in ((stamps, poses), (stamps[~lost], poses[~lost]), (stamps, np.full_like(poses, np.nan)))
+    )
+
+    def drift(estimate: Trajectory, truth: Trajectory) -> ErrorSeries:
+        return relative_pose_error(estimate, truth).translation
+
+    for error in (drift, absolute_trajectory_error, distance_error):
+        series, expected = (error(pair["estimate"], pair["truth"]) for pair in (holed, cut))
+        assert np.isfinite(series.rmse) and series.rmse == expected.rmse
+        with pytest.raises(GavoError):
+            error(unknown["estimate"], unknown["truth"])
 
 
 def test_too_little_to_compare_is_refused():
