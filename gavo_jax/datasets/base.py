@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, UInt8, UInt16
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, require_camera
 from gavo_jax.errors import GavoError
 from gavo_jax.image.numbers import is_real
 from gavo_jax.trajectory import Trajectory
@@ -143,16 +143,32 @@ class Frame:
         return replace(self, timestamp=timestamp, depth_timestamp=depth)
 
 
-def require_sequence(sequence: Any) -> None:
-    """Refuse what is no sequence: a list of frames, a generator, a path.
+TRACKED = ("camera", "timestamps", "__len__", "__getitem__")
+"""What tracking needs of a `Sequence`."""
+RUN = (*TRACKED, "name", "ground_truth", "check")
+"""What a run needs."""
+
+
+def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
+    """Refuse what is no sequence (a list of frames, a generator, a path), and one of somebody's own that lacks a part.
 
     Raises:
-        GavoError: It lacks what tracking needs of a `Sequence`.
+        GavoError: It lacks what is needed of a `Sequence`, or that is of another kind.
     """
-    needed = ("camera", "timestamps", "__len__", "__getitem__")
-    if isinstance(sequence, type) or not all(hasattr(sequence, name) for name in needed):
-        fault = f"a Sequence is needed, not {type(sequence).__name__}"
+    kind = type(sequence).__name__
+    lacking = [name for name in needed if not hasattr(sequence, name)]
+    if isinstance(sequence, type) or "camera" in lacking:
+        fault = f"a Sequence is needed, not {kind}"
         raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
+    if lacking:
+        raise GavoError(f"{kind} is no Sequence: it has no {', '.join(lacking)}")
+    require_camera(sequence.camera)
+    if np.shape(sequence.timestamps) != (len(sequence),):
+        shape = np.shape(sequence.timestamps)
+        raise GavoError(f"{kind}: timestamps: one for each of {len(sequence)} frames is needed, not shape {shape}")
+    truth = getattr(sequence, "ground_truth", None)
+    if not isinstance(truth, Trajectory | None):
+        raise GavoError(f"{kind}: ground_truth: a Trajectory or None is needed, not {type(truth).__name__}")
 
 
 class Sequence(Protocol):

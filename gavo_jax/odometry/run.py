@@ -10,7 +10,7 @@ import numpy as np
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.waits import Stopwatch
-from gavo_jax.datasets.base import Sequence, require_sequence
+from gavo_jax.datasets.base import RUN, Sequence, require_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
@@ -95,7 +95,7 @@ def run_odometry(
     Raises:
         GavoError: It is no sequence, has fewer than two frames, or its own check refuses it.
     """
-    require_sequence(sequence)
+    require_sequence(sequence, RUN)
     if len(sequence) < 2:
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()

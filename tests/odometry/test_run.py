@@ -11,6 +11,7 @@ import small
 from driving import Altered, errors, known, run
 from small import Rendered
 
+from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
@@ -35,6 +36,38 @@ def test_what_is_no_sequence_is_refused_by_name():
     odometry.register(frames[0], 0.0)
     step = odometry.register(replace(frames[1], grey=dark), 1 / 30)  # a covered lens is no reason to end a run
     assert step is not None and step.alignment.status is not AlignmentStatus.OK
+
+
+class Own:
+    """A sequence of somebody's own."""
+
+    name, camera, timestamps, ground_truth = "own", small.CAMERA, np.arange(3.0), None
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: int) -> Any:
+        raise FrameError(f"frame {index}: not there")
+
+    def check(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"check": None, "name": None}, "Own is no Sequence: it has no name, check"),
+        ({"timestamps": np.arange(2.0)}, r"Own: timestamps: .*3 frames"),
+        ({"camera": "fr1"}, "a Camera is needed"),
+        ({"ground_truth": "groundtruth.txt"}, "Own: ground_truth: a Trajectory or None"),
+        ({}, "frame 0: not there"),
+    ],
+)
+def test_what_a_sequence_of_ones_own_lacks_is_named(change, words, monkeypatch):
+    """They ended in tracebacks, somewhere on the way."""
+    for name, value in change.items():
+        monkeypatch.delattr(Own, name) if value is None else monkeypatch.setattr(Own, name, value)
+    with pytest.raises(GavoError, match=words):
+        run_odometry(Own(), small.NEWTON)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("wrong", [None, "rgb/1.png", (np.zeros((120, 160), np.uint8),) * 2])
