@@ -166,7 +166,7 @@ def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
     if np.shape(sequence.timestamps) != (len(sequence),):
         shape = np.shape(sequence.timestamps)
         raise GavoError(f"{kind}: timestamps: one for each of {len(sequence)} frames is needed, not shape {shape}")
-    truth = getattr(sequence, "ground_truth", None)
+    truth = sequence.ground_truth if "ground_truth" in needed else None
     if not isinstance(truth, Trajectory | None):
         raise GavoError(f"{kind}: ground_truth: a Trajectory or None is needed, not {type(truth).__name__}")
 
