@@ -112,7 +112,7 @@ class OdometryOptions:
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")
-    keyframe_overlap: float = within(0.7, 0)
+    keyframe_overlap: float = within(0.7, 0, 1)
     prior: bool = static(True)
     synchronise: bool = static(True)
     rolling_shutter: bool = static(True)

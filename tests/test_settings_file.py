@@ -81,6 +81,7 @@ def test_values_of_every_kind():
         ("alignment.depth_weight", -1, ["depth_weight", "at least 0"]),
         ("alignment.bounds", 0, ["bounds", "at least"]),
         ("odometry.keyframe_overlap", -0.1, ["keyframe_overlap", "at least 0"]),
+        ("odometry.keyframe_overlap", 70, ["keyframe_overlap", "at most 1"]),
         ("odometry.on_lost", "panic", ["on_lost", "hold, predict, stop"]),
         ("odometry.prior", 1, ["prior", "true or false"]),
         ("solver.mutants", [[1], [1, 2]], ["mutants", "must be a number"]),
