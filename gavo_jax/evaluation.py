@@ -193,7 +193,8 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
 
 
 def _known(trajectory: Trajectory) -> Trajectory:
-    """The poses that are finite, and so are their stamps."""
+    """The poses that are finite, and so are their stamps; raise GavoError where one is no rigid transform."""
+    trajectory.require_rigid()
     known = np.isfinite(trajectory.world_T_camera).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
     return trajectory if known.all() else trajectory[known]
 

@@ -85,25 +85,28 @@ class Trajectory:
     segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Hold all as arrays; raise ValueError where their shapes do not belong together, or a pose that is finite is
-        no rigid transform.
-        """
+        """Hold all as arrays; raise ValueError where their shapes do not belong together."""
         timestamps = np.asarray(self.timestamps, np.float64)
         world_T_camera = np.asarray(self.world_T_camera, np.float64)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
             raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
-        broken = np.flatnonzero(np.isfinite(world_T_camera).all(axis=(1, 2)) & ~is_rigid(world_T_camera))
-        if len(broken):
-            raise ValueError(
-                f"pose {broken[0]} of {len(timestamps)} is no rigid transform: a rotation, a column of metres beside "
-                "it, and 0 0 0 1 below"
-            )
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_camera", world_T_camera)
         segments = np.zeros(len(timestamps), int) if self.segments is None else np.asarray(self.segments, int)
         if segments.shape != timestamps.shape:
             raise ValueError(f"one segment a pose expected, got {segments.shape} for {timestamps.shape}")
         object.__setattr__(self, "segments", segments)
+
+    def require_rigid(self) -> None:
+        """Refuse poses that are no rigid transforms, save those that are not finite: nothing is said by them.
+
+        Raises:
+            GavoError: names the first one.
+        """
+        broken = np.flatnonzero(np.isfinite(self.world_T_camera).all(axis=(1, 2)) & ~is_rigid(self.world_T_camera))
+        if len(broken):
+            needed = "a rotation, a column of metres beside it, and 0 0 0 1 below are needed"
+            raise GavoError(f"pose {broken[0]} of {len(self)} is no rigid transform: {needed}")
 
     def __len__(self) -> int:
         """Return the number of poses."""

@@ -9,6 +9,7 @@ from evo.core import metrics, sync
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import (
     ErrorSeries,
@@ -281,6 +282,24 @@ def test_poses_that_are_not_known_are_left_out(which):
         assert np.isfinite(series.rmse) and series.rmse == expected.rmse
         with pytest.raises(GavoError):
             error(unknown["estimate"], unknown["truth"])
+
+
+@pytest.mark.parametrize("which", ["estimate", "truth"])
+@pytest.mark.parametrize(
+    "change", [np.transpose, lambda pose: 1.1 * pose, lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0])]
+)
+def test_poses_that_are_no_rigid_transforms_are_refused(change, which):
+    """Transposed ones have no translation: what drifted was told to stand still."""
+    truth = smooth_truth()
+    both = {"estimate": perturbed(truth, truth.timestamps[::3], 0), "truth": truth}
+    poses = both[which].world_T_camera.copy()
+    poses[1] = change(poses[1])
+    both[which] = broken = Trajectory(both[which].timestamps, poses)
+    for error in (relative_pose_error, absolute_trajectory_error, distance_error):
+        with pytest.raises(GavoError, match=f"pose 1 of {len(poses)} is no rigid transform"):
+            error(both["estimate"], both["truth"])
+    with pytest.raises(GavoError, match="pose 1 of .* is no rigid transform"):
+        SyntheticSequence(trajectory=broken)
 
 
 def test_too_little_to_compare_is_refused():

@@ -153,7 +153,7 @@ def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
     """Refuse what is no sequence (a list of frames, a generator, a path), and one of somebody's own that lacks a part.
 
     Raises:
-        GavoError: It lacks what is needed of a `Sequence`, or that is of another kind.
+        GavoError: It lacks what is needed of a `Sequence`.
     """
     kind = type(sequence).__name__
     lacking = [name for name in needed if not hasattr(sequence, name)]
@@ -162,13 +162,6 @@ def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
         raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
     if lacking:
         raise GavoError(f"{kind} is no Sequence: it has no {', '.join(lacking)}")
-    require_camera(sequence.camera)
-    if np.shape(sequence.timestamps) != (len(sequence),):
-        shape = np.shape(sequence.timestamps)
-        raise GavoError(f"{kind}: timestamps: one for each of {len(sequence)} frames is needed, not shape {shape}")
-    truth = sequence.ground_truth if "ground_truth" in needed else None
-    if not isinstance(truth, Trajectory | None):
-        raise GavoError(f"{kind}: ground_truth: a Trajectory or None is needed, not {type(truth).__name__}")
 
 
 class Sequence(Protocol):
@@ -219,3 +212,18 @@ class Sequence(Protocol):
             GavoError: names the file and the fault.
         """
         ...
+
+
+def require_parts(sequence: Sequence) -> None:
+    """Refuse a sequence of somebody's own whose camera, stamps or ground truth are of another kind.
+
+    Raises:
+        GavoError: names the part.
+    """
+    kind, truth = type(sequence).__name__, sequence.ground_truth
+    require_camera(sequence.camera)
+    if np.shape(sequence.timestamps) != (len(sequence),):
+        shape = np.shape(sequence.timestamps)
+        raise GavoError(f"{kind}: timestamps: one for each of {len(sequence)} frames is needed, not shape {shape}")
+    if not isinstance(truth, Trajectory | None):
+        raise GavoError(f"{kind}: ground_truth: a Trajectory or None is needed, not {type(truth).__name__}")

@@ -10,7 +10,7 @@ import numpy as np
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.waits import Stopwatch
-from gavo_jax.datasets.base import RUN, Sequence, require_sequence
+from gavo_jax.datasets.base import RUN, Sequence, require_parts, require_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 from gavo_jax.mapping.background import BackgroundMapper
@@ -99,6 +99,7 @@ def run_odometry(
     if len(sequence) < 2:
         raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
     sequence.check()
+    require_parts(sequence)
     sequence = without_distortion(sequence)
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
     seed = as_seed(seed)

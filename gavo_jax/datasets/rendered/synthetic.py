@@ -106,6 +106,7 @@ class SyntheticSequence:
         else:
             source = trajectory if isinstance(trajectory, Trajectory) else Trajectory.read_tum(trajectory)
             self._truth, self._half_extent, self._height = _fit_room(_play(source, frames, rate, speed))
+            source.require_rigid()
         self._selection = np.arange(len(self._truth))
         self._phases = np.random.default_rng([seed, _EXPOSURE_STREAM]).uniform(0, 2 * np.pi, 2)
         if isinstance(bodies, int):
