@@ -84,28 +84,19 @@ def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
 
 
 ROUNDED = 0.01
-"""Largest entry of RᵀR − I that numbers of two or three digits leave, and largest departure of the last row."""
+"""Largest entry of RᵀR − I that rounded numbers leave."""
 
 
 def is_rigid(
     matrices: Float[np.ndarray, "*batch 4 4"], tolerance: float = ROUNDED
 ) -> Bool[np.ndarray, " *batch"] | np.bool_:
-    """Whether numbers, rounded as they may be, are those of a rotation and a translation, and finite."""
+    """Whether numbers, rounded as they may be, are those of a rotation and a translation, above 0 0 0 1, and finite."""
     matrices = np.asarray(matrices, np.float64)
     rotations, last = matrices[..., :3, :3], matrices[..., 3, :]
     with np.errstate(over="ignore", invalid="ignore"):
         departures = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max(axis=(-2, -1))
         turns = (departures <= tolerance) & (np.linalg.det(rotations) > 0)
-    return turns & (np.abs(last - np.eye(4)[3]) <= tolerance).all(axis=-1) & np.isfinite(matrices).all(axis=(-2, -1))
-
-
-def rigid_of(matrix: Float[np.ndarray, "4 4"], tolerance: float = ROUNDED) -> Float64[np.ndarray, "4 4"] | None:
-    """The rigid motion that rounded numbers stand for; None where they are none (`is_rigid`)."""
-    if not is_rigid(matrix, tolerance):
-        return None
-    result = rigid(matrix)
-    result[3] = np.eye(4)[3]
-    return result
+    return turns & np.isclose(last, [0, 0, 0, 1]).all(axis=-1) & np.isfinite(matrices).all(axis=(-2, -1))
 
 
 def departure_from_rigid(transform: Float[Array, "*batch 4 4"]) -> Float[Array, " *batch"]:

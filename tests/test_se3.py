@@ -8,7 +8,7 @@ import scipy.linalg
 from hypothesis import given
 from twists import hat, twists
 
-from gavo_jax.se3 import GENERATORS, adjoint, departure_from_rigid, exp, log, right_jacobian, rigid, rigid_of
+from gavo_jax.se3 import GENERATORS, adjoint, departure_from_rigid, exp, is_rigid, log, right_jacobian, rigid
 
 TURN = scipy.linalg.expm(np.array([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]]))
 jit_exp, jit_log, jit_jacobian = jax.jit(exp), jax.jit(log), jax.jit(right_jacobian)
@@ -40,11 +40,12 @@ def test_what_is_not_finite_stays_so_alone() -> None:
 
 
 def test_numbers_printed_with_few_digits_are_a_motion() -> None:
-    found = rigid_of(np.round(motion(TURN), 3), 0.01)
-    assert found is not None
+    rounded = np.round(motion(TURN), 3)
+    assert is_rigid(rounded, 0.01)
+    found = rigid(rounded)
     np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-15)
     np.testing.assert_allclose(found, motion(TURN), atol=1e-3)
-    assert rigid_of(np.round(motion(TURN), 3), 1e-5) is None
+    assert not is_rigid(rounded, 1e-5)
 
 
 @pytest.mark.parametrize(
@@ -57,11 +58,23 @@ def test_numbers_printed_with_few_digits_are_a_motion() -> None:
         motion(np.full((3, 3), np.nan)),
         motion(np.full((3, 3), 1e200)),
         2.0 * motion(TURN),
+        motion(TURN) + np.outer([0, 0, 0, 1], [0.005, 0, 0, 0]),
+        motion(TURN) + np.diag([0, 0, 0, 0.005]),
     ],
-    ids=["zeros", "transposed", "scaled", "mirrored", "not finite", "too large to square", "all of it doubled"],
+    ids=[
+        "zeros",
+        "transposed",
+        "scaled",
+        "mirrored",
+        "not finite",
+        "too large to square",
+        "all of it doubled",
+        "a last row that leans",
+        "a last number that is not 1",
+    ],
 )
 def test_other_numbers_are_none(matrix: np.ndarray) -> None:
-    assert rigid_of(matrix, 0.01) is None
+    assert not is_rigid(matrix, 0.01)
 
 
 def test_departure_tells_rounding_from_garbage() -> None:

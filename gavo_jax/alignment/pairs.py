@@ -20,7 +20,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.errors import GavoError
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
-from gavo_jax.se3 import rigid_of
+from gavo_jax.se3 import is_rigid, rigid
 from gavo_jax.settings import AlignmentOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
 from gavo_jax.status import AlignmentStatus
@@ -118,14 +118,11 @@ def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray,
     Raises:
         GavoError: One is no rigid motion, or not finite.
     """
-    result = np.empty_like(guesses)
-    for row, guess in enumerate(guesses):
-        motion = rigid_of(guess)
-        if motion is None:
-            which = f"guess {row}" if len(guesses) > 1 else "the guess"
-            raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")
-        result[row] = motion
-    return result
+    broken = np.flatnonzero(~is_rigid(guesses))
+    if len(broken):
+        which = f"guess {broken[0]}" if len(guesses) > 1 else "the guess"
+        raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")
+    return rigid(guesses)
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:

@@ -12,7 +12,7 @@ from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, 
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
-from gavo_jax.se3 import is_rigid, rigid_of
+from gavo_jax.se3 import is_rigid, rigid
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
 """Largest camera file, bytes; one of JSON may hold the pose of every frame, too."""
@@ -73,7 +73,7 @@ class Calibration:
         if (self.depth is None) != (self.color_T_depth is None):
             raise GavoError("a calibration has a depth camera and color_T_depth, or neither: depth is registered then")
         place = self.color_T_depth
-        if place is not None and not (np.shape(place) == (4, 4) and is_rigid(place)):
+        if place is not None and not (np.shape(place) == (4, 4) and is_rigid(place, ROTATION_TOLERANCE)):
             raise GavoError("color_T_depth: a 4x4 matrix is needed, of a rotation and a translation")
 
     def with_depth_scale(self, scale: float) -> "Calibration":
@@ -276,9 +276,8 @@ def _rigid(place: str, rows: Any) -> np.ndarray:
             raise ValueError
     except (ValueError, TypeError, OverflowError):
         raise GavoError(f"{place}: must be four rows of four numbers") from None
-    pose = rigid_of(matrix, ROTATION_TOLERANCE)
-    if pose is None:
+    if not is_rigid(matrix, ROTATION_TOLERANCE):
         raise GavoError(f"{place}: no rigid transform (a rotation and a shift, last row 0 0 0 1)")
-    if np.abs(pose[:3, 3]).max() > LARGEST_SHIFT:
+    if np.abs(matrix[:3, 3]).max() > LARGEST_SHIFT:
         raise GavoError(f"{place}: a shift of more than {LARGEST_SHIFT:g} m: not in metres?")
-    return pose
+    return rigid(matrix)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
 from gavo_jax.datasets.names import FEWEST
 from gavo_jax.errors import GavoError, data_rows, number
-from gavo_jax.se3 import rigid_of
+from gavo_jax.se3 import rigid
 from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
 
 TRUTH = "groundtruth.txt"
@@ -33,8 +33,8 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 """Between ICL-NUIM's world and cameras, whose y points up as the negative fy of its page says, and those of its images,
 whose rows run from the top as everywhere. Both sides of a pose turn over, so that it stays a rotation and a shift."""
 
-SKEWED = 0.02
-"""Largest entry of RᵀR − I of a pose whose numbers were rounded."""
+SKEWED = 0.01
+"""A pose of which a number is off the nearest rigid transform's by more is none."""
 
 MAX_POSE_BYTES = 4096
 
@@ -262,8 +262,10 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
         raise GavoError(f"{place}: expected a pose of four rows of four numbers, found {found}") from None
     if not np.isfinite(matrix).all():
         return None
-    pose = rigid_of(matrix, SKEWED)
-    if pose is not None and np.abs(pose[:3, 3]).max() < MAX_MAGNITUDE:
+    pose = rigid(matrix)
+    pose[3] = (0, 0, 0, 1)
+    turns = np.abs(pose - matrix).max() <= SKEWED and np.linalg.det(pose[:3, :3]) > 0
+    if turns and np.abs(pose[:3, 3]).max() < MAX_MAGNITUDE:
         return pose
     raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")
 
