@@ -95,16 +95,25 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def level(self, k: int) -> "Camera":
-        """Return the camera of pyramid level k, whose image is 2^k times smaller along each side.
+        """Return the camera of pyramid level k, whose image is 2^k times smaller along each side: `binned`."""
+        return self.binned(2**k)
 
-        A pixel of level k averages 2^k × 2^k pixels, so centres map as c' = (c + 1/2) / 2^k - 1/2.
-        Distortion is kept as it is: it acts on normalised coordinates.
+    def binned(self, pixels: int) -> "Camera":
+        """Return the camera of an image of which each pixel averages n × n; columns and rows left over are cut off.
+
+        Centres map as c' = (c + 1/2) / n - 1/2. Distortion is kept as it is: it acts on normalised coordinates.
         """
-        fx, fy, cx, cy = self.scaled(0.5**k)
-        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=self.width >> k, height=self.height >> k)
+        fx, fy, cx, cy = self.scaled(1 / pixels)
+        size = {"width": self.width // pixels, "height": self.height // pixels}
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, **size)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the camera of the same view at another size."""
+        (fx, _, cx, _), (_, fy, _, cy) = self.scaled(width / self.width), self.scaled(height / self.height)
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     def scaled(self, scale: Any) -> tuple[Any, Any, Any, Any]:
-        """Intrinsics fx, fy, cx, cy of an image `scale` times as large, or of several; see `level`."""
+        """Intrinsics fx, fy, cx, cy of an image `scale` times as large, or of several; see `binned`."""
         return (
             self.fx * scale,
             self.fy * scale,

@@ -1,6 +1,7 @@
 """Bad input as one kind of exception, lines about it, the text files that users hand in, and files written whole."""
 
 import contextlib
+import json
 import math
 import os
 import re
@@ -100,6 +101,19 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         if isinstance(error, GavoError):
             raise
         raise GavoError(f"{str(path)!r}: not a usable path: {error}") from None
+
+
+def read_json(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> Any:
+    """Return what a file of JSON holds.
+
+    Raises:
+        GavoError: as `read_text`, or it is no JSON.
+    """
+    text = read_text(path, max_bytes)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GavoError(f"{path}: not JSON: {' '.join(str(error).split())[:200]}") from None
 
 
 def parse_toml(place: str | Path, text: str) -> dict[str, Any]:

@@ -138,6 +138,44 @@ def nerf(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames[::-1]}))
 
 
+PLUS_STAMPS = [round(71234.25 + i / 60, 6) for i in range(4)]
+
+
+def scannet_plus_plus(folder: Path) -> None:
+    """As its toolbox leaves the iPhone's part; the poses of ARKit's own world lie there, too."""
+    frames: dict[str, object] = {}
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"rgb/frame_{i:06}.jpg", grey)
+        image(folder / f"depth/frame_{i:06}.png", raw(metres, 1000))
+        elsewhere = np.eye(4) + np.eye(4, k=3)
+        frames[f"frame_{i:06}"] = {
+            "timestamp": PLUS_STAMPS[i],
+            "pose": (elsewhere @ pose).tolist(),
+            "aligned_pose": pose.tolist(),
+            "intrinsic": MATRIX.tolist(),
+            "imu": [],
+        }
+    (folder / "pose_intrinsic_imu.json").write_text(json.dumps(frames))
+
+
+POLYCAM_STAMPS = [round(7123.456789 + i / 30, 6) for i in range(4)]
+
+
+def polycam(folder: Path) -> None:
+    """Its `keyframes/`: names are microseconds; the corrected poses are better than the others."""
+    for stamp, grey, metres, pose in zip(POLYCAM_STAMPS, GREYS, METRES, POSES, strict=True):
+        name = str(round(stamp * 1e6))
+        image(folder / f"images/{name}.jpg", grey)
+        image(folder / f"depth/{name}.png", raw(metres, 1000))
+        image(folder / f"confidence/{name}.png", np.full((120, 160), 255, np.uint8))
+        for kind, shift in (("cameras", 1.0), ("corrected_cameras", 0.0)):
+            matrix = pose @ np.diag([1.0, -1.0, -1.0, 1.0]) + shift * np.eye(4, k=3)
+            values = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+            camera = {"fx": 131.0, "fy": 131.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
+            (folder / kind).mkdir(exist_ok=True)
+            (folder / f"{kind}/{name}.json").write_text(json.dumps({**camera, **values, "blur_score": 90.0}))
+
+
 def tum(folder: Path) -> None:
     write_tum(ROOM, folder)
 
@@ -322,6 +360,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "one_folder": ("folder of colour and depth images", one_folder),
     "stray": ("scan of Stray Scanner", stray),
     "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
+    "scannet_plus_plus": ("scan of ScanNet++", scannet_plus_plus),
+    "polycam": ("scan of Polycam", polycam),
     "open_loris": ("OpenLORIS-Scene sequence", open_loris),
     "tartan_air": ("TartanAir trajectory", tartan_air),
     "tartan_air_2": ("TartanAir trajectory", tartan_air_2),

@@ -80,6 +80,27 @@ class Calibration:
         """The same with a depth scale that is known."""
         return replace(self, color=replace(self.color, depth_scale=scale), states_depth_scale=True)
 
+    def with_depth_of_size(self, width: int, height: int) -> "Calibration":
+        """The same where depth is of colour's view at a size of its own, as phones and their like have it.
+
+        Itself where depth has a camera already, has colour's size, or cannot be of that view: of another shape.
+        """
+        color = self.color
+        if self.depth is not None or (width, height) == (color.width, color.height):
+            return self
+        if width * color.height != height * color.width:
+            return self
+        return replace(self, depth=color.resized(width, height), color_T_depth=np.eye(4))
+
+    def with_color(self, color: Camera) -> "Calibration":
+        """The same with another colour camera, which is depth's, too, where depth is of its view."""
+        depth, moved = self.depth, self.color_T_depth
+        if depth is None or moved is None:
+            return replace(self, color=color)
+        of_view = self.color.resized(depth.width, depth.height)
+        is_of_view = np.allclose(moved, np.eye(4)) and np.allclose(of_view.matrix, depth.matrix)
+        return replace(self, color=color, depth=color.resized(depth.width, depth.height) if is_of_view else depth)
+
 
 def load_camera(path_or_name: str | Path) -> Camera:
     """Return a camera from a preset's name (fr1, fr2, fr3, bonn, icl) or from a file; see `load_calibration`.

@@ -42,7 +42,7 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines += [("not used", line) for line in facts["why_not"]]
     lines += [(f"of these, {count} {status}", NOTES[status]) for status, count in facts["frames_doubted"].items()]
     lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
-    lines += _recorded(facts["recorded_camera"])
+    lines += _recorded(facts["recorded_camera"], facts["camera"])
     lines += [("depth", _depth(facts))]
     if fault := facts["depth"]["fault"]:
         lines.append(("depth scale", f"WRONG? {fault}"))
@@ -76,11 +76,13 @@ def _is_distorted(camera: dict[str, Any]) -> bool:
     return camera["model"] == "fisheye" or any(camera["distortion"])
 
 
-def _recorded(recorded: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """The cameras before undistortion and registration, where they differ."""
+def _recorded(recorded: dict[str, Any] | None, camera: dict[str, Any]) -> list[tuple[str, str]]:
+    """The cameras before undistortion, averaging of pixels and registration, where they differ."""
     if recorded is None:
         return []
-    lines = [("colour as recorded", _camera(recorded["color"]))] if _is_distorted(recorded["color"]) else []
+    color = recorded["color"]
+    is_other = _is_distorted(color) or color["width"] != camera["width"]
+    lines = [("colour as recorded", _camera(color))] if is_other else []
     if "depth" in recorded:
         lines.append(("depth camera", _camera(recorded["depth"]) + ", registered to colour"))
     return lines

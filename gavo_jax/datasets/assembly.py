@@ -28,6 +28,9 @@ MUCH = 0.02
 
 METRES, MILLIMETRES = 1.0, 1000.0
 
+FINER = 2
+"""Columns of colour for each of depth that are left at least where colour is read coarser than it was recorded."""
+
 METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 30.0), (300.0, 60000.0)
 """Median depth of a file of floats that is taken as one of metres, or of millimetres; between them lie centimetres."""
 
@@ -149,9 +152,18 @@ class FrameAssembler:
     _told: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @cached_property
+    def binning(self) -> int:
+        """How many columns and rows of colour become one: as many as leave it finer than depth still, by `FINER`.
+
+        What is finer than that adds time, and nothing to the motion: it has no depth of its own.
+        """
+        color, depth = self.calibration.color, self.calibration.depth
+        return 1 if depth is None else max(1, int(color.fx / depth.fx / FINER))
+
+    @cached_property
     def recorded(self) -> Camera:
-        """The colour camera as it records, with the frames' depth scale."""
-        return replace(self.calibration.color, depth_scale=self.unit.frame)
+        """The colour camera as it records, at the size of frames and with their depth scale."""
+        return replace(self.calibration.color.binned(self.binning), depth_scale=self.unit.frame)
 
     @property
     def camera(self) -> Camera:
@@ -182,11 +194,11 @@ class FrameAssembler:
         if self.calibration.depth_delay:
             stamped = timestamp if depth_timestamp is None else depth_timestamp
             depth_timestamp = stamped + self.calibration.depth_delay
-        _check_size(bgr, camera, name, "camera")
+        _check_size(bgr, self.calibration.color, name, "camera")
         if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MUCH:
             brighter = "is brighter than the images that were looked at first"
             self._tell_once(brighter, name, f"what exceeds {self.white} is white, in others too")
-        image = to_8_bits(bgr, self.white)
+        image = _binned(to_8_bits(bgr, self.white), self.binning)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if self.color else None
         if self.undistort:
@@ -245,6 +257,15 @@ def in_frame_units(raw: np.ndarray, unit: DepthUnit) -> UInt16[np.ndarray, "h w"
         return clean
     scaled = clean * np.float32(unit.frame / unit.file) + np.float32(0.5)
     return np.where(scaled < NO_READING, scaled, np.float32(0)).astype(np.uint16)
+
+
+def _binned(image: np.ndarray, pixels: int) -> np.ndarray:
+    """The image of `Camera.binned`."""
+    if pixels == 1:
+        return image
+    height, width = (side // pixels for side in image.shape[:2])
+    whole = image[: height * pixels, : width * pixels]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def common_white(images: Iterable[np.ndarray]) -> int:

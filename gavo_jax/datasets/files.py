@@ -305,11 +305,20 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
     Raises:
         FrameError: why the first of them cannot be read, where none can.
     """
+    return _size_of_most([entry.color for entry in entries], read_color)
+
+
+def depth_size_of_most(entries: Sequence[Entry]) -> Size:
+    """The same of depth."""
+    return _size_of_most([entry.depth for entry in entries if entry.depth is not None], read_depth)
+
+
+def _size_of_most(images: Sequence[Path], read: Callable[[Path], np.ndarray]) -> Size:
     fault: FrameError | None = None
     sizes: Counter[Size] = Counter()
-    for at in places_of_a_few(len(entries)):
+    for at in places_of_a_few(len(images)):
         try:
-            height, width = read_color(entries[at].color).shape[:2]
+            height, width = read(images[at]).shape[:2]
             sizes[width, height] += 1
         except FrameError as error:
             fault = fault or error

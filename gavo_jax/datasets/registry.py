@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from gavo_jax.datasets import unrecognised
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.layouts.arkit import Polycam, ScanNetPlusPlus
 from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.layouts.openloris import OpenLoris
 from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
@@ -55,6 +56,8 @@ BUILT_IN: tuple[Dataset, ...] = (
         StrayScan,
         ArkitScenes,
         Record3D,
+        ScanNetPlusPlus,
+        Polycam,
         RtabMap,
         Open3DFolder,
         PlainFolder,

@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 from command import runner
 from written_bags import COLOR, DEPTH, Recorder, Shot, record
-from written_folders import ARKIT_STAMPS, CAMERA, GREYS, LAYOUTS, METRES, RTABMAP_STAMPS, image, raw
+from written_folders import (
+    ARKIT_STAMPS,
+    CAMERA,
+    GREYS,
+    LAYOUTS,
+    METRES,
+    POLYCAM_STAMPS,
+    RTABMAP_STAMPS,
+    image,
+    raw,
+)
 
 SHOTS = [
     Shot(1 + i / 30, np.dstack([grey] * 3), raw(metres, 1000))
@@ -169,8 +179,8 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     ),
     "stray: frames of another size": (
         "stray",
-        lambda clip: [image(clip / f"rgb/{i:06}.png", cv2.resize(GREYS[i], (320, 240))) for i in range(4)],
-        ["clip: colour images of 320x240", "depth of 160x120", "ffmpeg -i rgb.mp4 -vf scale=160:120 -start_number 0"],
+        lambda clip: [image(clip / f"rgb/{i:06}.png", cv2.resize(GREYS[i], (320, 180))) for i in range(4)],
+        ["clip: images of 320x180", "of a film of 1920x1440", "do not crop them"],
     ),
     "stray: poses of other frames": (
         "stray",
@@ -178,6 +188,56 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["odometry.csv: has no row of any frame"],
     ),
     "stray: poses of prose": ("stray", write("odometry.csv", "up\n"), ["odometry.csv:1: expected 9 numbers"]),
+    "stray: depth of another shape": (
+        "stray",
+        lambda clip: [image(clip / f"depth/{i:06}.png", raw(METRES[i][:90], 1000)) for i in range(4)],
+        ["depth/000000.png: is 160x90 pixels", "160x120", "colour_T_depth"],
+    ),
+    "scannet++: a list of frames": (
+        "scannet_plus_plus",
+        write("pose_intrinsic_imu.json", "[1, 2]"),
+        ["pose_intrinsic_imu.json: expected an object"],
+    ),
+    "scannet++: frames of another name": (
+        "scannet_plus_plus",
+        edit("pose_intrinsic_imu.json", '"frame_000002"', '"img 2"'),
+        ["pose_intrinsic_imu.json: 'img 2'", "frame_000000"],
+    ),
+    "scannet++: no camera": (
+        "scannet_plus_plus",
+        edit("pose_intrinsic_imu.json", '"intrinsic"', '"lens"'),
+        ["pose_intrinsic_imu.json: has no camera", "--camera"],
+    ),
+    "scannet++: a camera of four numbers": (
+        "scannet_plus_plus",
+        edit("pose_intrinsic_imu.json", '"intrinsic": [[131.0, 0.0, 79.5], [0.0', '"intrinsic": [[131.0, 0.0'),
+        ["pose_intrinsic_imu.json: intrinsic: expected three rows"],
+    ),
+    "scannet++: stamps of text": (
+        "scannet_plus_plus",
+        edit("pose_intrinsic_imu.json", '"timestamp": ', '"timestamp": "a", "then": '),
+        ["pose_intrinsic_imu.json: timestamp: expected seconds", "--rate"],
+    ),
+    "scannet++: a pose of two rows": (
+        "scannet_plus_plus",
+        edit("pose_intrinsic_imu.json", '"aligned_pose": [[', '"aligned_pose": [[1, 0, 0, 0], [0, 1, 0, 0]], "b": [['),
+        ["pose_intrinsic_imu.json: frame 0: expected a pose of four rows"],
+    ),
+    "polycam: a camera without numbers": (
+        "polycam",
+        lambda clip: [write(f"cameras/{file.name}", "{}")(clip) for file in list((clip / "cameras").iterdir())],
+        ["cameras: fx: missing"],
+    ),
+    "polycam: half a camera's file": (
+        "polycam",
+        lambda clip: write(f"cameras/{POLYCAM_STAMPS[1] * 1e6:.0f}.json", '{"fx": 131.0, ')(clip),
+        [".json: not JSON"],
+    ),
+    "polycam: a pose that is none": (
+        "polycam",
+        lambda clip: write(f"corrected_cameras/{POLYCAM_STAMPS[1] * 1e6:.0f}.json", '{"t_00": 2.0}')(clip),
+        [".json: expected a pose"],
+    ),
     "arkitscenes: cameras of two lenses": (
         "arkit_scenes",
         lambda clip: write(f"lowres_wide_intrinsics/41069021_{ARKIT_STAMPS[1]}.pincam", "160 120 140 131 79.5 59.5")(

@@ -50,7 +50,7 @@ def is_refused(done: Done, *words: str) -> bool:
     return done.status == 2 and not done.out and done.err.count("\n") == 1 and all(word in done.err for word in words)
 
 
-WITH_TIMES = ("tum", "stray", "arkit_scenes", "open_loris", "tartan_air_2", "rtabmap")
+WITH_TIMES = ("tum", "stray", "arkit_scenes", "open_loris", "tartan_air_2", "rtabmap", "scannet_plus_plus")
 """Layouts whose frames say when they were taken."""
 
 
@@ -61,8 +61,8 @@ def test_run_needs_nothing_but_the_folder_and_says_which_camera(gavo, tmp_path, 
     done = gavo("run", "clip", *FAST, "--output", "out")
     assert done.status == 0, done.err
     first = done.out.splitlines()[0]
-    counts = "stamps" if name == "associations" else "names"
-    rate = "" if name in WITH_TIMES else f" at 30 frames/s ({counts} are numbers)"
+    guesses = {"associations": "stamps are numbers", "polycam": "names taken for microseconds"}
+    rate = "" if name in WITH_TIMES else f" at 30 frames/s ({guesses.get(name, 'names are numbers')})"
     assert first.startswith(
         f"clip: {LAYOUTS[name][0]}, 4 frames of 160x120{rate}; camera fx 131 fy 131 cx 79.5 cy 59.5 (clip/"
     )

@@ -1,15 +1,15 @@
 """Poses in NeRF's `transforms.json`, as nerfstudio, Polycam's converters and others write it."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES
 from gavo_jax.datasets.truth import pose_of
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import read_json
 from gavo_jax.trajectory import Trajectory
 
 TRANSFORMS = "transforms.json"
@@ -41,7 +41,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
     poses: dict[float, np.ndarray] = {}
     for at, frame in frames:
         stamp = stamps.get(PureWindowsPath(str(frame.get("file_path"))).stem)
-        pose = pose_of(f"{path}: frames[{at}]", _fields(frame["transform_matrix"]))
+        pose = pose_of_rows(f"{path}: frames[{at}]", frame["transform_matrix"])
         if stamp is not None and pose is not None:
             poses[stamp] = pose @ FLIP
     if not poses:
@@ -51,16 +51,17 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
 
 
 def _frames(path: Path) -> list[dict[str, Any]]:
-    try:
-        values = json.loads(read_text(path, MAX_JSON_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise error if isinstance(error, GavoError) else GavoError(f"{path}: not JSON: {error}") from None
+    values = read_json(path, MAX_JSON_BYTES)
     frames = values.get("frames") if isinstance(values, dict) else None
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
 
 
-def _fields(matrix: Any) -> list[str]:
-    """Sixteen numbers as text; the last row may be left out."""
+def pose_of_rows(place: str, matrix: Any) -> Float[np.ndarray, "4 4"] | None:
+    """A pose of three or four rows of four numbers, or of as many numbers; None where it is not finite.
+
+    Raises:
+        GavoError: it is none.
+    """
     rows = matrix if isinstance(matrix, list) else [matrix]
     fields = [str(value) for row in rows for value in (row if isinstance(row, list) else [row])]
-    return fields + ["0", "0", "0", "1"] * (len(fields) == 12)
+    return pose_of(place, fields + ["0", "0", "0", "1"] * (len(fields) == 12))

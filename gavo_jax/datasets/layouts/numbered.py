@@ -21,13 +21,14 @@ from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
     Reading,
+    depth_size_of_most,
     info_of_scan,
     own_camera_file,
     preset_or_export,
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
+from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
@@ -47,6 +48,8 @@ class NumberedFolder(FileSequence):
     """Frames of which colour and depth have the same number; their time is that number over the rate."""
 
     kind: ClassVar[str] = "folder of numbered images"
+    depth_is_of_view: ClassVar[bool] = False
+    """Whether depth shows what colour does where it is of another size, as phones have it."""
     poses_of_depth: ClassVar[bool] = False
     """Whether the poses are those of the depth camera, where it is another than the colour camera."""
     DEPTH_SCALE: ClassVar[float] = MILLIMETRES
@@ -109,6 +112,8 @@ class NumberedFolder(FileSequence):
         entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
+        if cls.depth_is_of_view:
+            calibration = calibration.with_depth_of_size(*depth_size_of_most(entries))
         if (path / TRUTH).exists():  # somebody's own, which is better than the dataset's poses
             truth = truth_in(path, times.values(), None if is_stamped else lambda counts: counts / rate)
         else:
@@ -201,12 +206,11 @@ class ScanNet(NumberedFolder):
         color, depth = (cls._intrinsics(path, name) for name in ("color", "depth"))
         assert color is not None
         found = _millimetres(load_calibration(color, partial(size_of_most, entries), MILLIMETRES))
-        if depth is None or entries[0].depth is None:
+        if depth is None:
             return found
         for name in ("color", "depth"):
             _check_identity(color.with_name(f"extrinsic_{name}.txt"))
-        height, width = read_depth(entries[0].depth).shape
-        other = load_calibration(depth, (width, height), MILLIMETRES).color
+        other = load_calibration(depth, partial(depth_size_of_most, entries), MILLIMETRES).color
         if other == found.color:
             return found
         return replace(found, depth=other, color_T_depth=np.eye(4), origin=f"{color}, {depth.name}")
@@ -261,6 +265,8 @@ class PlainFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of colour and depth images"
     scale_is_open: ClassVar[bool] = True
+    depth_is_of_view: ClassVar[bool] = False
+    """As of `NumberedFolder`; nerfstudio has it so, too."""
     has_clock: ClassVar[bool] = False
     """Whether a file says when the frames were taken."""
     ESTIMATES: ClassVar[str] = ""
@@ -297,6 +303,8 @@ class PlainFolder(FileSequence):
         )
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
+        if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
+            calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)

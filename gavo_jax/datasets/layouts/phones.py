@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_each_frame
 from gavo_jax.datasets.layouts.pairing import Paired
@@ -36,6 +34,7 @@ class StrayScan(NumberedFolder):
     """
 
     kind: ClassVar[str] = "scan of Stray Scanner"
+    depth_is_of_view: ClassVar[bool] = True
     STAMPS: ClassVar[str] = "odometry.csv"
     MATRIX: ClassVar[str] = "camera_matrix.csv"
     FILM: ClassVar[tuple[int, int]] = (1920, 1440)
@@ -54,27 +53,16 @@ class StrayScan(NumberedFolder):
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """A camera file in the folder, else the film's camera, at the size of the images."""
-        if (file := own_camera_file(path)) is not None:
-            return load_calibration(file, lambda: size_of_most(entries), MILLIMETRES)
         width, height = size_of_most(entries)
-        cls._check_size(path, entries, width, height)
+        if (file := own_camera_file(path)) is not None:
+            return load_calibration(file, (width, height), MILLIMETRES)
         if width * cls.FILM[1] != height * cls.FILM[0]:
             film = "x".join(map(str, cls.FILM))
             raise GavoError(
                 f"{path}: images of {width}x{height}, of a film of {film}: say --camera, or do not crop them"
             )
         found = load_calibration(path / cls.MATRIX, cls.FILM, MILLIMETRES)
-        return replace(found, color=_at_width(found.color, width))
-
-    @classmethod
-    def _check_size(cls, path: Path, entries: Sequence[Entry], width: int, height: int) -> None:
-        """Refuse colour that is larger than depth: spread over its pixels, depth would cover a few of them."""
-        depth = entries[0].depth
-        shape = read_depth(depth).shape if depth is not None else (height, width)
-        if shape != (height, width):
-            how = f"ffmpeg -i rgb.mp4 -vf scale={shape[1]}:{shape[0]} -start_number 0 rgb/%06d.png"
-            sizes = f"colour images of {width}x{height}, depth of {shape[1]}x{shape[0]}"
-            raise GavoError(f"{path}: {sizes}: write them at that size ({how})")
+        return replace(found, color=found.color.resized(width, height))
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
@@ -127,6 +115,7 @@ class Record3D(PlainFolder):
     """
 
     kind: ClassVar[str] = "export of Record3D"
+    depth_is_of_view: ClassVar[bool] = True
     has_clock: ClassVar[bool] = True
     FILE: ClassVar[str] = "metadata.json"
 
@@ -171,14 +160,6 @@ def _clock_of(place: str, stamps: list[Any]) -> Seconds:
         return np.interp(numbers, np.arange(len(times)), times)
 
     return at
-
-
-def _at_width(camera: Camera, width: int) -> Camera:
-    """The camera of the same images at another size; pixel centres are whole numbers."""
-    share = width / camera.width
-    cx, cy = (share * (middle + 0.5) - 0.5 for middle in (camera.cx, camera.cy))
-    size = {"width": width, "height": round(share * camera.height)}
-    return replace(camera, fx=share * camera.fx, fy=share * camera.fy, cx=cx, cy=cy, **size)
 
 
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:

@@ -21,6 +21,7 @@ class RtabMap(PlainFolder):
     """
 
     kind: ClassVar[str] = "export of RTAB-Map"
+    depth_is_of_view: ClassVar[bool] = True
     scale_is_open: ClassVar[bool] = False
     ESTIMATES: ClassVar[str] = "*poses*.txt"
 

@@ -18,6 +18,8 @@ from written_folders import (
     LORIS_STAMPS,
     MATRIX,
     METRES,
+    PLUS_STAMPS,
+    POLYCAM_STAMPS,
     POSES,
     RTABMAP_STAMPS,
     STRAY_STAMPS,
@@ -63,18 +65,21 @@ def test_every_layout_gives_the_same_frames(folder, name):
     stamps = {
         "stray": STRAY_STAMPS,
         "arkit_scenes": ARKIT_STAMPS,
+        "scannet_plus_plus": PLUS_STAMPS,
+        "polycam": POLYCAM_STAMPS,
         "open_loris": LORIS_STAMPS,
         "rtabmap": RTABMAP_STAMPS,
     }
     from_one = ("nerf", "open3d", "open3d_image", "rtabmap_export")
     first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
-    expected = np.arange(4) / {"stray": 60, "tartan_air_2": 10}.get(name, 30)
+    expected = np.arange(4) / {"stray": 60, "scannet_plus_plus": 60, "tartan_air_2": 10}.get(name, 30)
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
+    is_lossy = bool([*folder.rglob("*.jpg")])
     for i, frame in enumerate(sequence):
         assert isinstance(frame, Frame)
-        lossy = name in ("scannet", "replica", "open3d", "open3d_image", "rtabmap", "rtabmap_export")
-        assert np.abs(frame.grey.astype(int) - GREYS[i]).mean() < (1.5 if lossy else 0.1)
+        limit = 1.5 if is_lossy else 0.1
+        assert np.abs(frame.grey.astype(int) - GREYS[i]).mean() < limit
         off = frame.depth / camera.depth_scale - METRES[i]
         assert np.abs(off).max() < 0.51 / min(camera.depth_scale, 1000 if "float" not in name else 5000) + 1e-6
         np.testing.assert_array_equal(frame.depth > 0, DEPTHS[i] > 0)
@@ -204,7 +209,10 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
 
 @pytest.mark.parametrize(
     "name",
-    ["seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris", "tartan_air", "tartan_air_2"],
+    [
+        *("seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris", "tartan_air"),
+        *("tartan_air_2", "scannet_plus_plus", "polycam"),
+    ],
 )
 def test_poses_are_the_truth(folder, name):
     sequence = open_source(wrote(folder, name))
