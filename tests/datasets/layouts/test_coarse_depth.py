@@ -25,6 +25,7 @@ def enlarge(folder: Path, times: int) -> None:
     """Write colour larger, as it was taken, and its cameras with it; depth stays as it is."""
     for file in (file for name in ("rgb", "images") for file in (folder / name).glob("*")):
         grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
         image(file, cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC))
     fx, _, cx, cy = CAMERA.scaled(times)
     numbers = {"131.0": fx, "79.5": cx, "59.5": cy, "160": 160 * times, "120": 120 * times}
@@ -48,11 +49,11 @@ def _replaced(values: object, numbers: dict[str, float]) -> object:
     return numbers.get(str(values), values)
 
 
-def opened(folder: Path, name: str, times: int, reading: Reading = Reading()) -> FileSequence:
+def opened(folder: Path, name: str, times: int, reading: Reading | None = None) -> FileSequence:
     folder.mkdir()
     LAYOUTS[name][1](folder)
     enlarge(folder, times)
-    sequence = open_source(folder, reading)
+    sequence = open_source(folder, reading or Reading())
     assert isinstance(sequence, FileSequence)
     return sequence
 
