@@ -17,6 +17,7 @@ from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, Size, lo
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
+from gavo_jax.datasets.films import file_of, film_of, read_frame
 from gavo_jax.datasets.images import read_bytes, read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError, read_text
@@ -101,6 +102,7 @@ class Entry(NamedTuple):
     stamp: float
     """Stamp of the colour image, seconds."""
     color: Path
+    """A file, or a frame's place in a film."""
     depth: Path | None
     depth_stamp: float | None = None
     doubt: str = ""
@@ -168,7 +170,7 @@ class FileSequence:
     @property
     def files(self) -> list[tuple[Path, ...]]:
         """Images of each frame."""
-        return [tuple(path for path in (entry.color, entry.depth) if path is not None) for entry in self.entries]
+        return [(file_of(entry.color), *filter(None, (entry.depth,))) for entry in self.entries]
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -194,7 +196,7 @@ class FileSequence:
             raise TimestampError(entry.doubt)
         assert entry.depth is not None
         return self._images.assembler.frame(
-            read_color(entry.color),
+            _color(entry.color),
             DepthImage(read_depth(entry.depth), str(entry.depth)),
             str(entry.color),
             entry.stamp,
@@ -222,7 +224,7 @@ class FileSequence:
             raise GavoError(f"{self.name}: no frames in the chosen range")
         for entry in self.entries:
             for path in (entry.color, entry.depth):
-                if path is not None and not os.path.isfile(path):
+                if path is not None and not os.path.isfile(file_of(path)):
                     raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
         self[0]
 
@@ -305,12 +307,18 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
     Raises:
         FrameError: why the first of them cannot be read, where none can.
     """
-    return _size_of_most([entry.color for entry in entries], read_color)
+    images = [entry.color for entry in entries]
+    return _size_of_most(images if film_of(images[0]) is None else images[:1], _color)
 
 
 def depth_size_of_most(entries: Sequence[Entry]) -> Size:
     """The same of depth."""
     return _size_of_most([entry.depth for entry in entries if entry.depth is not None], read_depth)
+
+
+def _color(place: Path) -> np.ndarray:
+    """`read_color`, also of a frame in a film."""
+    return read_color(place) if film_of(place) is None else read_frame(place)
 
 
 def _size_of_most(images: Sequence[Path], read: Callable[[Path], np.ndarray]) -> Size:
@@ -367,7 +375,8 @@ class _Images:
         for at in places_of_a_few(len(self._entries)):
             entry = self._entries[at]
             try:
-                colors.append(read_color(entry.color))
+                if film_of(entry.color) is None:  # those of a film have 8 bits
+                    colors.append(read_color(entry.color))
                 if entry.depth is not None:
                     depths.append(DepthImage(read_depth(entry.depth), str(entry.depth)))
             except FrameError:

@@ -140,7 +140,7 @@ def _at(place: int, files: Sequence[Path]) -> dict[int, Path]:
 
 
 def _numbers(file: Path) -> list[int]:
-    digits = re.findall(r"\d+", file.name[: -len(file.suffix)])
+    digits = re.findall(r"\d+", file.stem)
     return [int(some) for some in digits if len(some) <= MOST_DIGITS]
 
 

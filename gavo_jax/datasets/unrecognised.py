@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from gavo_jax.datasets.films import FILMS
 from gavo_jax.datasets.layouts.image_folders import (
     COLOR_FOLDERS,
     DEPTH_FOLDERS,
@@ -37,8 +38,6 @@ RECORDINGS = {
     ".klg": "a log of ElasticFusion's logger: write its images and depth first",
 }
 """What holds a source in a form of its maker's alone."""
-
-FILMS = (".mp4", ".avi", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 
 SHOWN = 5
 """Names that a message lists."""

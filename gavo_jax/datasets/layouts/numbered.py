@@ -28,8 +28,9 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
+from gavo_jax.datasets.films import rate_of
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
+from gavo_jax.datasets.layouts.image_folders import film_beside, passed_over, plain_files
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among
@@ -40,8 +41,8 @@ from gavo_jax.trajectory import Trajectory, inverse
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
 
-NUMBERS = "names are numbers"
-"""What is said of stamps that are counted, of which frames per second are a guess."""
+NUMBERS, BY_FILM = "names are numbers", "as the film says"
+"""What is said of stamps that are counted, of which frames per second are a guess, or are a film's."""
 
 
 class NumberedFolder(FileSequence):
@@ -309,13 +310,15 @@ class PlainFolder(FileSequence):
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
         is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
-        sequence.times_guessed = NUMBERS if is_open else paired.guessed
+        counted = NUMBERS if film_beside(path) is None else BY_FILM
+        sequence.times_guessed = counted if is_open else paired.guessed
         return sequence
 
     @classmethod
     def clock(cls, path: Path, reading: Reading) -> Seconds:
         """Times of frames by their numbers."""
-        rate = reading.rate or RATE
+        film = film_beside(path)
+        rate = reading.rate or (0.0 if film is None else rate_of(film)) or RATE
         return lambda numbers: numbers / rate
 
     @classmethod
