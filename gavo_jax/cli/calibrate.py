@@ -61,11 +61,11 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
         name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
     }
     delay = before.depth_delay + estimate.depth_delay
-    color = replace(before.color, **_at_width(values, before.color.width / sequence.camera.width))
+    color = replace(before.color, **_at_width(values, before.color.width // sequence.camera.width))
     return replace(before.with_color(color), depth_delay=delay)
 
 
-def _at_width(values: dict[str, float], scale: float) -> dict[str, float]:
+def _at_width(values: dict[str, float], scale: int) -> dict[str, float]:
     """What was found of frames, of images that are `scale` times as wide."""
     wide = {name: scale * values[name] for name in ("fx", "fy") if name in values}
     middle = {name: scale * (values[name] + 0.5) - 0.5 for name in ("cx", "cy") if name in values}

@@ -155,7 +155,7 @@ class FrameAssembler:
     def binning(self) -> int:
         """How many columns and rows of colour become one: as many as leave it finer than depth still, by `FINER`.
 
-        What is finer than that adds time, and nothing to the motion: it has no depth of its own.
+        What is finer than that has no depth of its own.
         """
         color, depth = self.calibration.color, self.calibration.depth
         return 1 if depth is None else max(1, int(color.fx / depth.fx / FINER))

@@ -308,7 +308,8 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
         FrameError: why the first of them cannot be read, where none can.
     """
     images = [entry.color for entry in entries]
-    return _size_of_most(images if film_of(images[0]) is None else images[:1], _color)
+    is_film = bool(images) and film_of(images[0]) is not None
+    return _size_of_most(images[:1] if is_film else images, _color)
 
 
 def depth_size_of_most(entries: Sequence[Entry]) -> Size:

@@ -14,17 +14,16 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gavo_jax.datasets.base import FrameError
-from gavo_jax.datasets.quiet import without_lines, without_log
+from gavo_jax.datasets.quiet import without_log
 from gavo_jax.errors import GavoError
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once: it would write on standard error, by its own threads
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg")
 """Endings of films; whether one can be decoded, only opening it tells."""
 
 MOST_FRAMES = 10**6
 """So many hours of film are taken for a number that is none."""
-
-SAID_BY_FFMPEG = ("@ 0x", "Truncating packet")
-"""In what it prints of a film that is damaged."""
 
 _READING = threading.Lock()
 """Held while a frame is decoded: a film is read by one at a time."""
@@ -109,7 +108,7 @@ class _Film:
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS))
 
     def _open(self) -> None:
-        with without_log(), without_lines(*SAID_BY_FFMPEG):
+        with without_log():
             self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise GavoError(f"{self._path}: no film that can be decoded: write its frames as images")
@@ -120,7 +119,7 @@ class _Film:
         """Return a frame; None where the film ends before."""
         if number < self._next:
             self._open()
-        with without_log(), without_lines(*SAID_BY_FFMPEG):
+        with without_log():
             while self._next < number and self._capture.grab():
                 self._next += 1
             is_there, image = self._capture.read() if self._next == number else (False, None)
