@@ -215,8 +215,12 @@ class Odometry:
         frame = self._accepted(frame, timestamp)
         timestamp = float(timestamp)  # an array may hold the next one soon
         stopwatch = Stopwatch()
+        drawn = self.progress.drawn
+        if isinstance(frame, Frame):
+            drawn = drawn.after(frame.grey)
+            frame = drawn.without(frame)
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
-        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, drawn=drawn)
         usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)

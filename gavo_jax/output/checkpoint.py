@@ -19,6 +19,7 @@ from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_change import DepthChange
 from gavo_jax.odometry.depth_watch import DepthWatch
+from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
 from gavo_jax.odometry.progress import Progress
@@ -26,6 +27,7 @@ from gavo_jax.odometry.way import Fix, Way
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
+LAST_GREY, SAME_LEVEL = "last_grey", "same_level"
 
 
 class Mark(NamedTuple):
@@ -83,6 +85,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
     if watch is not None:
         arrays |= {INVERSE_DEPTH: watch.change.inverse, EDGES: watch.edges.sums}
+    if progress.drawn.last is not None:
+        arrays |= {LAST_GREY: progress.drawn.last, SAME_LEVEL: progress.drawn.counts}
     data = io.BytesIO()
     arrays[SEAL] = np.array(_seal(arrays))
     np.savez(data, **arrays)  # pyright: ignore[reportArgumentType] (NumPy 2.0 takes allow_pickle=False for an array)
@@ -146,8 +150,9 @@ def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Prog
         (delay, *known), seen, told = depth
         change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
         numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
+    drawn = Drawn(arrays[LAST_GREY], arrays[SAME_LEVEL]) if LAST_GREY in arrays else Drawn()
     poses: dict[str, Any] = {name: arrays[name] for name in POSES}
-    return Progress(**numbers, **poses)
+    return Progress(**numbers, **poses, drawn=drawn)
 
 
 def _seal(arrays: dict[str, np.ndarray]) -> str:

@@ -1,0 +1,107 @@
+"""What is drawn into every image is told by its levels, and left out of the search."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import small
+from driving import SEARCH_ALONE, Altered
+from small import Rendered
+
+from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE, SensorNoise
+from gavo_jax.odometry.drawn import FRAMES, Drawn
+from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.run import run_odometry
+from gavo_jax.odometry.stream import track
+from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+
+ROOM = Rendered(FRAMES + 12, camera=small.CAMERA)
+
+
+def marked(_: int, frame: Frame) -> Frame:
+    """A bar with a text along the lower edge."""
+    grey = np.array(frame.grey)
+    grey[100:] = 40
+    cv2.putText(grey, "12:30:05 #7", (2, 115), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 240, 1)
+    return replace(frame, grey=grey)
+
+
+def seen(frames: Iterable[Frame]) -> Drawn:
+    drawn = Drawn()
+    for frame in frames:
+        drawn = drawn.after(frame.grey)
+    return drawn
+
+
+def test_what_is_drawn_loses_its_edges_and_its_depth_and_nothing_else_does() -> None:
+    frames = [marked(i, frame) for i, frame in enumerate(ROOM)]
+    for count in (1, FRAMES):
+        assert seen(frames[:count]).without(frames[count - 1]) is frames[count - 1], "it is not known yet"
+    last = frames[FRAMES + 2]
+    freed = seen(frames[: FRAMES + 3]).without(last)
+    steepest = [np.abs(np.diff(frame.grey[105:115, 5:95].astype(int))).max() for frame in (freed, last)]
+    assert steepest[0] < 15 and steepest[1] > 100
+    assert not np.any(freed.depth[104:115, 5:95])
+    np.testing.assert_array_equal(freed.grey[:86], last.grey[:86])
+    np.testing.assert_array_equal(freed.depth[:86], last.depth[:86])
+
+
+@pytest.mark.parametrize("noise", [KINECT, NONE])
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_a_scene_is_not_taken_for_a_drawing(noise: SensorNoise, speed: float) -> None:
+    drawn = Drawn()
+    for frame in Rendered(30, camera=small.CAMERA, noise=noise, speed=speed):
+        drawn = drawn.after(frame.grey)
+        assert drawn.without(frame) is frame
+
+
+def test_a_camera_that_stands_still_draws_nothing() -> None:
+    """An exact sensor returns the same image over and over then."""
+    still = [marked(0, ROOM[0])] * 30
+    assert seen(still).without(still[0]) is still[0]
+
+
+def test_another_size_begins_anew() -> None:
+    drawn = seen(marked(i, frame) for i, frame in enumerate(ROOM))
+    small_image = Rendered(1, camera=small.CAMERA.level(1))[0]
+    assert drawn.after(small_image.grey).without(small_image) is small_image
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_levels_of_any_kind(kind: type) -> None:
+    frames = [replace(frame, grey=marked(i, frame).grey.astype(kind)) for i, frame in enumerate(ROOM)]
+    freed = seen(frames).without(frames[-1])
+    assert freed.grey.dtype == kind and not np.any(freed.depth[104:115, 5:95])
+
+
+def test_a_run_is_not_held_by_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = Altered(ROOM, marked)
+    truth = ROOM.ground_truth
+    assert truth is not None
+
+    def error() -> float:
+        run = run_odometry(sequence, SEARCH_ALONE)
+        moved = [np.linalg.inv(poses[FRAMES + 1]) @ poses[-1] for poses in (run.trajectory.world_T_camera, true)]
+        return float(np.linalg.norm((moved[0] - moved[1])[:3, 3]))
+
+    true = truth.interpolate(ROOM.timestamps)[0]
+    freed = error()
+    monkeypatch.setattr(Drawn, "without", lambda self, frame: frame)
+    assert freed < 0.3 * error()
+
+
+def test_a_run_that_goes_on_knows_what_is_drawn(tmp_path) -> None:
+    sequence = Altered(ROOM, marked)
+    whole = [*track(sequence, SEARCH_ALONE)]
+    first = Odometry(small.CAMERA, SEARCH_ALONE)
+    for index in range(8):
+        first.register(sequence[index], float(sequence.timestamps[index]))
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(first.progress, {}, ""))
+    again = Odometry(small.CAMERA, SEARCH_ALONE)
+    again.progress = load_checkpoint(tmp_path / "checkpoint.npz", first.progress.tracker).progress
+    assert again.progress.drawn.counts.dtype == np.uint8
+    rest = [*track(sequence, odometry=again)]
+    np.testing.assert_array_equal(rest[-1].world_T_camera, whole[-1].world_T_camera)
