@@ -42,10 +42,11 @@ class Drawn(NamedTuple):
     def after(self, grey: np.ndarray) -> Self:
         """Look at one more image."""
         some = np.ascontiguousarray(np.asarray(grey)[::STEP, ::STEP])
-        some = some if some.dtype == np.uint8 else some.astype(np.float32)
-        if self.last is None or self.last.shape != some.shape:
+        if some.dtype != np.uint8:
+            some = np.clip(np.nan_to_num(some.astype(np.float64)), 0.0, 255.0).astype(np.float32)
+        if self.last is None or (self.last.shape, self.last.dtype) != (some.shape, some.dtype):
             return self._replace(last=some, counts=np.zeros(some.shape, np.uint8))
-        change = cv2.absdiff(some, self.last.astype(some.dtype, copy=False))
+        change = cv2.absdiff(some, self.last)
         seen = change[::STEP, ::STEP][_is_steep(some)[::STEP, ::STEP]]
         if not seen.size or np.mean(seen > CHANGED) < MOVED:
             return self._replace(last=some)

@@ -77,6 +77,15 @@ def test_levels_of_any_kind(kind: type) -> None:
     assert freed.grey.dtype == kind and not np.any(freed.depth[104:115, 5:95])
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_image_without_levels_is_looked_at_without_a_word() -> None:
+    images = [np.full((40, 60), value) for value in (np.inf, -np.inf, np.nan, 3e38, -1.0, 7)]
+    drawn = Drawn()
+    for image in (*images, *images[::-1], *(image.astype(np.uint8) for image in images[-1:])):
+        drawn = drawn.after(image)
+    assert not np.any(drawn.counts)
+
+
 def test_a_run_is_not_held_by_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = Altered(ROOM, marked)
     truth = ROOM.ground_truth
