@@ -7,6 +7,7 @@ from pathlib import Path
 from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.camera_files.calibration import Calibration
+from gavo_jax.camera_files.words import FOCAL
 from gavo_jax.cli.options import Calibrate
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import open_sequence
@@ -61,15 +62,9 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
         name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
     }
     delay = before.depth_delay + estimate.depth_delay
-    color = replace(before.color, **_at_width(values, before.color.width // sequence.camera.width))
-    return replace(before.with_color(color), depth_delay=delay)
-
-
-def _at_width(values: dict[str, float], scale: int) -> dict[str, float]:
-    """What was found of frames, of images that are `scale` times as wide."""
-    wide = {name: scale * values[name] for name in ("fx", "fy") if name in values}
-    middle = {name: scale * (values[name] + 0.5) - 0.5 for name in ("cx", "cy") if name in values}
-    return values | wide | middle
+    lens = replace(sequence.camera, **values).scaled(before.color.width // sequence.camera.width)
+    values |= {name: value for name, value in zip(FOCAL, lens, strict=True) if name in values}
+    return replace(before.with_color(replace(before.color, **values)), depth_delay=delay)
 
 
 def in_all(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:

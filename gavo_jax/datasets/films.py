@@ -23,7 +23,7 @@ FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg")
 """Endings of films; whether one can be decoded, only opening it tells."""
 
 MOST_FRAMES = 10**6
-"""So many hours of film are taken for a number that is none."""
+"""Frames of nine hours: a film that claims more is taken for one of none."""
 
 _READING = threading.Lock()
 """Held while a frame is decoded: a film is read by one at a time."""
@@ -44,7 +44,7 @@ def frames_of(film: Path) -> list[Path]:
     """Places of the frames that a film claims to have; none where it cannot be decoded."""
     try:
         with _READING:
-            count = _opened(film, _written(film)).count
+            count = _opened(film).count
     except GavoError:
         return []
     return [film / f"{number:06}" for number in range(count)] if count < MOST_FRAMES else []
@@ -57,7 +57,7 @@ def rate_of(film: Path) -> float:
         GavoError: it cannot be decoded.
     """
     with _READING:
-        return _opened(film, _written(film)).rate
+        return _opened(film).rate
 
 
 def read_frame(place: Path) -> UInt8[np.ndarray, "h w 3"]:
@@ -69,12 +69,16 @@ def read_frame(place: Path) -> UInt8[np.ndarray, "h w 3"]:
     film = place.parent
     with _READING:
         try:
-            image = _opened(film, _written(film)).read(int(place.name))
+            image = _opened(film).read(int(place.name))
         except GavoError as error:
             raise FrameError(str(error)) from None
     if image is None:
         raise FrameError(f"{film}: frame {int(place.name)}: the film cannot be decoded as far as that")
     return image
+
+
+def _opened(film: Path) -> "_Film":
+    return _open_film(film, *_written(film))
 
 
 def _written(film: Path) -> tuple[int, int, int]:
@@ -89,7 +93,7 @@ def _written(film: Path) -> tuple[int, int, int]:
 
 
 @lru_cache(maxsize=1)
-def _opened(film: Path, written: tuple[int, int, int]) -> "_Film":
+def _open_film(film: Path, written: int, size: int, process: int) -> "_Film":
     return _Film(film)
 
 

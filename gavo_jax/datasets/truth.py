@@ -270,6 +270,12 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
     raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")
 
 
+def by_stamp(poses: Mapping[float, Float[np.ndarray, "4 4"]]) -> Trajectory:
+    """The trajectory of poses, of one at least, by their stamps."""
+    stamps = sorted(poses)
+    return Trajectory(np.array(stamps), np.stack([poses[stamp] for stamp in stamps]))
+
+
 def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | None:
     """The numbers of a row; None where they are not all finite.
 

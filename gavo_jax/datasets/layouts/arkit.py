@@ -19,6 +19,7 @@ from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder
 from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.names import Found, by_number
+from gavo_jax.datasets.truth import by_stamp
 from gavo_jax.errors import GavoError, read_json
 from gavo_jax.trajectory import Trajectory
 
@@ -126,10 +127,7 @@ class Polycam(PlainFolder):
             rows = [[values.get(f"t_{row}{column}") for column in range(4)] for row in range(3)]
             if values and (pose := pose_of_rows(str(file), rows)) is not None:
                 poses[entry.stamp] = pose @ FLIP
-        if not poses:
-            return None, unread
-        times = sorted(poses)
-        return Trajectory(np.array(times), np.stack([poses[time] for time in times])), unread
+        return by_stamp(poses) if poses else None, unread
 
 
 def _frames(file: Path) -> dict[int, dict[str, Any]]:

@@ -109,7 +109,7 @@ def missing_folder(path: Path) -> str | None:
     return f"no folder of {kind} beside {there.name}/; {kind} is looked for in {', '.join(known)}"
 
 
-def film_beside(path: Path) -> Path | None:
+def _film_beside(path: Path) -> Path | None:
     """The film of colour that lies in a folder in place of a folder of colour; None where none or several do."""
     found = [file for file in images_among(path.glob("*"), FILMS) if file.stem.lower() in COLOR_FOLDERS]
     return found[0] if len(found) == 1 and _folders(path)[0] is None else None
@@ -122,7 +122,7 @@ def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
         files = list(color.glob("*"))
         some = images_among(files, COLOR_SUFFIXES) or images_among(files, (".npy",))
         return some, images_among(depth.glob("*"), DEPTH_SUFFIXES)
-    if depth is not None and (film := film_beside(path)) is not None:
+    if depth is not None and (film := _film_beside(path)) is not None:
         return frames_of(film), images_among(depth.glob("*"), DEPTH_SUFFIXES)
     files = list(path.glob("*"))
     depths = _with_depth(images_among(files, DEPTH_SUFFIXES))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES
-from gavo_jax.datasets.truth import pose_of
+from gavo_jax.datasets.truth import by_stamp, pose_of
 from gavo_jax.errors import read_json
 from gavo_jax.trajectory import Trajectory
 
@@ -46,8 +46,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
             poses[stamp] = pose @ FLIP
     if not poses:
         return None, [f"{path.name}: has no pose of any of these images"] if frames else []
-    times = sorted(poses)
-    return Trajectory(np.array(times), np.stack([poses[time] for time in times])), []
+    return by_stamp(poses), []
 
 
 def _frames(path: Path) -> list[dict[str, Any]]:

@@ -28,9 +28,9 @@ from gavo_jax.datasets.files import (
     resolve_folder,
     size_of_most,
 )
-from gavo_jax.datasets.films import rate_of
+from gavo_jax.datasets.films import film_of, rate_of
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.layouts.image_folders import film_beside, passed_over, plain_files
+from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among
@@ -299,8 +299,10 @@ class PlainFolder(FileSequence):
         """
         root = resolve_folder(path)
         color, depth = plain_files(path)
+        film = film_of(color[0]) if color else None
+        usual = RATE if film is None else rate_of(film) or RATE
         paired = paired_by_stamp(path, color, depth, reading) or paired_by_number(
-            path, color, depth, cls.clock(path, reading)
+            path, color, depth, cls.clock(path, reading, usual)
         )
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
@@ -310,15 +312,14 @@ class PlainFolder(FileSequence):
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
         is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
-        counted = NUMBERS if film_beside(path) is None else BY_FILM
+        counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
         return sequence
 
     @classmethod
-    def clock(cls, path: Path, reading: Reading) -> Seconds:
-        """Times of frames by their numbers."""
-        film = film_beside(path)
-        rate = reading.rate or (0.0 if film is None else rate_of(film)) or RATE
+    def clock(cls, path: Path, reading: Reading, usual: float) -> Seconds:
+        """Times of frames by their numbers, at the usual frames per second where nothing says others."""
+        rate = reading.rate or usual
         return lambda numbers: numbers / rate
 
     @classmethod

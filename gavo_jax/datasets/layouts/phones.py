@@ -1,6 +1,5 @@
 """Scans of phones: Stray Scanner's folders, ARKitScenes, and what Record3D exports."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,7 +18,7 @@ from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_e
 from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.datasets.truth import Seconds, numbers_in, posed
-from gavo_jax.errors import GavoError, data_rows, read_text
+from gavo_jax.errors import GavoError, data_rows, read_json, read_text
 from gavo_jax.trajectory import Trajectory, inverse
 
 SLOWEST, FASTEST = 0.1, 1000.0
@@ -126,19 +125,19 @@ class Record3D(PlainFolder):
         return file.is_file() and '"K"' in read_text(file, MAX_JSON_BYTES) and super().recognises(path)
 
     @classmethod
-    def clock(cls, path: Path, reading: Reading) -> Seconds:
+    def clock(cls, path: Path, reading: Reading, usual: float) -> Seconds:
         """Take the rate that its file says, unless one is said."""
         try:
-            told = json.loads(read_text(path / cls.FILE, MAX_JSON_BYTES))
-        except (ValueError, RecursionError):  # with a camera file in the folder it need not be one
+            told = read_json(path / cls.FILE, MAX_JSON_BYTES)
+        except GavoError:  # with a camera file in the folder it need not be one
             told = {}
         rate, stamps = (told.get(key) if isinstance(told, dict) else None for key in ("fps", "frameTimestamps"))
         if reading.rate is not None:
-            return super().clock(path, reading)
+            return super().clock(path, reading, usual)
         if isinstance(stamps, list) and len(stamps) > 1:
             return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps)
         is_rate = isinstance(rate, int | float) and SLOWEST <= rate <= FASTEST
-        return super().clock(path, replace(reading, rate=rate) if is_rate else reading)
+        return super().clock(path, replace(reading, rate=rate) if is_rate else reading, usual)
 
 
 def _clock_of(place: str, stamps: list[Any]) -> Seconds:
