@@ -5,6 +5,7 @@ Nießner et al. 2013), into which frames go one by one, so that memory grows wit
 """
 
 import contextlib
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterable
@@ -32,6 +33,9 @@ Shape = Literal["cloud", "mesh"]
 
 ENDINGS: dict[str, tuple[Shape, ...]] = {".ply": ("cloud", "mesh"), ".pcd": ("cloud",), ".obj": ("mesh",)}
 """What a file of each ending can hold; the first is written where nothing is said."""
+
+LARGEST = {".ply": (51, 13), ".pcd": (28, 0), ".obj": (120, 70)}
+"""Bytes that a point or vertex, and a triangle, take at most in a file of each ending."""
 
 VOXEL = 0.01
 """Metres."""
@@ -98,6 +102,7 @@ class SceneMap:
             write = open3d.io.write_triangle_mesh
         try:
             partial.unlink(missing_ok=True)
+            _take_room(partial, len(self.points), 0 if self.triangles is None else len(self.triangles))
             with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
                 written = write(str(partial), cloud)
             if not written:
@@ -107,6 +112,18 @@ class SceneMap:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
             raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def _take_room(path: Path, points: int, triangles: int) -> None:
+    """Make a file that is as large as a map's, where the system can; Open3D does not notice a full disk.
+
+    Raises:
+        OSError: there is no room.
+    """
+    of_point, of_triangle = LARGEST[path.suffix]
+    with path.open("xb") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, 1000 + points * of_point + triangles * of_triangle)
 
 
 class MapBuilder:

@@ -1,6 +1,7 @@
 """A map of a few small frames; where Open3D is not installed, its refusals alone."""
 
 import importlib.util
+import resource
 import sys
 from dataclasses import replace
 from typing import Any
@@ -18,6 +19,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
 from gavo_jax.scene_map import (
+    LARGEST,
     LiveMap,
     MapBuilder,
     SceneMap,
@@ -28,6 +30,8 @@ from gavo_jax.scene_map import (
 )
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
+
+FILES = {"a.ply": "cloud", "a.pcd": "cloud", "b.ply": "mesh", "b.obj": "mesh"}
 
 needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
@@ -191,6 +195,27 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
     assert len(open3d.io.read_point_cloud(str(tmp_path / "a.pcd")).points) == len(cloud.points)
     assert len(open3d.io.read_triangle_mesh(str(tmp_path / "b.ply")).triangles) == len(np.asarray(mesh.triangles))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pcd", "a.ply", "b.obj", "b.ply"]
+
+
+@needs_open3d
+@pytest.mark.parametrize(("name", "share"), [(name, share) for name in FILES for share in (0.1, 0.99)])
+def test_a_full_disk_leaves_no_part_of_a_map(tmp_path, capfd, name, share):
+    """Open3D does not notice; its library of PLY says so once for each value, and it goes on."""
+    corners = np.random.default_rng(0).uniform(size=(900, 3))
+    triangles = np.arange(900).reshape(-1, 3) if FILES[name] == "mesh" else None
+    scene = SceneMap(corners, np.zeros((900, 3), np.uint8), corners, triangles)
+    scene.write(tmp_path / name)
+    whole = (tmp_path / name).read_bytes()
+    assert len(whole) < 1000 + 900 * LARGEST[name[1:]][0] + 300 * LARGEST[name[1:]][1]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(whole)), hard))
+    try:
+        with pytest.raises(GavoError, match=f"{name}: cannot be written: File too large"):
+            scene.write(tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_bytes() == whole
+    assert capfd.readouterr() == ("", "")
 
 
 @needs_open3d
