@@ -46,6 +46,11 @@ def tell(line: str) -> None:
     print(f"gavo: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
+def line_of(error: BaseException) -> str:
+    """What another library's error says, in one line that is not too long; what it is where it says nothing."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 @contextlib.contextmanager
 def blamed(whose: str, kind: Callable[[str], Exception] = GavoError) -> Iterator[None]:
     """Turn whatever other people's code raises in the block into one line, which begins with whose fault it is."""
@@ -54,7 +59,7 @@ def blamed(whose: str, kind: Callable[[str], Exception] = GavoError) -> Iterator
     except GavoError:
         raise
     except Exception as error:
-        raise kind(f"{whose}: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
+        raise kind(f"{whose}: {line_of(error)}") from error
 
 
 def shown(value: Any) -> str:
@@ -109,11 +114,31 @@ def read_json(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     Raises:
         GavoError: as `read_text`, or it is no JSON.
     """
-    text = read_text(path, max_bytes)
+    return parse_json(path, read_text(path, max_bytes))
+
+
+def read_json_object(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, Any]:
+    """Return the names and values that a file of JSON holds.
+
+    Raises:
+        GavoError: as `read_json`, or it holds something else.
+    """
+    values = read_json(path, max_bytes)
+    if not isinstance(values, dict):
+        raise GavoError(f"{path}: not a JSON object: names and values are needed")
+    return values
+
+
+def parse_json(place: str | Path, text: str) -> Any:
+    """Return what a text of JSON holds.
+
+    Raises:
+        GavoError: it is none; the message begins with `place`.
+    """
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: not JSON: {' '.join(str(error).split())[:200]}") from None
+        raise GavoError(f"{place}: not JSON: {line_of(error)}") from None
 
 
 def parse_toml(place: str | Path, text: str) -> dict[str, Any]:
@@ -125,7 +150,7 @@ def parse_toml(place: str | Path, text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise GavoError(f"{place}: not TOML: {' '.join(str(error).split())[:200]}") from None
+        raise GavoError(f"{place}: not TOML: {line_of(error)}") from None
 
 
 def read_toml(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, blamed
 from gavo_jax.objective.losses import l2
 from gavo_jax.settings import AlignmentOptions, OdometryOptions, Settings, as_settings
 from gavo_jax.solvers.base import Solver
@@ -165,10 +165,10 @@ def faulty_plugins() -> dict[str, str]:
     faults = {}
     for entry in entry_points(group=PLUGINS):
         try:
-            register(entry.name, entry.load())
-        except Exception as error:  # somebody else's code may fail in any way
-            words = " ".join(str(error).split())[:200] or type(error).__name__
-            faults[entry.name] = f"method {entry.name!r} of {entry.value}: cannot be loaded: {words}"
+            with blamed(f"method {entry.name!r} of {entry.value}: cannot be loaded"):
+                register(entry.name, entry.load())
+        except GavoError as error:
+            faults[entry.name] = str(error)
     return faults
 
 

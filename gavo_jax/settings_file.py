@@ -6,7 +6,6 @@ A settings file is TOML: `method` and `preset` at the top say what it starts fro
 
 import dataclasses
 import difflib
-import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -17,7 +16,7 @@ import optax
 import tomli_w
 
 from gavo_jax import presets
-from gavo_jax.errors import GavoError, parse_toml, read_text, read_toml, shown, write_bytes
+from gavo_jax.errors import GavoError, parse_toml, read_json_object, read_toml, shown, write_bytes
 from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import MAX_REAL, alternatives, is_whole, kind_of, require_settings
@@ -56,7 +55,8 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
         GavoError: It cannot be read, or holds an unknown name (with the nearest known one) or a wrong value.
     """
     path = Path(path)
-    table = _read_table(path)
+    read = read_json_object if path.suffix == ".json" else read_toml
+    table = read(path, MAX_FILE_BYTES)
     if path.suffix == ".json":
         if not any(room in table for room in ROOMS):
             raise GavoError(f"{path}: no settings: a run's config.json holds {', '.join(ROOMS)}")
@@ -112,19 +112,6 @@ def assignments(texts: Iterable[str], place: str = "--set") -> dict[str, Any]:
         except GavoError:
             values[name] = value
     return values
-
-
-def _read_table(path: Path) -> dict[str, Any]:
-    if path.suffix != ".json":
-        return read_toml(path, MAX_FILE_BYTES)
-    text = read_text(path, MAX_FILE_BYTES)
-    try:
-        table = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: cannot be read: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(table, dict):
-        raise GavoError(f"{path}: not a table of settings")
-    return table
 
 
 def _without_types(room: Any) -> Any:

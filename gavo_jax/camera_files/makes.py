@@ -3,7 +3,6 @@
 A parser returns what a file says as a table of the keys of our own TOML file; `calibration` checks the numbers.
 """
 
-import json
 import re
 from collections.abc import Callable
 from functools import cache
@@ -21,9 +20,9 @@ from gavo_jax.camera_files.exports import (
     read_openloris,
     read_realsense,
 )
-from gavo_jax.camera_files.storage import line_of, read_storage, real_of, values_of
+from gavo_jax.camera_files.storage import read_storage, real_of, values_of
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
-from gavo_jax.errors import GavoError, number, parse_toml, shown
+from gavo_jax.errors import GavoError, line_of, number, parse_json, parse_toml, shown
 
 PROJECTION = "projection_matrix"
 """Key of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
@@ -76,11 +75,7 @@ def _yaml_loader() -> type[Any]:
 def _parse_json(path: Path, text: str) -> Table:
     if '"opencv-matrix"' in text:
         return _parse_storage(path, text)
-    try:
-        values = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GavoError(f"{path}: not JSON: {line_of(error)}") from None
-    return _of_known_make(path, values)
+    return _of_known_make(path, parse_json(path, text))
 
 
 def _of_known_make(path: Path, values: Any) -> Table:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, line_of
 
 Read = TypeVar("Read")
 
@@ -75,8 +75,3 @@ def real_of(node: Any, name: str = "a list") -> float:
     if not (node.isReal() or node.isInt()):
         raise TypeError(f"{name}: not a number")
     return node.real()
-
-
-def line_of(error: BaseException) -> str:
-    """What an error of OpenCV, or of another library, says in one line."""
-    return " ".join(str(error).split())[:200]

@@ -12,8 +12,8 @@ from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.datasets.rendered.actors import MOST_BODIES
 from gavo_jax.datasets.selection import SYNTHETIC, open_part
-from gavo_jax.errors import GavoError
-from gavo_jax.output.files import describe, read_json
+from gavo_jax.errors import GavoError, read_json_object
+from gavo_jax.output.files import describe
 from gavo_jax.settings import Settings
 from gavo_jax.settings_file import NamedSettings, assignments, load_settings, override
 
@@ -106,7 +106,7 @@ def settings_line(options: Run) -> str | None:
     path = options.settings
     if path is None or path.suffix != ".json":
         return None
-    earlier, now = read_json(path).get("options"), describe(with_whole_paths(options))
+    earlier, now = read_json_object(path).get("options"), describe(with_whole_paths(options))
     if not isinstance(earlier, dict):
         return None
     differing = {name: earlier[name] for name in FRAMES_AND_SEED if name in earlier and earlier[name] != now[name]}

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, line_of
 from gavo_jax.locks import hold
 
 SERVER = "https://cvg.cit.tum.de/rgbd/dataset"
@@ -115,7 +115,7 @@ def _told(error: Exception, url: str, kept: str) -> str:
     """Why a download came to nothing; `kept` says what is there of it."""
     import requests
 
-    words = " ".join(str(error).split())[:200]
+    words = line_of(error)
     match error:
         case requests.HTTPError():
             return f"{url}: the server says: {words}"
@@ -187,9 +187,8 @@ def _unpack(archive: Path, target: Path) -> None:
             raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
         os.replace(scratch / target.name, target)
     except (tarfile.TarError, EOFError, zlib.error, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
-        reason = " ".join(str(error).split())
         archive.unlink()
-        raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {reason}") from None
+        raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {line_of(error)}") from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

@@ -15,7 +15,7 @@ import jax
 
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, line_of
 from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
 from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.interrupts import interruptible
@@ -122,7 +122,7 @@ class RayExecutor:
                     try:
                         outcome = ray.get(reference)
                     except ray.exceptions.RayError as error:
-                        outcome = Outcome(batch, (), " ".join(str(error).split())[:500])
+                        outcome = Outcome(batch, (), line_of(error))
                     on_pairs(sum(run.pairs for run in batch.runs))
                     yield outcome
         finally:

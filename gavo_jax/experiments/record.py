@@ -1,11 +1,10 @@
 """What is kept beside a table of runs: which runs are the experiment's, in which order, and what publications give."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.experiments.plan import Plan
 from gavo_jax.output.files import write_json
 
@@ -41,10 +40,10 @@ def read_record(folder: Path) -> Record:
     path = folder / FILE
     if not path.is_file():
         return Record("", {}, {}, frozenset())
+    record = read_json_object(path)
     try:
-        record = json.loads(read_text(path))
         printed = {(entry["sequence"], entry["label"]): float(entry["drift"]) for entry in record["printed"]}
         order = {(name, label): i for i, (name, label) in enumerate(record["order"])}
         return Record(str(record["name"]), printed, order, frozenset(record.get("runs", ())))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise GavoError(f"{path}: not the record of an experiment: {error}") from None

@@ -14,7 +14,7 @@ import numpy as np
 
 from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
-from gavo_jax.errors import GavoError, read_toml, shown
+from gavo_jax.errors import GavoError, line_of, read_toml, shown
 from gavo_jax.experiments.plan import Part, frames_of
 from gavo_jax.experiments.plan_file import parts_of, require_what_loops_need
 from gavo_jax.experiments.values import seeds_of, text_of, whole_of
@@ -170,8 +170,7 @@ def _storage_faults(storage: str) -> Iterator[None]:
     except GavoError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:300] or type(error).__name__
-        raise GavoError(f"{storage}: cannot be used as storage: {reason}") from None
+        raise GavoError(f"{storage}: cannot be used as storage: {line_of(error)}") from None
 
 
 def _configuration(tuning: Tuning, sequences: Sequence[FrameSequence], start: Settings) -> dict[str, Any]:

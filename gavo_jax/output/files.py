@@ -15,7 +15,7 @@ import cv2
 import jax
 import numpy as np
 
-from gavo_jax.errors import PARTIAL, GavoError, read_text
+from gavo_jax.errors import PARTIAL, GavoError
 from gavo_jax.output.plots import CAPTIONS as FIGURES
 from gavo_jax.output.plots import FORMATS as FIGURE_FORMATS
 from gavo_jax.settings import Settings
@@ -35,22 +35,6 @@ RECORDING = "run.rrd"
 """What `--viewer save` writes."""
 VIEW = "view.rrd"
 """What `gavo view --viewer save` writes."""
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        GavoError: it is missing, unreadable or none.
-    """
-    text = read_text(path)
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
-        raise GavoError(f"{path}: not a JSON object")
-    return value
 
 
 def environment() -> dict[str, str]:

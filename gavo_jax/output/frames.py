@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gavo_jax.alignment.result import no_alignment
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
-from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY, read_json
+from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
@@ -188,7 +188,7 @@ def read_run(folder: str | Path) -> RecordedRun:
         raise GavoError(f"{folder}: {fault}: name the output folder of a run")
     if not (folder / CONFIG).exists():
         raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
-    config = read_json(folder / CONFIG)
+    config = read_json_object(folder / CONFIG)
     # a run with loops that was killed has the poses as they were found alone
     is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()
     trajectory = Trajectory.read_tum(folder / (ODOMETRY if is_cut_short else TRAJECTORY))

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Bool
 
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.progress import Progress
@@ -36,7 +36,6 @@ from gavo_jax.output.files import (
     describe,
     differences,
     prepare_folder,
-    read_json,
     refuse_foreign,
     remove_figures,
     remove_files,
@@ -223,7 +222,7 @@ class RunFolder:
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
         self._revise()  # it may have been killed before it did
-        return read_json(path)
+        return read_json_object(path)
 
     def add(self, step: Step, progress: Progress | None = None) -> None:
         """Append one frame: its pair's row, and its pose unless its stamp is in doubt.
@@ -331,7 +330,7 @@ class RunFolder:
 
 def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:
     """Raise GavoError where a config.json is not of the run that `config` describes; it names the first difference."""
-    earlier = read_json(path)
+    earlier = read_json_object(path)
     now = json.loads(json.dumps(describe(config), allow_nan=False))
     for name, before, after in differences(_identity(earlier), _identity(now)):
         raise GavoError(

@@ -196,7 +196,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "scannet++: a list of frames": (
         "scannet_plus_plus",
         write("pose_intrinsic_imu.json", "[1, 2]"),
-        ["pose_intrinsic_imu.json: expected an object"],
+        ["pose_intrinsic_imu.json: not a JSON object"],
     ),
     "scannet++: frames of another name": (
         "scannet_plus_plus",

@@ -20,7 +20,7 @@ from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder
 from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.datasets.truth import by_stamp
-from gavo_jax.errors import GavoError, read_json
+from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.trajectory import Trajectory
 
 
@@ -103,7 +103,7 @@ class Polycam(PlainFolder):
         if own_camera_file(path) is not None:
             return super().calibrate(path, entries, reading)
         tables = [
-            {key: value for key, value in _object(file).items() if key in REQUIRED}
+            {key: value for key, value in read_json_object(file).items() if key in REQUIRED}
             for entry in entries
             if (file := path / cls.CAMERAS / f"{entry.color.stem}.json").is_file()
         ]
@@ -123,7 +123,7 @@ class Polycam(PlainFolder):
         poses: dict[float, np.ndarray] = {}
         for entry in paired.entries:
             file = folder / f"{entry.color.stem}.json"
-            values = _object(file) if file.is_file() else {}
+            values = read_json_object(file) if file.is_file() else {}
             rows = [[values.get(f"t_{row}{column}") for column in range(4)] for row in range(3)]
             if values and (pose := pose_of_rows(str(file), rows)) is not None:
                 poses[entry.stamp] = pose @ FLIP
@@ -140,19 +140,12 @@ def _frames(file: Path) -> dict[int, dict[str, Any]]:
 def _read_frames(file: Path, written: int, size: int) -> dict[int, dict[str, Any]]:
     """`_frames`, of a file that was written then; read once for its stamps, cameras and poses."""
     frames = {}
-    for name, frame in _object(file).items():
+    for name, frame in read_json_object(file).items():
         number = name.removeprefix("frame_")
         if not number.isdecimal() or not isinstance(frame, dict):
             raise GavoError(f"{file}: {name[:60]!r}: expected frame_000000 and so on, and what is said of each")
         frames[int(number)] = frame
     return frames
-
-
-def _object(file: Path) -> dict[str, Any]:
-    values = read_json(file)
-    if not isinstance(values, dict):
-        raise GavoError(f"{file}: expected an object of names and values")
-    return values
 
 
 def _matrix(file: Path, rows: Any) -> dict[str, Any]:
