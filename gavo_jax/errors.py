@@ -7,6 +7,7 @@ import os
 import re
 import reprlib
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -201,16 +202,22 @@ def without_heading(rows: list[tuple[str, list[str]]]) -> tuple[list[str], list[
     return heading, rows[1:]
 
 
+def partial_of(path: Path) -> Path:
+    """Where this thread writes a file first; no other one does."""
+    return path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}{PARTIAL}")
+
+
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write a file whole or not at all: beside it first, then renamed into place.
 
-    What lies where it is written first, left by a kill or planted by somebody, is removed and not followed.
+    What lies where it is written first, left by a kill or planted by somebody, is removed and not followed. Several
+    writers of one file do not meet: the last one's is there in the end.
 
     Raises:
         GavoError: the file cannot be written.
     """
     path = Path(path)
-    partial = path.with_name(path.name + PARTIAL)
+    partial = partial_of(path)
     try:
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:

@@ -81,8 +81,7 @@ def detect(
     column, row = np.round(pixels).astype(int).T
     z = depth[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)] / float(camera.depth_scale)
     z = np.where(z > 0, z, np.nan)
-    x, y = (pixels - (float(camera.cx), float(camera.cy))).T / np.array([[float(camera.fx)], [float(camera.fy)]])
-    return Features(pixels, descriptors, np.stack([x * z, y * z, z], axis=-1))
+    return Features(pixels, descriptors, np.asarray(camera.back_project(pixels, z)))
 
 
 def match(reference: Features, target: Features) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ Nießner et al. 2013), into which frames go one by one, so that memory grows wit
 import contextlib
 import os
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.se3 import is_rigid
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import Trajectory, inverse
+from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 Shape = Literal["cloud", "mesh"]
 
@@ -318,20 +318,18 @@ def build_map(
     """
     check_shape(shape)
     sequence, steps = without_distortion(sequence), list(steps)
-    corrected: dict[float, tuple[np.ndarray, int]] = {}
-    if trajectory is not None:
-        rows = zip(trajectory.world_T_camera, trajectory.segments.tolist(), strict=True)
-        corrected = dict(zip(trajectory.timestamps.tolist(), rows, strict=True))
+    corrected = _PosesInOrder(trajectory, float(sequence.timestamps[0]))
     places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]
     reasons: Counter[str] = Counter()
     for step in steps:
+        world_T_camera, segment = corrected.of(step)
         if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
             reasons[LOST] += len(places)
             places.clear()
         if (why := _why_not(step)) is not None:
             reasons[why] += 1
         else:
-            places.append((step.index, step, *corrected.get(step.timestamp, (step.world_T_camera, step.segment))))
+            places.append((step.index, step, world_T_camera, segment))
     segments = [segment for *_, segment in places]
     chosen = max(set(segments), key=lambda segment: (segments.count(segment), -segment), default=0)
     builder = MapBuilder(sequence.camera, voxel, farthest)
@@ -345,6 +343,28 @@ def build_map(
         except FrameError:
             reasons[UNREADABLE] += 1
     return builder.extract(shape, _left_out(reasons))
+
+
+class _PosesInOrder:
+    """The poses and segments of steps that a trajectory has, asked in the steps' order: a stamp may come again, once a
+    clock was set back.
+    """
+
+    def __init__(self, trajectory: Trajectory | None, first: float) -> None:
+        self._left: dict[str, deque[tuple[np.ndarray, int]]] = {}
+        if trajectory is None:
+            return
+        for row in zip(trajectory.timestamps, trajectory.world_T_camera, trajectory.segments, strict=True):
+            stamp, pose, segment = row
+            self._left.setdefault(stamp_name(stamp), deque()).append((pose, int(segment)))
+        if len(trajectory) and stamp_name(trajectory.timestamps[0]) == stamp_name(first):
+            self._left[stamp_name(first)].popleft()  # the first frame's, which no step has
+
+    def of(self, step: Step) -> tuple[np.ndarray, int]:
+        """What the trajectory has for the next step, or the step itself."""
+        left = self._left.get(stamp_name(step.timestamp))
+        has_pose = step.alignment.status is not AlignmentStatus.BAD_TIMESTAMP  # see `run.trajectory_of`
+        return left.popleft() if left and has_pose else (step.world_T_camera, step.segment)
 
 
 def check_map(path: str | Path, shape: Shape | None = None) -> Shape:

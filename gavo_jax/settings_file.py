@@ -96,7 +96,7 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     write_bytes(path, tomli_w.dumps(table).encode())
 
 
-def assignments(texts: Iterable[str], place: str = "--set") -> dict[str, Any]:
+def assignments(texts: Iterable[str]) -> dict[str, Any]:
     """Values by dotted name from texts like `alignment.points=2400`; a value is TOML, or a word.
 
     Raises:
@@ -106,9 +106,9 @@ def assignments(texts: Iterable[str], place: str = "--set") -> dict[str, Any]:
     for text in texts:
         name, sign, value = (part.strip() for part in text.partition("="))
         if not (name and sign and value):
-            raise GavoError(f"{place}: {shown(text)} is not NAME=VALUE")
+            raise GavoError(f"--set: {shown(text)} is not NAME=VALUE")
         try:
-            values[name] = parse_toml(place, f"value = {value}")["value"]
+            values[name] = parse_toml("--set", f"value = {value}")["value"]
         except GavoError:
             values[name] = value
     return values

@@ -2,16 +2,18 @@
 
 import math
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from gavo_jax.errors import PARTIAL, GavoError, number, printable, write_bytes
+from gavo_jax.errors import PARTIAL, GavoError, number, partial_of, printable, write_bytes
+from gavo_jax.output.files import remove_files
 
 
 def test_a_planted_link_is_not_followed(tmp_path):
     foreign = tmp_path / "foreign.txt"
     foreign.write_text("somebody else's")
-    (tmp_path / ("metrics.json" + PARTIAL)).symlink_to(foreign)
+    partial_of(tmp_path / "metrics.json").symlink_to(foreign)
     write_bytes(tmp_path / "metrics.json", b"{}")
     assert foreign.read_text() == "somebody else's"
     assert (tmp_path / "metrics.json").read_bytes() == b"{}" and not (tmp_path / "metrics.json").is_symlink()
@@ -19,13 +21,28 @@ def test_a_planted_link_is_not_followed(tmp_path):
 
 
 def test_what_a_kill_left_is_replaced(tmp_path):
-    (tmp_path / ("rows.txt" + PARTIAL)).write_bytes(b"half")
+    partial_of(tmp_path / "rows.txt").write_bytes(b"half")
     write_bytes(tmp_path / "rows.txt", b"whole")
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("rows.txt", b"whole")]
 
 
+def test_what_a_kill_left_goes_with_the_file_that_it_was_of(tmp_path):
+    for name in ("rows.txt", f"rows.txt.123-4{PARTIAL}", f"other.txt.123-4{PARTIAL}"):
+        (tmp_path / name).write_bytes(b"half")
+    remove_files(tmp_path, "rows.txt")
+    assert [path.name for path in tmp_path.iterdir()] == [f"other.txt.123-4{PARTIAL}"]
+
+
+def test_several_threads_write_one_file(tmp_path):
+    """Each one removed what the other one was writing: a third of them failed."""
+    path = tmp_path / "rows.txt"
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(lambda k: write_bytes(path, b"%d" % k * 10_000), [k % 10 for k in range(200)]))
+    assert len(set(path.read_bytes())) == 1 and [file.name for file in tmp_path.iterdir()] == ["rows.txt"]
+
+
 def test_a_folder_in_the_way_is_one_line(tmp_path):
-    (tmp_path / ("rows.txt" + PARTIAL)).mkdir()
+    partial_of(tmp_path / "rows.txt").mkdir()
     with pytest.raises(GavoError, match="rows.txt: cannot be written: ") as fault:
         write_bytes(tmp_path / "rows.txt", b"whole")
     assert "\n" not in str(fault.value) and not (tmp_path / "rows.txt").exists()

@@ -133,6 +133,17 @@ def test_a_map_goes_through_segments_that_loops_have_joined(monkeypatch):
     assert fused(steps, trajectory)[1] == list(range(0, 80, 10))
 
 
+def test_a_stamp_that_comes_again_has_a_pose_of_its_own(monkeypatch):
+    """A clock that was set back: both frames of a stamp were put where the second one was."""
+    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    stamps = [*WALK.timestamps[:4], *WALK.timestamps[1:4]]
+    steps = [stepped(1), stepped(2), stepped(3), *(stepped(i, segment=1) for i in (1, 2, 3))]
+    poses = np.stack([np.eye(4)] * 7)
+    poses[:, 0, 3] = 10 * np.arange(7)
+    frames, x, _ = fused(steps, Trajectory(np.array(stamps), poses, np.array([0, 0, 0, 0, 1, 1, 1])))
+    assert frames == list(WALK.timestamps[:4]) and x == [0, 10, 20, 30]
+
+
 def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
     monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
     steps = [stepped(1, AlignmentStatus.NO_REFERENCE, segment=1, lost=True)]

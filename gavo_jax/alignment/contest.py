@@ -38,7 +38,7 @@ def hold_contest(
     search: Callable[[], tuple[Float[Array, "k 4 4"], Any]],
     aliases: Float[Array, "a 4 4"],
     refine: Callable[[Float[Array, "4 4"], Bool[Array, ""]], Entry],
-    always: bool = False,
+    always: bool,
 ) -> tuple[Entry, Float[Array, ""], Any]:
     """Refine what is known and, unless that decides it, what a search finds; then the winner on the finest level.
 

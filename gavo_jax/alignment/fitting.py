@@ -70,9 +70,7 @@ def fit_objective(
             scales = scales._replace(depth_weight=trust * scales.depth_weight)
         objective = replace(objective, scales=scales)
     if exchanged is not None and level.exchanged is not None:
-        readout = None if level.readout is None else -level.readout
-        swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)
-        backward, _ = fit_objective(swapped, exchanged.target, options, rigid_inverse(guess))
+        backward, _ = fit_objective(level.with_parts_exchanged(), exchanged.target, options, rigid_inverse(guess))
         objective = replace(objective, backward=replace(backward, scales=objective.scales))
     return objective, brightness
 
@@ -84,9 +82,8 @@ def comparable_objective(
     objective = level_objective(level, target, options, unchanged_brightness(level))
     if exchanged is None or level.exchanged is None:
         return objective
-    readout = None if level.readout is None else -level.readout
-    swapped = level._replace(reference=level.exchanged, exchanged=None, readout=readout)
-    return replace(objective, backward=comparable_objective(swapped, exchanged.target, options, None))
+    backward = comparable_objective(level.with_parts_exchanged(), exchanged.target, options, None)
+    return replace(objective, backward=backward)
 
 
 def objectives_of(

@@ -100,7 +100,7 @@ class _Points(NamedTuple):
     """Corners in space, each at the moment that its row was read."""
 
     place: Float64[np.ndarray, "n 3"]
-    """Metres, in the frame's camera; anything where the depth is not"""
+    """Metres, in the frame's camera; anything where the depth is not known."""
     known: Bool[np.ndarray, " n"]
 
 

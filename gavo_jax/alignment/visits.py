@@ -75,6 +75,11 @@ class Level(NamedTuple):
         """Whether the motion that the level starts from may be far off: nothing is aligned yet, or several compete."""
         return self.is_first | (self.islands > 1)
 
+    def with_parts_exchanged(self) -> "Level":
+        """The level of the target's points, for the symmetric error; rows pass in the other direction then."""
+        readout = None if self.readout is None else -self.readout
+        return self._replace(reference=self.exchanged, exchanged=None, readout=readout)
+
 
 def stack_levels(
     views: tuple[Reference, ...],

@@ -107,9 +107,9 @@ class BodyAware:
         return MotionSegmenter(self.search.camera, self.search.settings)
 
     @property
-    def finds_motions(self) -> bool:
-        """Whether each body's own motion is looked for."""
-        return self.search.settings.odometry.bodies == "track"
+    def search_of_bodies(self) -> Aligner | None:
+        """What finds each body's own motion; None where it is not looked for."""
+        return self.search.plain if self.search.settings.odometry.bodies == "track" else None
 
     def warm_up(self) -> float:
         """Compile what every frame needs, side by side: the search, and the look at what it explains."""
@@ -200,7 +200,9 @@ class BodyAware:
         if np.any(found) or np.any(tracks.numbers):
             inverse_depth = inverse_depth_of(segmenter.view(attempt.state))
             bodies = whole_surfaces(found, np.asarray(look.belief.suspected) > SUSPECTED, inverse_depth)
-            tracks, seen = find_motions(self, state, frame, clock, bodies, look.belief, inverse_depth)
+            tracks, seen = find_motions(
+                self.search_of_bodies, segmenter, state, frame, clock, bodies, look.belief, inverse_depth
+            )
         tracker: TrackerState = attempt.state
         whole, elapsed = tracker.previous, float(clock.elapsed)
         suspected = suspect(look.belief, bodies > 0, elapsed, trusted=not is_doubted)

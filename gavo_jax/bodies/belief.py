@@ -174,11 +174,10 @@ def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, 
     return jax.lax.fori_loop(0, ENTERING, spread, _carry(suspected, e, same))
 
 
-def _box(image: Float[Array, "h w"], radius: int = 2) -> Float[Array, "h w"]:
-    """Mean over a square of pixels."""
-    size = 2 * radius + 1
-    padded = jnp.pad(image, radius, mode="edge")
-    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, (size, size), (1, 1), "VALID") / size**2
+def _box(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Mean over a square of 5 x 5 pixels."""
+    padded = jnp.pad(image, 2, mode="edge")
+    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, (5, 5), (1, 1), "VALID") / 25
 
 
 ROUNDS = (8, 12, 50)

@@ -1,6 +1,6 @@
 """Which bodies a frame shows, and how each has moved: the same search on a body's own points."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Integer
@@ -14,16 +14,15 @@ from gavo_jax.bodies.scene import AwareState, MotionSegmenter
 from gavo_jax.camera import to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.points import Reference, apply_rolling_shutter
+from gavo_jax.odometry.aligners import Aligner
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS, Usual
 from gavo_jax.odometry.tracking import Clock, TrackerState
 from gavo_jax.status import AlignmentStatus
 
-if TYPE_CHECKING:
-    from gavo_jax.bodies.aligner import BodyAware
-
 
 def find_motions(
-    aware: "BodyAware",
+    search: Aligner | None,
+    segmenter: MotionSegmenter,
     state: AwareState,
     frame: Frame,
     clock: Clock,
@@ -34,7 +33,8 @@ def find_motions(
     """The bodies of a new frame by their numbers, with their motions where these are asked for.
 
     Args:
-        aware: Who asks.
+        search: Finds a body's motion on its own points; None where masks alone are asked for.
+        segmenter: Of the frames.
         state: Before the frame.
         frame: The new one.
         clock: When it was taken.
@@ -51,25 +51,31 @@ def find_motions(
         if number == 0 or age > 0 or not np.any(part):
             continue
         alignment = None
-        if aware.finds_motions and np.any(before.labels == number):
-            alignment = _align(aware, state, frame, clock, before, int(number))
+        if search is not None and np.any(before.labels == number):
+            alignment = _align(search, segmenter, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
             tracks.motions[place] = alignment.xi if is_known else 0.0
             tracks.seconds[place] = clock.elapsed if is_known else UNKNOWN_SECONDS
         field = np.where(part, np.maximum(moving, 1e-3), np.minimum(moving, -1e-3)).astype(np.float32)
-        centroid = _centroid(part, inverse_depth, aware.segmenter)
+        centroid = _centroid(part, inverse_depth, segmenter)
         seen.append(Seen(int(number), field, float(np.mean(part)), centroid, alignment))
     return tracks, tuple(seen)
 
 
 def _align(
-    aware: "BodyAware", state: AwareState, frame: Frame, clock: Clock, before: BodyTracks, number: int
+    search: Aligner,
+    segmenter: MotionSegmenter,
+    state: AwareState,
+    frame: Frame,
+    clock: Clock,
+    before: BodyTracks,
+    number: int,
 ) -> Alignment:
     """Motion of a body in the camera, by the search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
     whole = state.whole
     if np.any(state.tracker.instant_motion):
-        whole = _with_rolling_shutter(whole, state.tracker, aware.segmenter)
+        whole = _with_rolling_shutter(whole, state.tracker, segmenter)
     motion: Any = np.float32(before.motions[place])
     tracker = state.tracker._replace(
         previous=whole,
@@ -81,7 +87,7 @@ def _align(
         usual=Usual.unknown(),
         part=state.tracker.part._replace(is_body=np.array(True)),  # pyright: ignore[reportArgumentType]
     )
-    return aware.search.plain.align(aware.segmenter.without(tracker, before.labels != number), frame, clock).result
+    return search.align(segmenter.without(tracker, before.labels != number), frame, clock).result
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:

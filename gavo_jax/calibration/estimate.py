@@ -332,6 +332,9 @@ def _stretches(sequence: Sequence) -> list[list[Frame]]:
     Raises:
         GavoError: there is none of enough frames.
     """
+    too_few = GavoError(f"{sequence.name}: at least {LEAST_FRAMES} frames in a row that can be read are needed")
+    if len(sequence) < LEAST_FRAMES:
+        raise too_few
     count = min(len(sequence), MOST_SEARCHED)
     length = min(WINDOW, count)
     changes = _changes(sequence, count)
@@ -345,7 +348,7 @@ def _stretches(sequence: Sequence) -> list[list[Frame]]:
     runs = [_readable(sequence, start, length) for start in chosen]
     runs = [run for run in runs if len(run) >= LEAST_FRAMES]
     if not runs:
-        raise GavoError(f"{sequence.name}: at least {LEAST_FRAMES} frames in a row that can be read are needed")
+        raise too_few
     return runs
 
 

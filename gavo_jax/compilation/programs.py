@@ -113,7 +113,7 @@ class CachedProgram(Generic[P, R]):
             return program(*leaves)  # which compiles it, where `_load` did not
 
     def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Whether a call would find its program, here or in the folder, and trace and compile nothing."""
+        """Whether a call would find its program, here or in the folder, and trace nothing."""
         if _folder is None:
             return False
         leaves, structure = jax.tree.flatten(args)

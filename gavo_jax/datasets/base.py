@@ -62,14 +62,15 @@ def require_grey_levels(grey: Any) -> None:
         raise FrameError(f"grey levels reach from 0 to 255, not to {most:g}: scale the image")
 
 
-def require_seconds(name: str, stamp: Any) -> None:
-    """Refuse what is no time in seconds: text, a date.
+def as_seconds(name: str, stamp: Any) -> float:
+    """A time in seconds as a number of its own: an array may hold the next one soon.
 
     Raises:
-        GavoError: It is no single number.
+        GavoError: It is no single number, but text, a date.
     """
     if np.ndim(stamp) or np.asarray(stamp).dtype.kind not in "iuf":
         raise GavoError(f"{name}: seconds are needed, a number, not {type(stamp).__name__}")
+    return float(stamp)
 
 
 YEAR = 365.25 * 86400
@@ -123,7 +124,7 @@ class Frame:
     def __post_init__(self):
         for name in ("timestamp", "depth_timestamp"):
             if (stamp := getattr(self, name)) is not None or name == "timestamp":
-                require_seconds(name, stamp)
+                object.__setattr__(self, name, as_seconds(name, stamp))
 
     @property
     def depth_delay(self) -> float:

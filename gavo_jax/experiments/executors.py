@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import jax
 
+from gavo_jax.compilation.cache import cache_folder, enable_compilation_cache
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, line_of
@@ -89,7 +90,7 @@ class RayExecutor:
             try:
                 ray.init(log_to_driver=False, configure_logging=False, include_dashboard=False)
             except (ConnectionError, RuntimeError, ValueError) as error:
-                raise GavoError(f"--executor ray: no cluster: {' '.join(str(error).split())}") from None
+                raise GavoError(f"--executor ray: no cluster: {line_of(error)}") from None
         resources = ray.cluster_resources()
         gpus = options.gpus if options.gpus is not None else min(1.0, resources.get("GPU", 0.0))
         self._wanted = {"CPU": min(options.cpus, resources.get("CPU", 1.0)), "GPU": gpus}
@@ -105,9 +106,9 @@ class RayExecutor:
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
         """Hand all of them to the cluster and yield them in the order in which they come back."""
         ray = self._ray
-        cache_folder = jax.config.values.get("jax_compilation_cache_dir")
-        variables = {"JAX_COMPILATION_CACHE_DIR": cache_folder} if cache_folder else {}
-        task = ray.remote(run_batch).options(
+        folder = cache_folder()  # each node keeps its own kind of processor's programs in it
+        variables = {} if folder is None else {"GAVO_CACHE_DIR": str(folder)}
+        task = ray.remote(_run_cached).options(
             num_cpus=self._wanted["CPU"],
             num_gpus=self._wanted["GPU"],
             max_retries=self.RETRIES,
@@ -133,6 +134,12 @@ class RayExecutor:
         """Leave the cluster; one that was started here ends."""
         if self._started:
             self._ray.shutdown()
+
+
+def _run_cached(experiment: str, batch: Batch) -> Outcome:
+    """`run_batch` in a process of its own, with what others compiled for its kind of processor."""
+    enable_compilation_cache()
+    return run_batch(experiment, batch)
 
 
 def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | None = None) -> Outcome:

@@ -82,7 +82,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class RayOptions:
-    """What one batch takes of a Ray cluster; None: two processors, and a GPU where the cluster has any."""
+    """What one batch takes of a Ray cluster: processors, and GPUs (None: one where the cluster has any)."""
 
     cpus: float = 2.0
     gpus: float | None = None

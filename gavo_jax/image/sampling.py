@@ -42,20 +42,19 @@ def pack_grey(grey: Float[Array, "h+1 w+1"]) -> UInt32[Array, "h w"]:
 
 
 def inverse_depth_slopes(
-    inverse_depth: Float[Array, "h+2 w+2"], limit: float = SAME_SURFACE
+    inverse_depth: Float[Array, "h+2 w+2"],
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from whichever neighbours lie on the same surface; 0 where none does.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, with a margin of one pixel.
-        limit: Largest relative step between neighbours that is still one surface.
     """
     q = inverse_depth[1:-1, 1:-1]
 
     def along(last: jax.Array, following: jax.Array) -> jax.Array:
         ahead, behind = following - q, q - last
-        near_ahead = (following > 0) & (jnp.abs(ahead) < limit * q)
-        near_behind = (last > 0) & (jnp.abs(behind) < limit * q)
+        near_ahead = (following > 0) & (jnp.abs(ahead) < SAME_SURFACE * q)
+        near_behind = (last > 0) & (jnp.abs(behind) < SAME_SURFACE * q)
         total = jnp.where(near_ahead, ahead, 0.0) + jnp.where(near_behind, behind, 0.0)
         count = near_ahead.astype(jnp.float32) + near_behind.astype(jnp.float32)
         return total / jnp.maximum(count, 1.0)

@@ -242,7 +242,9 @@ class Objective:
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
     ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P motions in one call; those not `counted` cost nothing and have an error of +inf."""
+        """Errors and overlaps of P motions in one call; those not `counted` have an error of +inf, and on a
+        CPU cost nothing.
+        """
         if counted is None:
             counted = jnp.ones(target_T_reference.shape[0], bool)
         found = _score(replace(self, backward=None), target_T_reference, counted)

@@ -52,10 +52,10 @@ class Problem:
     def score(
         self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None
     ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every solver.
+        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every population.
 
-        Candidates that are not `counted` cost nothing and have an error of +inf: a population that is smaller on one
-        level than on another leaves places empty.
+        Candidates that are not `counted` have an error of +inf and on a CPU cost nothing: a population that is smaller
+        on one level than on another leaves places empty.
         """
         # held back, or XLA would compute each motion anew for each of its 16 entries
         motions = jax.lax.optimization_barrier(self.transform(x))

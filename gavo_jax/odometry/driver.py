@@ -21,9 +21,9 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import (
     Frame,
     FrameError,
+    as_seconds,
     require_begin_in_seconds,
     require_grey_levels,
-    require_seconds,
 )
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
@@ -212,8 +212,8 @@ class Odometry:
             GavoError: What is given is no frame, its images are not of the camera's size or no grey and depth, or a
                 stamp is no number, or the first one is not in seconds.
         """
+        timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
-        timestamp = float(timestamp)  # an array may hold the next one soon
         stopwatch = Stopwatch()
         drawn = self.progress.drawn
         if isinstance(frame, Frame):
@@ -276,8 +276,6 @@ class Odometry:
             frame = rectified(frame, self.recorded)
             if is_first:  # later a dark image may be a covered lens
                 require_grey_levels(frame.grey)
-        require_seconds("timestamp", timestamp)
-        timestamp = float(timestamp)
         if is_first:
             require_begin_in_seconds(timestamp)
         if isinstance(frame, Frame):

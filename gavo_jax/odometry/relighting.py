@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Integer
 
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.evidence import compare, seen_level, view_of
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.levels import Levels
@@ -128,8 +128,9 @@ def _with_light(
     def in_new_light(reference: Reference) -> Reference:
         """Points by the light of the nearest pixel of the level that is looked at."""
         x, y, _ = reference.points
-        column = _index_at((planes.fx * x + planes.cx + 0.5) / planes.width, level.width)
-        row = _index_at((planes.fy * y + planes.cy + 0.5) / planes.height, level.height)
+        u, v = to_pixels(planes, x, y)
+        column = _index_at((u + 0.5) / planes.width, level.width)
+        row = _index_at((v + 0.5) / planes.height, level.height)
         gain = 1.0 + light.reshape(level.height, level.width)[row, column]
         return reference._replace(
             grey=gain * reference.grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v

@@ -138,7 +138,7 @@ def remove_files(folder: Path, *names: str) -> None:
     Raises:
         GavoError: one cannot be removed.
     """
-    for path in (folder / (name + suffix) for name in names for suffix in ("", PARTIAL)):
+    for path in (path for name in names for path in (folder / name, *folder.glob(f"{name}.*{PARTIAL}"))):
         try:
             path.unlink(missing_ok=True)
         except OSError as error:

@@ -45,7 +45,7 @@ class Peer(Protocol):
         ...
 
     def align(self, reference: Any, target: Any) -> PeerResult:
-        """Align two prepared frames from a zero guess."""
+        """Align two prepared frames, but for kiss-icp from a zero guess."""
         ...
 
 

@@ -1,9 +1,9 @@
 """Odometries of other libraries by name, to set beside this one in the same tables.
 
 Every peer answers in this project's terms: `target_T_reference`, which maps points of the reference camera into the
-target camera, in metres. Each aligns two single frames from a zero guess, at its library's default settings; where one
-differs, the docstring of the class names it with the reason. A library beside OpenCV is imported only when one of its
-peers is made.
+target camera, in metres. Each aligns two single frames from a zero guess, but for kiss-icp, which keeps a map of the
+frames before. Each runs at its library's default settings; where one differs, the docstring of the class names it with
+the reason. A library beside OpenCV is imported only when one of its peers is made.
 """
 
 import importlib.util

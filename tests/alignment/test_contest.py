@@ -40,7 +40,9 @@ def contest(
         evidence = Evidence(totals[nearest] - fall[nearest], seen[nearest] - fall[nearest])
         return Entry(motion, evidence, Brightness(jnp.ones(1), jnp.where(is_last, 1.0, 0.0)[None]))
 
-    winner, lead, searched = jax.jit(lambda: hold_contest(known, lambda: (found, jnp.float32(1.0)), aliases, refine))()
+    winner, lead, searched = jax.jit(
+        lambda: hold_contest(known, lambda: (found, jnp.float32(1.0)), aliases, refine, always=False)
+    )()
     return winner, float(lead), float(searched)
 
 

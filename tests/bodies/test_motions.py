@@ -85,7 +85,8 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     frame: Any = None
     clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
     nearness = np.ones(part.shape)
-    tracks, seen = motions.find_motions(aware, state, frame, clock, part.astype(np.int32), belief, nearness)
+    found_parts = part.astype(np.int32)
+    tracks, seen = motions.find_motions(search, aware.segmenter, state, frame, clock, found_parts, belief, nearness)
     assert seen[0].alignment is found
     place = list(tracks.numbers).index(seen[0].number)
     is_known = status is AlignmentStatus.OK

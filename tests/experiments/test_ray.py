@@ -79,7 +79,7 @@ def children_of(pid: int) -> list[int]:
 def kill_a_worker() -> None:
     """Kill one process, below this one, that is at work on a batch."""
     for pid in children_of(os.getpid()):
-        if b"ray::run_batch" in Path(f"/proc/{pid}/cmdline").read_bytes():
+        if b"ray::_run_cached" in Path(f"/proc/{pid}/cmdline").read_bytes():
             os.kill(pid, signal.SIGKILL)
             return
     pytest.fail("no worker is at work")

@@ -37,6 +37,14 @@ def test_what_is_no_time_is_refused_by_name(stamp: Any) -> None:
         replace(frame, depth_timestamp=stamp or "")
 
 
+def test_a_frame_keeps_its_stamp_and_not_the_array_that_held_it() -> None:
+    """An array that was filled again made all frames one: no time passed between them."""
+    stamp = np.zeros(())
+    frame = replace(Rendered(1, camera=small.CAMERA)[0], timestamp=stamp, depth_timestamp=stamp)
+    stamp[...] = 1.0
+    assert (frame.timestamp, frame.depth_timestamp) == (0.0, 0.0) and type(frame.timestamp) is float
+
+
 @pytest.mark.parametrize("unit", [1e3, 1e6, 1e9, -1e9])
 def test_a_stream_in_other_units_of_time_is_refused(unit: float) -> None:
     """Nanoseconds were taken for seconds without a word: no motion was implausible, and every guess wrong."""

@@ -117,8 +117,8 @@ def _projector_shadow(depth: np.ndarray, focal_baseline: float) -> np.ndarray:
     return shadow
 
 
-def _depth_jumps(depth: np.ndarray, share: float = 0.05) -> np.ndarray:
-    """Pixels whose 3 x 3 neighbourhood spans more than a share of its nearest depth: bool [H, W]."""
+def _depth_jumps(depth: np.ndarray) -> np.ndarray:
+    """Pixels whose 3 x 3 neighbourhood spans more than a twentieth of its nearest depth: bool [H, W]."""
     kernel = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(depth, kernel)
-    return cv2.dilate(depth, kernel) - nearest > share * nearest
+    return cv2.dilate(depth, kernel) - nearest > np.float32(0.05) * nearest
