@@ -32,8 +32,14 @@ def summary(sequence: Sequence) -> str:
     return (
         f"{sequence.name}: {source['kind']}{topics}, {len(sequence)} frames of {camera.width}x{camera.height}{rate}; "
         f"camera fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({source['camera_from']}); "
-        f"depth in {name_of_unit(source['depth_units_per_metre'])}"
+        f"depth in {unit_of(source)}"
     )
+
+
+def unit_of(source: Facts) -> str:
+    """The unit of depth in words, and that it is a guess where nothing says it."""
+    doubt = ", a guess: say --depth-scale if it is another" if source["depth_unit_assumed"] else ""
+    return f"{name_of_unit(source['depth_units_per_metre'])}{doubt}"
 
 
 def left_out(sequence: Sequence) -> list[str]:
@@ -76,6 +82,7 @@ def _source(sequence: Sequence) -> Facts:
         "topics": list(getattr(sequence, "topics", ())),
         "times_guessed": getattr(sequence, "times_guessed", ""),
         "camera_from": getattr(calibration, "origin", "the sequence"),
+        "depth_unit_assumed": getattr(sequence, "unit_is_assumed", False),
         "depth_units_per_metre": sequence.camera.depth_scale if unit is None else unit.file,
     }
 

@@ -176,6 +176,59 @@ def polycam(folder: Path) -> None:
             (folder / f"{kind}/{name}.json").write_text(json.dumps({**camera, **values, "blur_score": 90.0}))
 
 
+SCANNER_STAMPS = [round(5123.25 + i / 15, 6) for i in range(4)]
+
+
+def scanner_app(folder: Path) -> None:
+    """As 3D Scanner App exports all data: depth and cameras of frames without an image, too."""
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"frame_{i:05}.jpg", grey)
+        image(folder / f"depth_{i:05}.png", raw(metres, 1000))
+        image(folder / f"conf_{i:05}.png", np.full((120, 160), 2, np.uint8))
+        matrix = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        said = {"cameraPoseARFrame": matrix.ravel().tolist(), "intrinsics": MATRIX.ravel().tolist(), "frame_index": i}
+        (folder / f"frame_{i:05}.json").write_text(json.dumps({**said, "time": SCANNER_STAMPS[i], "motionQuality": 1}))
+    image(folder / "depth_00004.png", raw(METRES[0], 1000))
+    (folder / "info.json").write_text(json.dumps({"device": "iPhone", "title": "a scan"}))
+
+
+def bop(folder: Path) -> None:
+    """A scene of the BOP challenge: millimetres all over, and the world in the camera."""
+    said = {}
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True), 1):
+        image(folder / f"rgb/{i:06}.png", grey)
+        image(folder / f"depth/{i:06}.png", raw(metres, 10000))
+        camera_T_world = np.linalg.inv(pose)
+        turn, shift = camera_T_world[:3, :3].ravel().tolist(), (1000 * camera_T_world[:3, 3]).tolist()
+        said[str(i)] = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": turn, "cam_t_w2c": shift}
+    (folder / "scene_camera.json").write_text(json.dumps(said))
+
+
+def neural_rgbd(folder: Path) -> None:
+    """Its cameras look along -z; the third frame has no pose."""
+    blocks = []
+    for i, (grey, metres, pose) in enumerate(zip(GREYS, METRES, POSES, strict=True)):
+        image(folder / f"images/img{i}.png", grey)
+        image(folder / f"depth_filtered/depth{i}.png", raw(metres, 1000))
+        image(folder / f"depth_with_noise/depth{i}.png", raw(metres + 0.1, 1000))
+        blocks.append(pose @ np.diag([1.0, -1.0, -1.0, 1.0]) if i != 2 else np.full((4, 4), np.nan))
+    (folder / "focal.txt").write_text("131.0\n")
+    np.savetxt(folder / "poses.txt", np.concatenate(blocks))
+    np.savetxt(folder / "trainval_poses.txt", np.concatenate(blocks)[::-1])
+
+
+def semantic_replica(folder: Path) -> None:
+    """Rendered by another camera than Replica's own, which a file says."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"rgb/rgb_{i}.png", grey)
+        image(folder / f"depth/depth_{i}.png", raw(metres, 1000))
+    np.savetxt(folder / "traj_w_c.txt", POSES.reshape(4, 16))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+
+
+CAMERA_TOML = "fx = 131\nfy = 131\ncx = 79.5\ncy = 59.5\nwidth = 160\nheight = 120\n"
+
+
 def tum(folder: Path) -> None:
     write_tum(ROOM, folder)
 
@@ -362,6 +415,10 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "arkit_scenes": ("scan of ARKitScenes", arkit_scenes),
     "scannet_plus_plus": ("scan of ScanNet++", scannet_plus_plus),
     "polycam": ("scan of Polycam", polycam),
+    "scanner_app": ("scan of 3D Scanner App", scanner_app),
+    "bop": ("BOP scene", bop),
+    "neural_rgbd": ("scene of Neural RGB-D", neural_rgbd),
+    "semantic_replica": ("Replica room of Semantic-NeRF", semantic_replica),
     "open_loris": ("OpenLORIS-Scene sequence", open_loris),
     "tartan_air": ("TartanAir trajectory", tartan_air),
     "tartan_air_2": ("TartanAir trajectory", tartan_air_2),

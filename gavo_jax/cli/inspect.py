@@ -4,8 +4,7 @@ from typing import Any
 
 from gavo_jax.cli.options import Inspect
 from gavo_jax.cli.selection import open_sequence
-from gavo_jax.datasets.depth_unit import name_of_unit
-from gavo_jax.inspection import inspect_sequence
+from gavo_jax.inspection import inspect_sequence, unit_of
 from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import counted, say, waiting
 
@@ -89,7 +88,7 @@ def _recorded(recorded: dict[str, Any] | None, camera: dict[str, Any]) -> list[t
 
 
 def _depth(facts: dict[str, Any]) -> str:
-    depth, unit = facts["depth"], name_of_unit(facts["depth_units_per_metre"])
+    depth, unit = facts["depth"], unit_of(facts)
     if depth["median_m"] is None:
         return f"no reading; in {unit}"
     span = f"{depth['near_m']:.2f} to {depth['far_m']:.2f} m, median {depth['median_m']:.2f} m"

@@ -168,6 +168,11 @@ class FileSequence:
         return self._images.assembler.unit
 
     @property
+    def unit_is_assumed(self) -> bool:
+        """Whether nothing says the unit of depth, so that it is the usual one that depth looks most like."""
+        return self.scale_is_open and not self.calibration.states_depth_scale
+
+    @property
     def files(self) -> list[tuple[Path, ...]]:
         """Images of each frame."""
         return [(file_of(entry.color), *filter(None, (entry.depth,))) for entry in self.entries]

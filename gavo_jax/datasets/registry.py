@@ -9,7 +9,9 @@ from typing import Any, Protocol
 from gavo_jax.datasets import unrecognised
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
-from gavo_jax.datasets.layouts.arkit import Polycam, ScanNetPlusPlus
+from gavo_jax.datasets.layouts.arkit import Polycam, ScannerApp, ScanNetPlusPlus
+from gavo_jax.datasets.layouts.bop import BopScene
+from gavo_jax.datasets.layouts.neural import NeuralRgbd, SemanticReplica
 from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.layouts.openloris import OpenLoris
 from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
@@ -49,6 +51,7 @@ BUILT_IN: tuple[Dataset, ...] = (
         OpenLoris,
         TumSequence,
         SevenScenes,
+        BopScene,
         ScanNet,
         Replica,
         TartanAir,
@@ -57,7 +60,10 @@ BUILT_IN: tuple[Dataset, ...] = (
         ArkitScenes,
         Record3D,
         ScanNetPlusPlus,
+        ScannerApp,
         Polycam,
+        SemanticReplica,
+        NeuralRgbd,
         RtabMap,
         Open3DFolder,
         PlainFolder,

@@ -18,7 +18,9 @@ from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, 
 TRUTH = "groundtruth.txt"
 """In TUM's form."""
 
-OTHER_NAMES = re.compile(r"(gt|ground[-_]?truth|poses?|traj|trajectory)(_left)?\.(txt|csv|tum)", re.IGNORECASE)
+OTHER_NAMES = re.compile(
+    r"(gt|ground[-_]?truth|(cam(era)?[-_]?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum)", re.IGNORECASE
+)
 """Files that look like one, and are not looked for: their form is open."""
 
 NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
@@ -141,8 +143,19 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
     found = set(fnmatch.filter(files, estimates))
     others = [name for name in files if name not in found and OTHER_NAMES.fullmatch(name)]
     return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [
-        f"{name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}" for name in others
+        f"{name}: {_how_to_name(folder / name)}" for name in others
     ]
+
+
+def _how_to_name(file: Path) -> str:
+    """What makes the truth of a file of poses."""
+    try:
+        rows = data_rows(file)
+    except GavoError:
+        rows = []
+    if rows and len(rows[0][1]) != 8:
+        return f"if it is the true trajectory, write it as rows of timestamp tx ty tz qx qy qz qw into {TRUTH}"
+    return f"if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}"
 
 
 def counted_in(trajectory: Trajectory) -> float:
@@ -305,9 +318,10 @@ def posed(values: Sequence[float]) -> Float[np.ndarray, "4 4"] | None:
 
 
 def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list[str]]]:
-    """Rows of a file of poses, with their places, by the numbers of their images.
+    """Sixteen fields of each pose in a file, row by row, with their places, by the numbers of their images.
 
-    They are those of the images in their order, where there are as many, else all numbers from 0.
+    They are those of the images in their order, where there are as many, else all numbers from 0. A pose has a row to
+    itself, or four rows of four numbers.
 
     Raises:
         GavoError: there is no row.
@@ -315,5 +329,8 @@ def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list
     rows, numbers = data_rows(path), sorted(images)
     if not rows:
         raise GavoError(f"{path}: holds no trajectory (no rows)")
+    if len(rows[0][1]) == 4 and len(rows) >= 4:
+        blocks = (rows[at : at + 4] for at in range(0, len(rows), 4))
+        rows = [(block[0][0], [field for _, fields in block for field in fields]) for block in blocks]
     named = numbers if len(numbers) == len(rows) else range(len(rows))
     return [(number, *row) for number, row in zip(named, rows, strict=True)]

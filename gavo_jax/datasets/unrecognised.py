@@ -105,6 +105,11 @@ def _stereo(place: Place) -> str | None:
     stereo = next((folder for folder in folders if (folder / "cam0" / "data").is_dir()), None)
     if stereo is None:
         return None
+    if (stereo / "depth0" / "data").is_dir():
+        return (
+            f"{stereo / 'depth0'}: as InteriorNet has it, whose depth is the length of a ray: write z = length / "
+            "sqrt(1 + x^2 + y^2) for each pixel into depth/, beside rgb/"
+        )
     return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
 
 
@@ -115,6 +120,12 @@ def _nyu(place: Place) -> str | None:
         "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
         "dataset's toolbox first"
     )
+
+
+def _spectacular(place: Place) -> str | None:
+    if not all((place.path / name).is_file() for name in ("data.jsonl", "calibration.json")):
+        return None
+    return "a recording of Spectacular AI: write rgb/ and depth/ of it with sai-cli process first"
 
 
 def _recording(place: Place) -> str | None:
@@ -144,6 +155,7 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _images_missing,
     _stereo,
     _nyu,
+    _spectacular,
     _recording,
     _part_of_source,
     _folder,

@@ -211,7 +211,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "scannet++: a camera of four numbers": (
         "scannet_plus_plus",
         edit("pose_intrinsic_imu.json", '"intrinsic": [[131.0, 0.0, 79.5], [0.0', '"intrinsic": [[131.0, 0.0'),
-        ["pose_intrinsic_imu.json: intrinsic: expected three rows"],
+        ["pose_intrinsic_imu.json: expected a camera matrix of nine numbers"],
     ),
     "scannet++: stamps of text": (
         "scannet_plus_plus",
@@ -223,6 +223,46 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         edit("pose_intrinsic_imu.json", '"aligned_pose": [[', '"aligned_pose": [[1, 0, 0, 0], [0, 1, 0, 0]], "b": [['),
         ["pose_intrinsic_imu.json: frame 0: expected a pose of four rows"],
     ),
+    "bop: a list of cameras": ("bop", write("scene_camera.json", "[1]"), ["scene_camera.json: not a JSON object"]),
+    "bop: cameras by name": ("bop", write("scene_camera.json", '{"left": {}}'), ["'left': expected the number of an"]),
+    "bop: a matrix of eight": (
+        "bop",
+        write("scene_camera.json", '{"1": {"cam_K": [1, 0, 0, 0, 1, 0, 0, 0]}}'),
+        ["scene_camera.json: expected a camera matrix of nine numbers"],
+    ),
+    "bop: no matrix": ("bop", write("scene_camera.json", '{"1": {}}'), ["has no camera of any frame: say --camera"]),
+    "bop: units that differ": (
+        "bop",
+        write("scene_camera.json", '{"1": {"depth_scale": 0.1}, "2": {"depth_scale": 1.0}}'),
+        ["scene_camera.json: depth_scale: expected one number", "--depth-scale"],
+    ),
+    "bop: half a pose": (
+        "bop",
+        write(
+            "scene_camera.json",
+            json.dumps(
+                {"1": {"cam_K": [131, 0, 79.5, 0, 131, 59.5, 0, 0, 1], "cam_R_w2c": [1], "cam_t_w2c": [0, 0, 0]}}
+            ),
+        ),
+        ["scene_camera.json: image 1: expected nine numbers in cam_R_w2c"],
+    ),
+    "scanner app: half a frame's file": ("scanner_app", cut("frame_00001.json", 0.5), ["frame_00001.json: not JSON"]),
+    "scanner app: text for a stamp": (
+        "scanner_app",
+        write("frame_00001.json", '{"time": "now", "cameraPoseARFrame": []}'),
+        ["frame_00001.json: timestamp: expected seconds", "--rate"],
+    ),
+    "neural rgbd: a camera of prose": (
+        "neural_rgbd",
+        write("focal.txt", "wide"),
+        ["focal.txt: expected a focal length"],
+    ),
+    "neural rgbd: poses of three numbers": (
+        "neural_rgbd",
+        write("poses.txt", "1 2 3"),
+        ["poses.txt:1: expected a pose"],
+    ),
+    "semantic nerf: no poses": ("semantic_replica", write("traj_w_c.txt", ""), ["traj_w_c.txt: holds no trajectory"]),
     "polycam: a camera without numbers": (
         "polycam",
         lambda clip: [write(f"cameras/{file.name}", "{}")(clip) for file in list((clip / "cameras").iterdir())],

@@ -50,7 +50,16 @@ def is_refused(done: Done, *words: str) -> bool:
     return done.status == 2 and not done.out and done.err.count("\n") == 1 and all(word in done.err for word in words)
 
 
-WITH_TIMES = ("tum", "stray", "arkit_scenes", "open_loris", "tartan_air_2", "rtabmap", "scannet_plus_plus")
+WITH_TIMES = (
+    "tum",
+    "stray",
+    "arkit_scenes",
+    "open_loris",
+    "tartan_air_2",
+    "rtabmap",
+    "scannet_plus_plus",
+    "scanner_app",
+)
 """Layouts whose frames say when they were taken."""
 
 

@@ -1,4 +1,4 @@
-"""Scans of phones that say camera and pose of each frame in JSON, as ARKit found them: ScanNet++ and Polycam."""
+"""Scans of phones that say camera and pose of each frame in JSON, as ARKit found them."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -8,19 +8,17 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera_files.calibration import Calibration, camera_from_table, load_calibration
+from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camera_from_table, load_calibration
 from gavo_jax.camera_files.exports import common_camera
-from gavo_jax.camera_files.makes import of_matrix
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
-from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_matrices
 from gavo_jax.datasets.layouts.pairing import Paired
-from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.datasets.truth import by_stamp
-from gavo_jax.errors import GavoError, read_json_object
+from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.trajectory import Trajectory
 
 
@@ -42,32 +40,21 @@ class ScanNetPlusPlus(NumberedFolder):
         return (path / cls.STAMPS).is_file() and all(plain_files(path))
 
     @classmethod
-    def find(cls, path: Path) -> Found:
-        """Each kind has a folder."""
-        return by_number(*plain_files(path))
-
-    @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """A camera file in the folder, else what the frames' cameras have in common."""
-        size = width, height = size_of_most(entries)
+        size = size_of_most(entries)
         if (file := own_camera_file(path)) is not None:
             return load_calibration(file, size, MILLIMETRES)
         file = path / cls.STAMPS
-        matrices = [_matrix(file, frame["intrinsic"]) for frame in _frames(file).values() if "intrinsic" in frame]
-        if not matrices:
-            raise GavoError(f"{file}: has no camera (intrinsic) of any frame: say --camera")
-        table = {**common_camera(str(file), matrices), "width": width, "height": height}
-        origin = f"{file}, the median of {len(matrices)}"
-        return Calibration(camera_from_table(file, table, MILLIMETRES), origin=origin)
+        matrices = [frame["intrinsic"] for frame in _frames(file).values() if "intrinsic" in frame]
+        return of_matrices(file, matrices, size, MILLIMETRES)
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
         """Those of the frames, which are seconds."""
         file = path / cls.STAMPS
         found = {number: frame["timestamp"] for number, frame in _frames(file).items() if "timestamp" in frame}
-        if not all(isinstance(stamp, int | float) and np.isfinite(stamp) for stamp in found.values()):
-            raise GavoError(f"{file}: timestamp: expected seconds: say --rate to do without them")
-        return found
+        return {number: _seconds(file, stamp) for number, stamp in found.items()}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -77,6 +64,53 @@ class ScanNetPlusPlus(NumberedFolder):
         given = {number: frame[key] for number, frame in frames.items() if key in frame}
         found = {number: pose_of_rows(f"{path / cls.STAMPS}: frame {number}", rows) for number, rows in given.items()}
         return {number: pose for number, pose in found.items() if pose is not None}
+
+
+class ScannerApp(NumberedFolder):
+    """What 3D Scanner App exports as *All Data*: `frame_00000.jpg`, `depth_00000.png`, `frame_00000.json`.
+
+    Depth is in millimetres, of colour's view at a size of its own; there is more of it than of colour. A frame's file
+    has its stamp, its camera, and the pose of a camera that looks along -z.
+    """
+
+    kind: ClassVar[str] = "scan of 3D Scanner App"
+    depth_is_of_view: ClassVar[bool] = True
+    STAMPS: ClassVar[str] = "frame_*.json"
+    POSE: ClassVar[str] = "cameraPoseARFrame"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Recognise a folder by the frames' files, of which one has such a pose, beside images."""
+        file = next(path.glob(cls.STAMPS), None)
+        return file is not None and cls.POSE in read_text(file, MAX_JSON_BYTES) and all(plain_files(path))
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else what the frames' cameras have in common."""
+        size = size_of_most(entries)
+        if (file := own_camera_file(path)) is not None:
+            return load_calibration(file, size, MILLIMETRES)
+        matrices = [matrix for _, matrix in cls._said(path, "intrinsics").values()]
+        return of_matrices(path / cls.STAMPS, matrices, size, MILLIMETRES)
+
+    @classmethod
+    def stamps(cls, path: Path) -> dict[int, float]:
+        """Those of the frames, which are seconds since the phone was switched on."""
+        return {number: _seconds(file, stamp) for number, (file, stamp) in cls._said(path, "time").items()}
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """What ARKit found."""
+        said = cls._said(path, cls.POSE)
+        found = {number: pose_of_rows(str(file), rows) for number, (file, rows) in said.items()}
+        return {number: pose @ FLIP for number, pose in found.items() if pose is not None}
+
+    @classmethod
+    def _said(cls, path: Path, key: str) -> dict[int, tuple[Path, Any]]:
+        """What the frames' files say by a key, by the frames' numbers."""
+        files = {int(number): file for file in path.glob(cls.STAMPS) if (number := file.stem[6:]).isdecimal()}
+        found = {number: (file, read_json_object(file).get(key)) for number, file in sorted(files.items())}
+        return {number: (file, value) for number, (file, value) in found.items() if value is not None}
 
 
 class Polycam(PlainFolder):
@@ -130,6 +164,12 @@ class Polycam(PlainFolder):
         return by_stamp(poses) if poses else None, unread
 
 
+def _seconds(file: Path, stamp: Any) -> float:
+    if isinstance(stamp, bool) or not isinstance(stamp, int | float) or not np.isfinite(stamp):
+        raise GavoError(f"{file}: timestamp: expected seconds: say --rate to do without them")
+    return stamp
+
+
 def _frames(file: Path) -> dict[int, dict[str, Any]]:
     """What a file says of each frame, by the frames' numbers."""
     status = file.stat()
@@ -146,10 +186,3 @@ def _read_frames(file: Path, written: int, size: int) -> dict[int, dict[str, Any
             raise GavoError(f"{file}: {name[:60]!r}: expected frame_000000 and so on, and what is said of each")
         frames[int(number)] = frame
     return frames
-
-
-def _matrix(file: Path, rows: Any) -> dict[str, Any]:
-    """Intrinsics of three rows of three numbers."""
-    if not (isinstance(rows, list) and len(rows) == 3 and all(isinstance(row, list) and len(row) == 3 for row in rows)):
-        raise GavoError(f"{file}: intrinsic: expected three rows of three numbers")
-    return of_matrix(str(file), rows)

@@ -9,7 +9,7 @@ from gavo_jax.datasets.names import images_among
 
 COLOR_FOLDERS = (
     *("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide"),
-    *("color_images", "colour_images", "rgb_images", "rgb_raw", "color_raw"),
+    *("color_images", "colour_images", "rgb_images", "rgb_raw", "color_raw", "gray"),
 )
 DEPTH_FOLDERS = (
     *("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth"),

@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camera_from_table, load_calibration
 from gavo_jax.camera_files.exports import common_camera
+from gavo_jax.camera_files.makes import of_matrix
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import (
@@ -35,11 +36,14 @@ from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
 """Frames per second where nobody says it: that of nearly every RGB-D camera."""
+
+SLOWEST, FASTEST = 0.1, 1000.0
+"""Frames per second that may be a rate."""
 
 NUMBERS, BY_FILM = "names are numbers", "as the film says"
 """What is said of stamps that are counted, of which frames per second are a guess, or are a film's."""
@@ -65,8 +69,8 @@ class NumberedFolder(FileSequence):
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """The image files."""
-        raise NotImplementedError
+        """The image files: each kind in a folder, or told apart by their names."""
+        return by_number(*plain_files(path))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
@@ -268,8 +272,6 @@ class PlainFolder(FileSequence):
     scale_is_open: ClassVar[bool] = True
     depth_is_of_view: ClassVar[bool] = False
     """As of `NumberedFolder`; nerfstudio has it so, too."""
-    has_clock: ClassVar[bool] = False
-    """Whether a file says when the frames were taken."""
     ESTIMATES: ClassVar[str] = ""
     """Names of files of poses that the kind's own program found, which are no truth; empty where there are none."""
 
@@ -300,10 +302,10 @@ class PlainFolder(FileSequence):
         root = resolve_folder(path)
         color, depth = plain_files(path)
         film = film_of(color[0]) if color else None
-        usual = RATE if film is None else rate_of(film) or RATE
-        paired = paired_by_stamp(path, color, depth, reading) or paired_by_number(
-            path, color, depth, cls.clock(path, reading, usual)
-        )
+        told = None if reading.rate else cls.clock(path)
+        usual = reading.rate or (film and rate_of(film)) or RATE
+        seconds = told or (lambda numbers: numbers / usual)
+        paired = paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
@@ -311,16 +313,15 @@ class PlainFolder(FileSequence):
         truth, unread = cls.truth(path, paired)
         left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
-        is_open = paired.seconds is not None and not reading.rate and not cls.has_clock
+        is_open = paired.seconds is not None and not reading.rate and told is None
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
         return sequence
 
     @classmethod
-    def clock(cls, path: Path, reading: Reading, usual: float) -> Seconds:
-        """Times of frames by their numbers, at the usual frames per second where nothing says others."""
-        rate = reading.rate or usual
-        return lambda numbers: numbers / rate
+    def clock(cls, path: Path) -> Seconds | None:
+        """Times of frames by their numbers, where a file of the folder says them."""
+        return None
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
@@ -353,9 +354,31 @@ class Open3DFolder(PlainFolder):
         return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
+    def clock(cls, path: Path) -> Seconds | None:
+        """By the rate that Open3D's reader of RealSense recordings writes beside the intrinsics."""
+        file = cls._intrinsics(path)
+        assert file is not None
+        return by_rate(told_in(file).get("fps"))
+
+    @classmethod
     def _intrinsics(cls, path: Path) -> Path | None:
         names = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json")
         return next((path / name for name in names if (path / name).is_file()), None)
+
+
+def by_rate(rate: Any) -> Seconds | None:
+    """Times of frames by their numbers at some frames per second; None for what is no such rate."""
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not SLOWEST <= rate <= FASTEST:
+        return None
+    return lambda numbers: numbers / rate
+
+
+def told_in(file: Path) -> dict[str, Any]:
+    """The names and values that a file of JSON beside the images holds; none where it is something else."""
+    try:
+        return read_json_object(file, MAX_JSON_BYTES)
+    except GavoError:
+        return {}
 
 
 def _any(folder: Path, pattern: str) -> Path | None:
@@ -378,6 +401,36 @@ def _check_identity(file: Path) -> None:
     pose = pose_in(file)
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
+
+
+def of_matrices(file: Path, matrices: list[Any], size: tuple[int, int], depth_scale: float) -> Calibration:
+    """The camera that the frames' own have in common, see `common_camera`.
+
+    Args:
+        file: that has them.
+        matrices: of the cameras, each nine numbers or three rows of three.
+        size: of the images, width and height.
+        depth_scale: units per metre.
+
+    Raises:
+        GavoError: there is none, one is no camera matrix, or they differ by more than focus moves them.
+    """
+    if not matrices:
+        raise GavoError(f"{file}: has no camera of any frame: say --camera")
+    tables = [_table_of(file, matrix) for matrix in matrices]
+    table = {**common_camera(str(file), tables), "width": size[0], "height": size[1]}
+    origin = f"{file}, the median of {len(matrices)}"
+    return Calibration(camera_from_table(file, table, depth_scale), origin=origin)
+
+
+def _table_of(file: Path, matrix: Any) -> dict[str, Any]:
+    """Intrinsics of a matrix."""
+    try:
+        return of_matrix(str(file), matrix)
+    except GavoError:
+        raise
+    except (ValueError, TypeError):
+        raise GavoError(f"{file}: expected a camera matrix of nine numbers, or of three rows of three") from None
 
 
 def of_each_frame(folder: Path, files: Sequence[Path], load: Callable[[Path], Calibration]) -> Calibration:

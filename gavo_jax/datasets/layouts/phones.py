@@ -14,15 +14,11 @@ from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
 from gavo_jax.datasets.layouts.image_folders import plain_files
-from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_each_frame
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, by_rate, of_each_frame, told_in
 from gavo_jax.datasets.layouts.pairing import Paired
-from gavo_jax.datasets.names import Found, by_number
 from gavo_jax.datasets.truth import Seconds, numbers_in, posed
-from gavo_jax.errors import GavoError, data_rows, read_json, read_text
+from gavo_jax.errors import GavoError, data_rows, read_text
 from gavo_jax.trajectory import Trajectory, inverse
-
-SLOWEST, FASTEST = 0.1, 1000.0
-"""Frames per second that may be a rate."""
 
 
 class StrayScan(NumberedFolder):
@@ -43,11 +39,6 @@ class StrayScan(NumberedFolder):
     def recognises(cls, path: Path) -> bool:
         """Recognise a folder by the recorder's own files, beside images."""
         return all((path / name).is_file() for name in (cls.STAMPS, cls.MATRIX)) and all(plain_files(path))
-
-    @classmethod
-    def find(cls, path: Path) -> Found:
-        """Colour lies where it was written to."""
-        return by_number(*plain_files(path))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
@@ -115,7 +106,6 @@ class Record3D(PlainFolder):
 
     kind: ClassVar[str] = "export of Record3D"
     depth_is_of_view: ClassVar[bool] = True
-    has_clock: ClassVar[bool] = True
     FILE: ClassVar[str] = "metadata.json"
 
     @classmethod
@@ -125,19 +115,13 @@ class Record3D(PlainFolder):
         return file.is_file() and '"K"' in read_text(file, MAX_JSON_BYTES) and super().recognises(path)
 
     @classmethod
-    def clock(cls, path: Path, reading: Reading, usual: float) -> Seconds:
-        """Take the rate that its file says, unless one is said."""
-        try:
-            told = read_json(path / cls.FILE, MAX_JSON_BYTES)
-        except GavoError:  # with a camera file in the folder it need not be one
-            told = {}
-        rate, stamps = (told.get(key) if isinstance(told, dict) else None for key in ("fps", "frameTimestamps"))
-        if reading.rate is not None:
-            return super().clock(path, reading, usual)
+    def clock(cls, path: Path) -> Seconds | None:
+        """What its file says, of each frame or of all."""
+        told = told_in(path / cls.FILE)  # with a camera file in the folder it need not be one
+        stamps = told.get("frameTimestamps")
         if isinstance(stamps, list) and len(stamps) > 1:
             return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps)
-        is_rate = isinstance(rate, int | float) and SLOWEST <= rate <= FASTEST
-        return super().clock(path, replace(reading, rate=rate) if is_rate else reading, usual)
+        return by_rate(told.get("fps"))
 
 
 def _clock_of(place: str, stamps: list[Any]) -> Seconds:

@@ -18,18 +18,18 @@ from gavo_jax.datasets.files import FileSequence, Reading, open_pair
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 
-PHONES = ("stray", "scannet_plus_plus", "polycam", "nerf", "rtabmap")
+PHONES = ("stray", "scannet_plus_plus", "polycam", "scanner_app", "nerf", "rtabmap")
 
 
 def enlarge(folder: Path, times: int) -> None:
     """Write colour larger, as it was taken, and its cameras with it; depth stays as it is."""
-    for file in (file for name in ("rgb", "images") for file in (folder / name).glob("*")):
+    for file in (file for form in ("rgb/*", "images/*", "frame_*.jpg") for file in folder.glob(form)):
         grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         assert grey is not None
         image(file, cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC))
     fx, _, cx, cy = CAMERA.scaled(times)
     numbers = {"131.0": fx, "79.5": cx, "59.5": cy, "160": 160 * times, "120": 120 * times}
-    files = ("pose_intrinsic_imu.json", "transforms.json", "cameras/*.json", "calib/*.yaml")
+    files = ("pose_intrinsic_imu.json", "transforms.json", "cameras/*.json", "frame_*.json", "calib/*.yaml")
     for file in (file for pattern in files for file in folder.glob(pattern)):
         if file.suffix == ".json":
             file.write_text(json.dumps(_replaced(json.loads(file.read_text()), numbers)))

@@ -12,6 +12,7 @@ import pytest
 from written_folders import (
     ARKIT_STAMPS,
     CAMERA,
+    CAMERA_TOML,
     DEPTHS,
     GREYS,
     LAYOUTS,
@@ -22,6 +23,7 @@ from written_folders import (
     POLYCAM_STAMPS,
     POSES,
     RTABMAP_STAMPS,
+    SCANNER_STAMPS,
     STRAY_STAMPS,
     image,
     kinect,
@@ -32,7 +34,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.files import FileSequence, Reading
 from gavo_jax.datasets.layouts.numbered import PlainFolder, ScanNet, SevenScenes
 from gavo_jax.datasets.registry import open_source, recognise, register_dataset
 from gavo_jax.datasets.selection import open_part
@@ -67,12 +69,15 @@ def test_every_layout_gives_the_same_frames(folder, name):
         "arkit_scenes": ARKIT_STAMPS,
         "scannet_plus_plus": PLUS_STAMPS,
         "polycam": POLYCAM_STAMPS,
+        "scanner_app": SCANNER_STAMPS,
         "open_loris": LORIS_STAMPS,
         "rtabmap": RTABMAP_STAMPS,
     }
-    from_one = ("nerf", "open3d", "open3d_image", "rtabmap_export")
+    from_one = ("bop", "nerf", "open3d", "open3d_image", "rtabmap_export")
     first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
-    expected = np.arange(4) / {"stray": 60, "scannet_plus_plus": 60, "tartan_air_2": 10}.get(name, 30)
+    expected = np.arange(4) / {"stray": 60, "scannet_plus_plus": 60, "scanner_app": 15, "tartan_air_2": 10}.get(
+        name, 30
+    )
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
     is_lossy = bool([*folder.rglob("*.jpg")])
@@ -211,16 +216,50 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
     "name",
     [
         *("seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris", "tartan_air"),
-        *("tartan_air_2", "scannet_plus_plus", "polycam"),
+        *("tartan_air_2", "scannet_plus_plus", "polycam", "scanner_app", "bop", "neural_rgbd", "semantic_replica"),
     ],
 )
 def test_poses_are_the_truth(folder, name):
     sequence = open_source(wrote(folder, name))
     truth = sequence.ground_truth
     assert truth is not None
-    kept = [0, 1, 3] if name == "scannet" else [0, 1, 2, 3]
+    kept = [0, 1, 3] if name in ("scannet", "neural_rgbd") else [0, 1, 2, 3]
     np.testing.assert_array_equal(truth.timestamps, sequence.timestamps[kept])
     np.testing.assert_allclose(truth.world_T_camera, POSES[kept], atol=1e-6)
+
+
+def test_a_room_of_semantic_nerf_was_rendered_with_a_view_of_90_degrees(folder):
+    wrote(folder, "semantic_replica")
+    (folder / "camera.toml").unlink()
+    camera = open_source(folder).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale) == (80, 80, 79.5, 59.5, 1000)
+
+
+def test_a_scene_in_grey_of_bop_has_its_images_in_gray(folder):
+    wrote(folder, "bop")
+    (folder / "rgb").rename(folder / "gray")
+    assert len(open_source(folder)) == 4 and recognise(folder).kind == "BOP scene"
+
+
+@pytest.mark.parametrize(("fps", "rate", "guess"), [(15.0, 15, ""), ("15", 30, "names are numbers")])
+def test_the_rate_that_open3ds_reader_of_recordings_writes_is_taken(folder, fps, rate, guess):
+    path = wrote(folder, "open3d") / "camera_intrinsic.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fps": fps}))
+    sequence = open_source(folder)
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / rate)
+    assert isinstance(sequence, FileSequence) and sequence.times_guessed == guess
+    assert np.allclose(np.diff(open_source(folder, Reading(rate=10.0)).timestamps), 0.1)
+
+
+@pytest.mark.parametrize(("scale", "is_guess"), [(None, True), (1000.0, False)])
+def test_a_unit_that_nothing_says_is_called_a_guess(folder, scale, is_guess):
+    """Depth in 5000 or 6553.5 to a metre was "in millimetres", without a word."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"rgb/{i}.png", grey)
+        image(folder / f"depth/{i}.png", raw(metres, 6553.5))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    sequence = open_source(folder, Reading(depth_scale=scale))
+    assert ("millimetres, a guess: say --depth-scale" in summary(sequence)) == is_guess
 
 
 @pytest.mark.parametrize("name", ["seven_scenes", "plain", "associations", "tartan_air_2"])

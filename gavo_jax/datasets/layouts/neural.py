@@ -1,0 +1,104 @@
+"""Scenes that neural mapping is tried on: Replica as Semantic-NeRF and vMAP have it, and those of Neural RGB-D."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.datasets.assembly import MILLIMETRES
+from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from gavo_jax.datasets.layouts.image_folders import plain_files
+from gavo_jax.datasets.layouts.nerf import FLIP
+from gavo_jax.datasets.layouts.numbered import NumberedFolder
+from gavo_jax.datasets.names import Found, by_number, images_among
+from gavo_jax.datasets.truth import in_order, pose_of
+from gavo_jax.errors import GavoError, number, read_text
+
+
+class NeuralScene(NumberedFolder):
+    """A scene whose camera looks along the middle of its image, with one focal length, and whose depth is z in mm."""
+
+    POSES: ClassVar[str]
+    """The file of poses, each of sixteen numbers."""
+    FROM_OURS: ClassVar[np.ndarray] = np.eye(4)
+    """From our camera's axes to those of the poses."""
+
+    @classmethod
+    def focal(cls, path: Path, width: int) -> tuple[float, str]:
+        """The focal length, pixels, and where it is from."""
+        raise NotImplementedError
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else one by the focal length."""
+        size = width, height = size_of_most(entries)
+        if (file := own_camera_file(path)) is not None:
+            return load_calibration(file, size, MILLIMETRES)
+        focal, origin = cls.focal(path, width)
+        middle = (width - 1) / 2, (height - 1) / 2
+        return Calibration(Camera(focal, focal, *middle, width, height, depth_scale=MILLIMETRES), origin=origin)
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """By their images' numbers, or in order where there are as many as images."""
+        file = path / cls.POSES
+        rows = in_order(file, cls.find(path).color) if file.is_file() else ()
+        found = {number: pose_of(place, row) for number, place, row in rows}
+        return {number: pose @ cls.FROM_OURS for number, pose in found.items() if pose is not None}
+
+
+class SemanticReplica(NeuralScene):
+    """A rendered room of Replica as Semantic-NeRF and vMAP have it: `rgb/rgb_0.png`, `depth/`, `traj_w_c.txt`."""
+
+    kind: ClassVar[str] = "Replica room of Semantic-NeRF"
+    POSES: ClassVar[str] = "traj_w_c.txt"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Recognise a folder by the file of poses beside images."""
+        return (path / cls.POSES).is_file() and all(plain_files(path))
+
+    @classmethod
+    def focal(cls, path: Path, width: int) -> tuple[float, str]:
+        """That of a view of 90 degrees."""
+        return width / 2, "the one that it was rendered with, of 90 degrees"
+
+
+class NeuralRgbd(NeuralScene):
+    """A scene of Neural RGB-D (Azinović et al. 2022): `images/img0.png`, `depth_filtered/depth0.png`, `focal.txt`.
+
+    Its `poses.txt` are of cameras that look along -z; four rows of not-a-number stand for a frame without one.
+    """
+
+    kind: ClassVar[str] = "scene of Neural RGB-D"
+    POSES: ClassVar[str] = "poses.txt"
+    FROM_OURS: ClassVar[np.ndarray] = FLIP
+    FOCAL: ClassVar[str] = "focal.txt"
+    DEPTH: ClassVar[str] = "depth_filtered"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Recognise a folder by the file of the focal length beside images."""
+        return (path / cls.FOCAL).is_file() and all((path / name).is_dir() for name in ("images", cls.DEPTH))
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Depth is what the method itself takes, which is always there."""
+        color = images_among((path / "images").glob("*"), COLOR_SUFFIXES)
+        return by_number(color, images_among((path / cls.DEPTH).glob("*"), DEPTH_SUFFIXES))
+
+    @classmethod
+    def focal(cls, path: Path, width: int) -> tuple[float, str]:
+        """What its file says."""
+        file = path / cls.FOCAL
+        try:
+            return number(read_text(file).strip()), str(file)
+        except GavoError:
+            raise
+        except ValueError:
+            raise GavoError(f"{file}: expected a focal length in pixels, and nothing else") from None
