@@ -203,7 +203,7 @@ def without_heading(rows: list[tuple[str, list[str]]]) -> tuple[list[str], list[
 
 
 def partial_of(path: Path) -> Path:
-    """Where this thread writes a file first; no other one does."""
+    """The file that this thread writes first, in place of a file; no other one does."""
     return path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}{PARTIAL}")
 
 

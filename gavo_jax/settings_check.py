@@ -13,6 +13,7 @@ from jax.core import Tracer
 
 from gavo_jax.errors import GavoError, shown
 from gavo_jax.image.pyramid import LEVELS
+from gavo_jax.objective.losses import fault_of_loss
 from gavo_jax.solvers.base import Schedule
 
 MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
@@ -55,6 +56,8 @@ def require_settings(settings: Any, place: str = "settings") -> None:
             raise GavoError(f"{place}: {room.name}: must be of type {kind.__name__}, not {shown(part)}")
     for name, part, field in _fields(settings):
         _require_kind(f"{place}: {name}", getattr(part, field.name), kind_of(type(part), field.name), field.default)
+    if fault := fault_of_loss(settings.alignment.loss):
+        raise GavoError(f"{place}: alignment.loss: {shown(settings.alignment.loss)}: {fault}")
     _require_kind(f"{place}: solver.iterations", settings.solver.iterations, tuple[int, ...], ())
     if min(settings.solver.iterations) < 0:
         raise GavoError(f"{place}: solver.iterations: must be at least 0, not {min(settings.solver.iterations)}")

@@ -270,7 +270,7 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
             raise GavoError(f"{where}: cannot be left out")
         return None
     if callable(current):
-        return _callable(where, field, value)
+        return _callable(where, field, current, value)
     whole = _takes_whole(owner, field, current)
     if isinstance(value, list):
         return tuple(_plain(entry, whole) for entry in value)
@@ -285,8 +285,10 @@ def _plain(value: Any, whole: bool) -> Any:
     return float(value) if is_number and not whole and abs(value) <= MAX_REAL else value
 
 
-def _callable(where: str, field: str, value: Any) -> Any:
+def _callable(where: str, field: str, current: Any, value: Any) -> Any:
     known = LOSSES if field == "loss" else OPTIMIZERS
+    if value == getattr(current, "__name__", None) and value not in known:  # of the method that was registered
+        return current
     if not isinstance(value, str):
         raise GavoError(f"{where}: must be a name, not {shown(value)}")
     refuse_unknown(where, [value], known, "name")

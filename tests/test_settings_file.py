@@ -24,6 +24,17 @@ from gavo_jax.solvers.genetic import GeneticAlgorithm
 from gavo_jax.solvers.gradient import GradientDescent
 
 
+def test_the_loss_of_a_method_that_was_registered_keeps_its_name():
+    """config.json of such a run could not be given back, and was told to take another loss."""
+
+    def my_huber(s):
+        return huber(s)
+
+    own = replace(presets.preset(), alignment=replace(presets.preset().alignment, loss=my_huber))
+    assert override(own, {"alignment.loss": "my_huber"}) == own
+    assert override(own, {"alignment.loss": "huber"}).alignment.loss is huber
+
+
 def test_values_of_every_kind():
     values = {
         "solver.mutation_decay": 1,

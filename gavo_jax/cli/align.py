@@ -14,6 +14,7 @@ from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
+from gavo_jax.datasets.assembly import DepthImage, refuse_mixed
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import (
     Entry,
@@ -49,8 +50,16 @@ def align(options: Align) -> int:
     calibration, depth_scale = _cameras(options)
     pair = open_pair(images, calibration, Reading(depth_scale=depth_scale))
     (reference, target), camera = pair, pair.camera
-    if not options.force and (fault := lack_of_depth(pair) or fault_of_scale(pair)):
-        raise GavoError(f"{options.depth0}: {fault}, or go on with --force")
+    if options.depth_scale is None:
+        refuse_mixed([DepthImage(pair.raw_depth(k), str(images[k][1])) for k in range(2)])
+    if not options.force:
+        faults = [
+            (options.depth0, lack_of_depth(pair)),
+            *((images[k][1], fault_of_scale(pair[k : k + 1])) for k in (0, 1)),
+        ]
+        for depth, fault in faults:
+            if fault:
+                raise GavoError(f"{depth}: {fault}, or go on with --force")
     be_ready()
     with waiting("compiling and aligning …"):
         key = jax.random.key(options.seed)

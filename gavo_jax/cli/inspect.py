@@ -48,7 +48,10 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     if fault := facts["depth"]["lies"]:
         lines.append(("depth image", f"WRONG? {fault} beside the colour image, by the edges of both"))
     if (delay := facts["delay_of_depth_ms"]) is not None:
-        words = f"{delay['median']:.1f} ms after colour in the median, {delay['least']:.1f} to {delay['most']:.1f}"
+        side = "before" if delay["median"] < 0 else "after"
+        words = (
+            f"{abs(delay['median']):.1f} ms {side} colour in the median, {delay['least']:.1f} to {delay['most']:.1f}"
+        )
         lines.append(("delay of depth", words))
     return [*lines, ("ground truth", _truth(facts))]
 

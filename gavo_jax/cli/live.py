@@ -13,7 +13,7 @@ from gavo_jax.cli.map_file import check_map_options, write_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.run_table import print_run
-from gavo_jax.cli.selection import check_positive, choose_settings, with_shortcuts
+from gavo_jax.cli.selection import check_positive, choose_settings, unchanged_preset, with_shortcuts
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.live.devices import open_device
@@ -68,7 +68,7 @@ def run_live(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **run_identity(device.name, method, preset, options.seed),
+            **run_identity(device.name, method, unchanged_preset(options), options.seed),
             "complete": end.fault is None,
             **finish_run(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             "frames_received": newest.received,

@@ -13,6 +13,7 @@ from gavo_jax.cli.selection import (
     choose_settings,
     open_sequence,
     settings_line,
+    unchanged_preset,
     with_shortcuts,
     with_whole_paths,
 )
@@ -182,6 +183,7 @@ def _track(
     tracked = track_visibly(name, sequence, odometry, on_step, viewer, mapper)
     if tracked.interrupted:
         folder.save_checkpoint()
+        say("The same command with --resume goes on from there.")
     outcome = interruptible(
         lambda: finish_run(
             float(sequence.timestamps[0]),
@@ -198,7 +200,7 @@ def _track(
         write_loops(folder.path, outcome.loops)
         viewer.show_corrected(outcome.trajectory, outcome.loops)
     metrics = {
-        **run_identity(sequence.name, options.method, options.preset, options.seed),
+        **run_identity(sequence.name, options.method, unchanged_preset(options), options.seed),
         "complete": len(outcome.steps) == len(sequence) - 1,
         "left_out": left_out(sequence),
         **outcome.figures,

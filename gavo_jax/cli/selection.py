@@ -83,6 +83,14 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
 
+def unchanged_preset(search: SearchOptions) -> str | None:
+    """The name of the preset whose settings are the ones that the options say; None where `--set` or a file has changed
+    one.
+    """
+    method, preset, settings = choose_settings(search)
+    return preset if settings == presets.preset(method, preset) else None
+
+
 FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_scale", "rate", "moving", "seed")
 """Options of a run that are no settings."""
 

@@ -1,12 +1,16 @@
 """Losses: what a residual costs."""
 
 from collections.abc import Callable
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 
+from gavo_jax.errors import line_of
+
 Loss = Callable[[jax.Array], jax.Array]
-"""A cost of the squared normalised residual s = (r/σ)², never negative. Any callable of arrays will do."""
+"""A cost of the squared normalised residual s = (r/σ)², never negative: any function with a finite derivative.
+A population searches without it; the last step, the covariance and the status take it."""
 
 
 def l2(s: jax.Array) -> jax.Array:
@@ -39,6 +43,25 @@ def geman_mcclure(s: jax.Array) -> jax.Array:
 def truncated(s: jax.Array) -> jax.Array:
     """min(s, 2.795²): squares up to 2.8 σ, constant beyond. A population needs no derivative there."""
     return jnp.minimum(s, 2.795**2)
+
+
+@cache
+def fault_of_loss(loss: Loss) -> str:
+    """Why a function is no loss, in words that go on from its name; empty where it is one."""
+    if loss in LOSSES.values():
+        return ""
+    s = jnp.array([0.0, 0.5, 4.0, 1e4], jnp.float32)
+    try:
+        value, slope = jax.jit(lambda s: jax.jvp(loss, (s,), (jnp.ones_like(s),)))(s)
+    except Exception as error:  # somebody else's code may fail in any way
+        return f"cannot be used: {line_of(error)}"
+    if value.shape != s.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+        return "must return as many real numbers as it is given"
+    if not jnp.isfinite(value).all():
+        return "must be finite, from 0 on"
+    if not jnp.isfinite(slope).all():
+        return "must have a finite derivative, at 0 too: covariance and status take it"
+    return ""
 
 
 LOSSES: dict[str, Loss] = {

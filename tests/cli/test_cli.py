@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
+import cv2
 import numpy as np
 import pytest
 from command import GENETIC, Done, runner
@@ -228,7 +229,7 @@ def test_interrupted_run_keeps_what_is_done(gavo, clip, tmp_path, monkeypatch):
     done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
     assert done.status == 130 and "Traceback" not in done.err
     metrics = read_json(tmp_path / "out" / "metrics.json")
-    assert metrics["frames"] == 3 and metrics["complete"] is False
+    assert metrics["frames"] == 3 and metrics["complete"] is False and "--resume goes on from there" in done.out
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.txt")) == 3
 
 
@@ -459,6 +460,32 @@ def test_align_needs_a_camera_and_a_likely_unit(gavo, clip):
     (clip / "intrinsics.txt").write_text(f"{CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy}\n")
     assert is_refused(gavo("align", rgb, depth, rgb, depth, "--depth-scale", 1), str(depth), "--force")
     assert is_refused(gavo("align", rgb, depth, rgb, depth, "--depth-scale", 0), "--depth-scale", "0.001")
+
+
+def test_align_does_not_mix_floats_and_whole_numbers(gavo, clip):
+    """The other image's median was told of the one in metres; with the unit that was proposed the motion was wrong."""
+    rgb, depth = images(clip, "rgb"), images(clip, "depth")
+    raw = cv2.imread(str(depth[1]), cv2.IMREAD_UNCHANGED)
+    assert raw is not None
+    np.save(clip / "depth.npy", raw / np.float32(CAMERA.depth_scale))
+    for pair in ((depth[0], clip / "depth.npy"), (clip / "depth.npy", depth[0])):
+        done = gavo("align", rgb[0], pair[0], rgb[1], pair[1])
+        assert is_refused(done, f"{depth[0]}: depth in whole numbers, and in floats in {clip / 'depth.npy'}")
+
+
+def test_align_says_which_images_unit_is_doubted(gavo, clip):
+    rgb, depth = images(clip, "rgb"), images(clip, "depth")
+    raw = cv2.imread(str(depth[1]), cv2.IMREAD_UNCHANGED)
+    assert raw is not None
+    depth[1].write_bytes(cv2.imencode(".png", raw // 50)[1].tobytes())
+    assert is_refused(gavo("align", rgb[0], depth[0], rgb[1], depth[1]), f"{depth[1]}: depth with depth_scale")
+
+
+def test_a_run_of_changed_settings_is_none_of_a_preset(gavo, clip, tmp_path, undrawn):
+    for more, preset in (((), "default"), (("--set", "solver.patience=7"), None), (("--bodies", "off"), "default")):
+        command = ("run", clip, "--camera", clip / "camera.toml", *FAST, "--frames", 3, "--output", tmp_path / "out")
+        assert gavo(*command, *more).status == 0
+        assert read_json(tmp_path / "out" / "metrics.json")["preset"] == preset
 
 
 def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, clip):

@@ -45,7 +45,7 @@ class NeuralScene(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """By their images' numbers, or in order where there are as many as images."""
+        """Poses by the numbers of their images, or in order where there are as many as images."""
         file = path / cls.POSES
         rows = in_order(file, cls.find(path).color) if file.is_file() else ()
         found = {number: pose_of(place, row) for number, place, row in rows}

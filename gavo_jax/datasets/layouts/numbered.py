@@ -355,7 +355,7 @@ class Open3DFolder(PlainFolder):
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:
-        """By the rate that Open3D's reader of RealSense recordings writes beside the intrinsics."""
+        """Times by the rate that Open3D's reader of RealSense recordings writes beside the intrinsics."""
         file = cls._intrinsics(path)
         assert file is not None
         return by_rate(told_in(file).get("fps"))
