@@ -16,7 +16,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
-from gavo_jax.datasets.depth_unit import PLAUSIBLE
+from gavo_jax.datasets.depth_unit import DEPTH_RANGE, PLAUSIBLE
 from gavo_jax.status import AlignmentStatus
 
 
@@ -104,9 +104,6 @@ not, from which on a part of the image stands still. Half of a real image has 0.
 and 0.11 where they are rendered without noise."""
 MIN_SEEN = 40
 """Such pixels, of some 1200, that are needed to tell."""
-DEPTH_RANGE = (0.4, 15.0)
-"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
-without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
 MIN_FAR = 0.8
 """Metres: the highest of the quantiles, for units to be known; read as fifths, millimetres are that from 4 m on."""
 MAX_INTERVAL_RATIO = 2.5

@@ -9,7 +9,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.depth_unit import fault_of_scale, name_of_unit
+from gavo_jax.datasets.depth_unit import doubt_of_scale, fault_of_scale, name_of_unit
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame, some_of
 from gavo_jax.status import AlignmentStatus
@@ -47,6 +47,12 @@ def left_out(sequence: Sequence) -> list[str]:
     return list(getattr(sequence, "left_out", ()))
 
 
+def left_out_in_short(sequence: Sequence) -> str | None:
+    """How much of the source makes no frame, in a line; None where all does."""
+    counts = ", ".join(line.partition(": ")[0] for line in left_out(sequence))
+    return f"left out: {counts}" if counts else None
+
+
 def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: None) -> Facts:
     """Look at every frame and return what there is to know, as JSON has it; see docs/sources.md for the names.
 
@@ -68,7 +74,7 @@ def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: 
         **_times(stamps),
         "delay_of_depth_ms": looked["delay"],
         "image": looked["image"],
-        "depth": looked["depth"] | {"fault": fault_of_scale(sequence)},
+        "depth": looked["depth"] | {"fault": fault_of_scale(sequence), "doubt": doubt_of_scale(sequence)},
         "camera": _camera(sequence.camera),
         "recorded_camera": _recorded(sequence),
         "ground_truth": _truth(sequence, stamps),

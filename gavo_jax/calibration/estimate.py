@@ -310,7 +310,7 @@ def _depth_scale(sequence: Sequence) -> Found:
     scale = sample.kinect_scale
     common = min(COMMON, key=lambda other: abs(np.log(scale / other)))
     if abs(scale / common - 1) < SNAP:
-        why = f"steps of depth, as of a first Kinect, say {scale:.0f}: the common unit next to it"
+        why = f"the common unit nearest to {scale:.0f}, which the steps of depth say, as of a first Kinect"
         return Found(common, None, unit, why)
     return Found(scale, STEPS_DEVIATION * scale, unit, "steps of depth, as of a first Kinect")
 

@@ -16,7 +16,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
 from gavo_jax.errors import GavoError, tell
-from gavo_jax.inspection import summary
+from gavo_jax.inspection import left_out_in_short, summary
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import (
@@ -111,6 +111,8 @@ def compare(options: Compare) -> int:
         remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
         remove_figures(folder)
         say(summary(sequence))
+        if line := left_out_in_short(sequence):
+            say(f"{line}; gavo inspect says why")
         entries, status = _run_methods(options, methods, sequence, peers, folder)
         planned = sum(1 if method in PEERS else options.seeds for method in methods)
         cut_short = f"interrupted: {len(entries)} of {planned} runs were done" if status == INTERRUPTED else ""

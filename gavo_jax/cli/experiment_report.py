@@ -132,7 +132,7 @@ def _notes(
     if (states := len({_state(row) for row in rows})) > 1:
         notes.append(f"The rows come from {states} versions of the software or of what it uses.")
     if others:
-        notes.append(f"{len(others)} of {len(rows)} runs are none of the experiment's as its file is now.")
+        notes.append(f"{len(others)} of {len(rows)} runs are of earlier versions of the experiment's file.")
     return notes
 
 

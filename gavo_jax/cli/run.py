@@ -24,7 +24,7 @@ from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import tell
 from gavo_jax.evaluation import is_w_first
-from gavo_jax.inspection import left_out, summary
+from gavo_jax.inspection import left_out, left_out_in_short, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.mapping.mapper import Mapper
@@ -91,9 +91,8 @@ def run(options: Run) -> int:
             else:
                 _go_on(progress, sequence, odometry, folder, viewer, mapper)
             say(summary(sequence))
-            if lines := left_out(sequence):
-                counts = ", ".join(line.partition(": ")[0] for line in lines)
-                say(f"left out: {counts}; metrics.json says why (left_out)")
+            if line := left_out_in_short(sequence):
+                say(f"{line}; metrics.json says why (left_out)")
             if line := settings_line(options):
                 say(line)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)

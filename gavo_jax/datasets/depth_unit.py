@@ -43,6 +43,10 @@ KINECT_VIEW = (0.76, 0.93)
 PLAUSIBLE = (0.15, 150.0)
 """Metres: a median depth outside is hardly that of a scene."""
 
+DEPTH_RANGE = (0.4, 15.0)
+"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
+without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
+
 USUAL = (0.2, 10.0)
 """Metres: a median depth that a unit has to lead to if it is to be proposed for one that is not plausible."""
 
@@ -143,6 +147,18 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
         f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
         f"{name_of_unit(better)}: set --depth-scale {better:g}"
     )
+
+
+def doubt_of_scale(sequence: FrameSequence) -> str | None:
+    """What another common unit would make of depth that is nearer or farther than is usual; None where it is not."""
+    sample, scale = sample_sequence(sequence)
+    if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
+        return None
+    other = _most_usual(sample, [unit for unit in COMMON if unit != scale])
+    if other is None:
+        return None
+    as_it_is, in_other = (f"{sample.median / unit:.3g} m" for unit in (scale, other))
+    return f"a median of {as_it_is} is unusual; in {name_of_unit(other)} (--depth-scale {other:g}) it is {in_other}"
 
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:

@@ -134,8 +134,8 @@ def test_a_changed_experiment_is_told_apart_from_what_it_was(gavo, monkeypatch):
     assert now[label.format(0.003)][0] == "3" and now[label.format(0.002)][0] == "3" and now["opencv-rgb"][0] == "1"
     assert rows_of(earlier)[label.format(0.002)][0] == "3"
     assert f"{label.format(0.003)} / opencv-rgb" in done.out and "all sequences" not in done.out
-    assert "4 of 11 runs are none of the experiment's as its file is now" not in done.out
-    assert "7 of 11 runs are none of the experiment's as its file is now." in done.out
+    assert "4 of 11 runs are of earlier versions of the experiment's file" not in done.out
+    assert "7 of 11 runs are of earlier versions of the experiment's file." in done.out
     again = gavo("experiment", "report", "out")
     assert again.out.splitlines()[:3] == done.out[done.out.index("\nroom\n") + 1 :].splitlines()[:3]
 

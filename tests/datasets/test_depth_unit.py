@@ -1,5 +1,6 @@
 """Depth scales that are wrong by 5 or 1000 are noticed; right ones never are, near or far."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 from written_folders import CAMERA, LAYOUTS, METRES, image, kinect, raw
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.depth_unit import better_scale, sample_depth
+from gavo_jax.datasets.depth_unit import better_scale, doubt_of_scale, sample_depth
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.rendered.sensor_noise import KINECT
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.datasets.selection import open_part
@@ -98,6 +101,16 @@ def test_metres_read_as_millimetres():
     assert proposed(metres, 1000.0, FR1, True) == 1
     assert proposed(metres, 1.0, FR1, True) is None
     assert sample_depth([np.zeros((4, 4), np.uint16)]) is None
+
+
+@pytest.mark.parametrize(("scale", "words"), [(5000.0, r"in millimetres \(--depth-scale 1000\) it is"), (1000.0, None)])
+def test_a_depth_that_is_unusually_near_is_set_beside_another_unit(tmp_path, scale, words):
+    """It was only said to be `depth_units`, of each frame."""
+    for i, metres in enumerate(METRES):
+        image(tmp_path / f"rgb/{i}.png", np.full((120, 160), 99, np.uint8))
+        image(tmp_path / f"depth/{i}.png", raw(0.5 * metres, 1000))
+    doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA, depth_scale=scale)))
+    assert doubt is None if words is None else doubt and re.search(words, doubt)
 
 
 def test_a_wrong_scale_is_refused_in_one_line_unless_forced(tmp_path):
