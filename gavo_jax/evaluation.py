@@ -287,7 +287,7 @@ def _relative_pose_error(
     )
 
 
-def rotation_angle(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
     """Return the angle of rotation matrices in radians, 0 to π, exact for small ones too (where arccos is not)."""
     skew = rotation - np.swapaxes(rotation, -1, -2)
     sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)

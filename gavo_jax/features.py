@@ -10,10 +10,10 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float64, UInt8, UInt16
+from jaxtyping import Float, Float64, UInt8
 
 from gavo_jax.camera import Camera
-from gavo_jax.image.numbers import grey_bytes
+from gavo_jax.image.numbers import Depth, grey_bytes
 
 FeatureKind = Literal["sift", "orb"]
 
@@ -63,9 +63,7 @@ def _detector(kind: FeatureKind) -> Any:
     return cv2.ORB.create(nfeatures=KEYPOINTS)
 
 
-def detect(
-    grey: UInt8[np.ndarray, "h w"], depth: UInt16[np.ndarray, "h w"], camera: Camera, kind: FeatureKind = "sift"
-) -> Features:
+def detect(grey: UInt8[np.ndarray, "h w"], depth: Depth, camera: Camera, kind: FeatureKind = "sift") -> Features:
     """Find the keypoints of a frame without lens distortion.
 
     Args:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float64, UInt8, UInt16
+from jaxtyping import Float, Float64, UInt8
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.motion_compensation import filled_inverse_depth
-from gavo_jax.image.numbers import grey_bytes
+from gavo_jax.image.numbers import Depth, grey_bytes
 
 MOST = 500
 """Most corners of a frame; the strongest ones count."""
@@ -42,7 +42,7 @@ class Matches(NamedTuple):
 
 
 def track_corners(
-    reference: tuple[UInt8[np.ndarray, "h w"], UInt16[np.ndarray, "h w"]],
+    reference: tuple[UInt8[np.ndarray, "h w"], Depth],
     target: UInt8[np.ndarray, "h w"],
     target_T_reference: Float[np.ndarray, "4 4"],
     camera: Camera,

@@ -11,12 +11,13 @@ from typing import NamedTuple
 import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float64, UInt8
 
 from gavo_jax.alignment.corners import track_corners
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.motion_compensation import filled_inverse_depth, pixel_flow
+from gavo_jax.image.numbers import Depth
 from gavo_jax.image.shutter import row_time
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit, gravest
@@ -36,7 +37,7 @@ ROUNDS = 8
 LOOKS = 3
 """Rounds after each of which depth is looked up anew."""
 
-Images = tuple[UInt8[np.ndarray, "h w"], UInt16[np.ndarray, "h w"]]
+Images = tuple[UInt8[np.ndarray, "h w"], Depth]
 
 
 class OwnMotion(NamedTuple):
@@ -110,7 +111,7 @@ class _Side(NamedTuple):
     pixels: Float64[np.ndarray, "n 2"]
     seconds: Float64[np.ndarray, " n"]
     """After the frame's moment, by the row."""
-    depth: UInt16[np.ndarray, "h w"]
+    depth: Depth
     usual: Float[np.ndarray, " n"]
     """1/z [1/m] about each corner."""
     camera: Camera

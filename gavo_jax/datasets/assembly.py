@@ -13,9 +13,10 @@ from jaxtyping import Float, Shaped, UInt16
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.base import Frame, FrameError
-from gavo_jax.datasets.images import NO_READING, to_8_bits, white_of, without_invalid
+from gavo_jax.datasets.images import to_8_bits, white_of, without_invalid
 from gavo_jax.datasets.registration import Registration
 from gavo_jax.errors import GavoError, GavoWarning
+from gavo_jax.image.numbers import NO_READING, Depth
 
 FINE, COARSE = 5000.0, 1000.0
 """Units per metre of frames whose files hold floats: the finer as long as it reaches far enough."""
@@ -68,7 +69,7 @@ def recorded_as(sequence: Any) -> dict[str, Any]:
 class DepthImage(NamedTuple):
     """Raw depth with a name for messages."""
 
-    raw: UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
+    raw: Depth
     name: str
 
 

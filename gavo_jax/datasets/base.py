@@ -6,11 +6,11 @@ from typing import Any, Protocol, overload
 
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, UInt8
 
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.errors import GavoError
-from gavo_jax.image.numbers import is_real
+from gavo_jax.image.numbers import Depth, is_real
 from gavo_jax.trajectory import Trajectory
 
 
@@ -116,7 +116,7 @@ class Frame:
     """
 
     grey: UInt8[np.ndarray, "height width"]
-    depth: UInt16[np.ndarray, "height width"]
+    depth: Depth
     timestamp: float
     color: UInt8[np.ndarray, "height width 3"] | None = None
     depth_timestamp: float | None = None

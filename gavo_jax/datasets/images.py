@@ -18,6 +18,7 @@ from jaxtyping import Float, Shaped, UInt8, UInt16
 from gavo_jax.camera import MAX_SIDE
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
+from gavo_jax.image.numbers import NO_READING, Depth
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
 """Endings of colour images that are looked for in a folder; a file that is named may have any."""
@@ -45,9 +46,6 @@ JPEG_LOSS = re.compile(
 )
 """In those of its words that tell of pixels that are not the camera's; some bytes too many at the end, as many cameras
 leave them there, do not."""
-
-NO_READING = 65535
-"""Raw depth of 16 bits that stands for none, as 0 does: the largest number that there is."""
 
 SIGN = 128
 """From which on the highest byte of a float says that it is negative."""
@@ -81,7 +79,7 @@ def decode_color(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | UInt16[
     return image
 
 
-def read_depth(path: str | Path) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]:
+def read_depth(path: str | Path) -> Depth:
     """Return raw depth, as it stands in the file: whole numbers of 16 bits, or float32 for all else.
 
     What is no reading (0, 65535, negative, NaN, infinity) is left as it is: see `without_invalid`.
@@ -93,7 +91,7 @@ def read_depth(path: str | Path) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray
     return decode_depth(read_bytes(path), str(path))
 
 
-def decode_depth(data: bytes, name: str) -> UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]:
+def decode_depth(data: bytes, name: str) -> Depth:
     """`read_depth` of a file's content; `name` stands in messages."""
     if data.startswith(NPY_SIGNATURE):
         image = _decode_npy(data, name)
@@ -143,7 +141,7 @@ def white_of(image: Shaped[np.ndarray, "h w *channels"]) -> int:
     return next(white for white in WHITES if most <= white)
 
 
-def without_invalid(depth: UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]) -> np.ndarray:
+def without_invalid(depth: Depth) -> np.ndarray:
     """Return raw depth with 0 where there is no reading: 0, 65535 (of 16 bits), negative, NaN, infinity."""
     if depth.dtype == np.uint16:
         return cv2.threshold(depth, NO_READING - 1, 0, cv2.THRESH_TOZERO_INV)[1] if depth.max() == NO_READING else depth

@@ -15,7 +15,7 @@ from gavo_jax.image.pyramid import Atlas
 from gavo_jax.image.warp import Warped
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
-"""1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a hundredth of the sensor's noise."""
+"""1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a twentieth of a first Kinect's steps."""
 SAME_SURFACE = 0.1
 """Neighbouring readings of inverse depth that differ by less than this share are of one surface."""
 SLOPE_STEP = 1.0 / 4096.0

@@ -14,22 +14,22 @@ from gavo_jax.image.levels import ImagePlane
 
 
 class Points(NamedTuple):
-    """Points of the reference frame as inverse-depth rays: P⁻¹(p) = (x, y, 1)/q. Flat arrays of N."""
+    """Points of the reference frame as inverse-depth rays: P⁻¹(p) = (x, y, 1)/q. Arrays of any shape."""
 
-    x: Float[Array, " n"]
-    y: Float[Array, " n"]
-    q: Float[Array, " n"]
+    x: Float[Array, "*n"]
+    y: Float[Array, "*n"]
+    q: Float[Array, "*n"]
     """Inverse depth, 1/m; 0 marks a point without a reading."""
 
 
 class Warped(NamedTuple):
     """Reference points seen by the target camera, all at one moment."""
 
-    u: Float[Array, " n"]
-    v: Float[Array, " n"]
-    inverse_depth: Float[Array, " n"]
+    u: Float[Array, "*n"]
+    v: Float[Array, "*n"]
+    inverse_depth: Float[Array, "*n"]
     """1/z in the target camera, 1/m."""
-    inside: Float[Array, " n"]
+    inside: Float[Array, "*n"]
     """1 where the point has a reading, lies before the camera and inside the image, else 0."""
 
 

@@ -31,7 +31,7 @@ def _t_scales(residual: Float[Array, "c n"], mask: Float[Array, "c n"]) -> Float
 SMALLEST_GREY_SCALE = 0.5
 """Grey levels: rounding alone leaves 0.3."""
 SMALLEST_DEPTH_SCALE = 5e-4
-"""1/m: a tenth of the quantisation of a structured-light sensor."""
+"""1/m: a sixth of the quantisation of a structured-light sensor."""
 
 
 def _independent_share(
