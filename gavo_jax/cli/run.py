@@ -207,7 +207,10 @@ def _track(
     folder.finish(metrics, complete=not tracked.interrupted)
 
     def draw_figures() -> None:
-        draw(folder.path, {options.method: outcome.trajectory}, sequence.ground_truth)
+        curves = {options.method: outcome.trajectory}
+        if outcome.odometry is not None:
+            curves = {f"{options.method} with loops": outcome.trajectory, "odometry": outcome.odometry}
+        draw(folder.path, curves, sequence.ground_truth, list(curves)[:1])
         draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
     with waiting("drawing figures …"):

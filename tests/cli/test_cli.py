@@ -20,7 +20,7 @@ from small import CAMERA
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
-from gavo_jax.cli import compare, options, view
+from gavo_jax.cli import compare, options, run, view
 from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.cli.usage import COMMANDS
 from gavo_jax.datasets.layouts.tum_writing import write_tum
@@ -128,11 +128,14 @@ def test_run_writes_its_files(gavo, pristine, tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path):
+def test_run_with_loops_writes_both_trajectories(gavo, pristine, tmp_path, monkeypatch):
     pytest.importorskip("gtsam")
     out, camera = tmp_path / "out", ("--camera", pristine / "camera.toml")
     command = ("run", pristine, *camera, "--output", out, *FAST, "--loops")
+    drawn: dict[str, Trajectory] = {}
+    monkeypatch.setattr(run, "draw", lambda _folder, curves, *_: drawn.update(curves))
     assert gavo(*command).status == 0
+    assert list(drawn) == ["gauss-newton with loops", "odometry"]
     metrics = read_json(out / "metrics.json")
     assert {"odometry_rpe_translation_rmse_m_per_s", "odometry_ate_translation_rmse_m", "loops"} <= set(metrics)
     assert len(Trajectory.read_tum(out / "trajectory.txt")) == len(Trajectory.read_tum(out / "odometry.txt")) == 36
