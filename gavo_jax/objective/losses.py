@@ -1,6 +1,6 @@
 """Losses: what a residual costs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache
 
 import jax
@@ -45,11 +45,16 @@ def truncated(s: jax.Array) -> jax.Array:
     return jnp.minimum(s, 2.795**2)
 
 
-@cache
 def fault_of_loss(loss: Loss) -> str:
     """Why a function is no loss, in words that go on from its name; empty where it is one."""
-    if loss in LOSSES.values():
-        return ""
+    if not isinstance(loss, Hashable):
+        return "must be hashable: a program is compiled for each loss"
+    return "" if loss in LOSSES.values() else _fault_of_values(loss)
+
+
+@cache
+def _fault_of_values(loss: Loss) -> str:
+    """What is wrong with what a function returns."""
     s = jnp.array([0.0, 0.5, 4.0, 1e4], jnp.float32)
     try:
         value, slope = jax.jit(lambda s: jax.jvp(loss, (s,), (jnp.ones_like(s),)))(s)

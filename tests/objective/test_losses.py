@@ -27,6 +27,15 @@ def test_a_loss_is_its_argument_near_zero_and_never_falls(loss: str) -> None:
     assert np.all(np.isfinite(jax.jit(jax.vmap(jax.grad(LOSSES[loss])))(s)))
 
 
+class Unhashable:
+    """A loss that holds what may change."""
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __call__(self, s: jax.Array) -> jax.Array:
+        return s
+
+
 @pytest.mark.parametrize(
     ("loss", "words"),
     [
@@ -38,6 +47,7 @@ def test_a_loss_is_its_argument_near_zero_and_never_falls(loss: str) -> None:
         (lambda s: np.sqrt(s), "cannot be used: "),
         (lambda s: jax.pure_callback(np.abs, s, s), "cannot be used: Pure callbacks do not support JVP"),
         (lambda: 0, "cannot be used: "),
+        (Unhashable(), "must be hashable"),
     ],
 )
 def test_what_is_no_loss_is_told_before_anything_is_compiled(loss: Any, words: str) -> None:
