@@ -42,6 +42,8 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines += [(f"of these, {count} {status}", NOTES[status]) for status, count in facts["frames_doubted"].items()]
     lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
     lines += _recorded(facts["recorded_camera"], facts["camera"])
+    if not facts["camera"]["readout"]:
+        lines.append(("shutter", "all rows are taken as exposed at once; gavo calibrate finds whether they are"))
     lines += [("depth", _depth(facts))]
     if fault := facts["depth"]["fault"]:
         lines.append(("depth scale", f"WRONG? {fault}"))
