@@ -87,22 +87,32 @@ MEANINGS = {
 """What the columns that are shown are."""
 
 
-class Entry(NamedTuple):
-    """One run of one method."""
+class Contender(NamedTuple):
+    """Who is compared."""
 
+    label: str
+    """As it was asked for: `ga`, or `ga:fast` for a preset of its own."""
     method: str
+    preset: str | None
+    """None of another library's."""
+
+
+class Entry(NamedTuple):
+    """One run of one contender."""
+
+    label: str
     metrics: dict[str, Any]
     trajectory: Trajectory
 
 
 def compare(options: Compare) -> int:
     """Run the methods one after the other; write comparison.json, trajectories and figures; print a table."""
-    methods = _parse_methods(options.methods, options.preset)
+    contenders = _parse_methods(options.methods, options.preset)
     if not 1 <= options.seeds <= MAX_SEED:
         raise GavoError(f"--seeds: must be from 1 to {MAX_SEED}, not {options.seeds}")
     sequence = open_sequence(options)
     be_ready()
-    peers = {name: peer_odometry(name, sequence.camera) for name in methods if name in PEERS}
+    peers = {one.method: peer_odometry(one.method, sequence.camera) for one in contenders if one.preset is None}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):
         refuse_foreign(folder, FRAMES, "a run")
@@ -113,8 +123,8 @@ def compare(options: Compare) -> int:
         say(summary(sequence))
         if line := left_out_in_short(sequence):
             say(f"{line}; gavo inspect says why")
-        entries, status = _run_methods(options, methods, sequence, peers, folder)
-        planned = sum(1 if method in PEERS else options.seeds for method in methods)
+        entries, status = _run_contenders(options, contenders, sequence, peers, folder)
+        planned = sum(1 if contender.preset is None else options.seeds for contender in contenders)
         cut_short = f"interrupted: {len(entries)} of {planned} runs were done" if status == INTERRUPTED else ""
         _write(options, sequence, entries, folder, cut_short)
         if cut_short:
@@ -126,24 +136,25 @@ def compare(options: Compare) -> int:
 def _earlier_trajectories(folder: Path) -> list[str]:
     """Names of the trajectories that an earlier comparison left, of whatever methods and seeds."""
     methods = "|".join(map(re.escape, (*presets.methods(), *PEERS)))
-    return [path.name for path in folder.iterdir() if re.fullmatch(rf"({methods})(-seed\d+)?\.txt", path.name)]
+    form = rf"({methods})(-({'|'.join(presets.PRESETS)}))?(-seed\d+)?\.txt"
+    return [path.name for path in folder.iterdir() if re.fullmatch(form, path.name)]
 
 
-def _run_methods(
-    options: Compare, methods: list[str], sequence: Sequence, peers: dict[str, Odometry], folder: Path
+def _run_contenders(
+    options: Compare, contenders: list[Contender], sequence: Sequence, peers: dict[str, Odometry], folder: Path
 ) -> tuple[list[Entry], int]:
-    """Run the methods one after the other, each with its seeds; return what came of them, and the exit status.
+    """Run them one after the other, each with its seeds; return what came of them, and the exit status.
 
     Raises:
         KeyboardInterrupt: the user stopped it before the first run was done.
     """
     entries: list[Entry] = []
     try:
-        for method in methods:
-            for seed in range(options.seeds) if method not in PEERS else (None,):
-                entry = _run_method(sequence, method, options.preset, seed, peers.get(method))
+        for contender in contenders:
+            for seed in range(options.seeds) if contender.preset is not None else (None,):
+                entry = _run_contender(sequence, contender, seed, peers.get(contender.method))
                 suffix = "" if seed is None or options.seeds == 1 else f"-seed{seed}"
-                entry.trajectory.write_tum(folder / f"{method}{suffix}.txt")
+                entry.trajectory.write_tum(folder / f"{contender.label.replace(':', '-')}{suffix}.txt")
                 entries.append(entry)
     except KeyboardInterrupt:
         if not entries:
@@ -192,62 +203,69 @@ def _print(title: str, rows: list[list[Any]], seeds: int, cost: str) -> None:
 
 def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder: Path) -> list[Picture]:
     """Write the figures, where matplotlib is installed."""
-    estimates = {entry.method: entry.trajectory for entry in typical}
+    estimates = {entry.label: entry.trajectory for entry in typical}
     ours = [name for name in estimates if name not in PEERS]
     pictures = draw(folder, estimates, sequence.ground_truth, ours)
     drifts = _drifts(entries)
     if plots.available() and drifts:
-        figure = plots.plot_drift({sequence.name: drifts}, presets.methods())
+        figure = plots.plot_drift({sequence.name: drifts}, ours)
         pictures.append(save_figure(figure, folder, "drift"))
     return pictures
 
 
-def _parse_methods(text: str, preset: str) -> list[str]:
-    """Return the names between the commas; raise GavoError for one that is unknown, repeated or without the preset."""
-    names = [name.strip() for name in text.split(",")]
-    known = (*presets.methods(), *PEERS)
-    for name in names:
-        if name not in known:
-            hint = "; the preset is said once, by --preset" if name.partition(":")[0] in known else ""
-            raise GavoError(
-                f"--methods: unknown method {name!r}: not one of {', '.join((*presets.usable_methods(), *PEERS))}{hint}"
-            )
-        if names.count(name) > 1:
-            raise GavoError(f"--methods: {name} is given twice")
-        if name not in PEERS:
-            presets.preset(name, preset)
-    return names
+def _parse_methods(text: str, preset: str) -> list[Contender]:
+    """Return the methods between the commas, each with the preset or, after a colon, one of its own.
+
+    Raises:
+        GavoError: one is unknown, repeated or without the preset.
+    """
+    found: list[Contender] = []
+    for label in (name.strip() for name in text.split(",")):
+        method, colon, own = label.partition(":")
+        if method not in (*presets.methods(), *PEERS):
+            known = ", ".join((*presets.usable_methods(), *PEERS))
+            raise GavoError(f"--methods: unknown method {method!r}: not one of {known}")
+        if method in PEERS and colon:
+            raise GavoError(f"--methods: {label}: another library's method has no preset")
+        contender = Contender(label, method, None if method in PEERS else own if colon else preset)
+        if contender[1:] in [earlier[1:] for earlier in found]:
+            raise GavoError(f"--methods: {label} is given twice")
+        if contender.preset is not None:
+            presets.preset(method, contender.preset)
+        found.append(contender)
+    return found
 
 
-def _run_method(sequence: Sequence, method: str, preset_name: str, seed: int | None, peer: Odometry | None) -> Entry:
-    """Run one method once; a peer has neither preset nor seed.
+def _run_contender(sequence: Sequence, contender: Contender, seed: int | None, peer: Odometry | None) -> Entry:
+    """Run one of them once; a peer has no seed.
 
     Raises:
         KeyboardInterrupt: the user stopped it; an unfinished run is not compared.
     """
-    if peer is None:
+    label, method, preset_name = contender
+    if preset_name is not None:
         odometry = Odometry(sequence.camera, presets.preset(method, preset_name), seed=seed or 0)
     else:
+        assert peer is not None
         odometry = peer
-    label = method if seed is None else f"{method}, seed {seed}"
-    tracked = track_visibly(label, sequence, odometry)
+    tracked = track_visibly(label if seed is None else f"{label}, seed {seed}", sequence, odometry)
     if tracked.interrupted:
         raise KeyboardInterrupt
     outcome = tracked.outcome(sequence)
     metrics = {
-        **run_identity(sequence.name, method, None if peer else preset_name, seed),
+        **run_identity(sequence.name, method, preset_name, seed),
         **outcome.figures,
         "versions": make_peer(method, sequence.camera).versions if peer else environment(),
     }
-    return Entry(method, metrics, outcome.trajectory)
+    return Entry(label, metrics, outcome.trajectory)
 
 
 def _typical_runs(entries: list[Entry]) -> list[Entry]:
-    """Return for each method its run of median drift (the better of the two middle ones), in the methods' order."""
-    by_method: dict[str, list[Entry]] = {}
+    """Return for each contender its run of median drift (the better of the two middle ones), in their order."""
+    by_label: dict[str, list[Entry]] = {}
     for entry in entries:
-        by_method.setdefault(entry.method, []).append(entry)
-    return [_median(runs) for runs in by_method.values()]
+        by_label.setdefault(entry.label, []).append(entry)
+    return [_median(runs) for runs in by_label.values()]
 
 
 def _median(runs: list[Entry]) -> Entry:
@@ -258,13 +276,13 @@ def _median(runs: list[Entry]) -> Entry:
 
 
 def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
-    """Return translation (m/s) and rotation (deg/s) of every run, by method; empty where there is no truth."""
+    """Return translation (m/s) and rotation (deg/s) of every run, by contender; empty where there is no truth."""
     if any(entry.metrics[DRIFT] is None for entry in entries):
         return {}
     runs: dict[str, list[list[float]]] = {}
     for entry in entries:
-        runs.setdefault(entry.method, []).append([entry.metrics[DRIFT], entry.metrics[ROTATION_DRIFT]])
-    return {method: np.array(values) for method, values in runs.items()}
+        runs.setdefault(entry.label, []).append([entry.metrics[DRIFT], entry.metrics[ROTATION_DRIFT]])
+    return {label: np.array(values) for label, values in runs.items()}
 
 
 def _shown(metrics: dict[str, Any], key: str) -> float | None:
@@ -282,12 +300,12 @@ def _versions(entries: list[Entry]) -> dict[str, str]:
 def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
     rows = []
     for run in typical:
-        drifts = [entry.metrics[DRIFT] for entry in entries if entry.method == run.method]
+        drifts = [entry.metrics[DRIFT] for entry in entries if entry.label == run.label]
         known = [drift for drift in drifts if drift is not None]
         cells = [number(_shown(run.metrics, key), digits) for _, key, digits in COLUMNS]
         span = [number(extreme(known, default=None)) for extreme in (min, max)]
         path, end = path_and_end(run.trajectory)
         is_all = run.metrics[DRIFT_PER_FRAME] is None
         of_path = [number(path), end or DASH] if is_all else [DASH] * len(OF_PATH)
-        rows.append([run.method, *of_path, *cells, len(drifts), *span])
+        rows.append([run.label, *of_path, *cells, len(drifts), *span])
     return rows

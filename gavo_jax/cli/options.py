@@ -132,11 +132,11 @@ class Compare(Source):
         arg(
             metavar="NAME,NAME,…",
             help="Methods of `gavo run` and odometries of other libraries, with commas between: "
-            f"{', '.join((*METHODS, *PEERS))}.",
+            f"{', '.join((*METHODS, *PEERS))}. A method may have a preset of its own: ga:fast.",
         ),
     ] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
     preset: PresetName = "default"
-    """Settings of the project's own methods."""
+    """Settings of the project's own methods, where none is named with one."""
     seeds: Annotated[int, arg(metavar="N")] = 1
     """Run each random method with seeds 0 to N - 1; table and figures show the run of median drift."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-compare-PRESET)")] = (

@@ -692,16 +692,36 @@ def test_a_method_that_the_settings_contradict_is_told(gavo, pristine, tmp_path)
     assert is_refused(gavo(*source, "--preset", "wide"), "--preset wide: ", "says fast")
 
 
+def test_presets_of_one_method_are_compared(gavo, pristine, tmp_path):
+    """A method of one's own, which has `default` alone, could not stand beside a preset of another one."""
+    arguments = ("compare", pristine, "--camera", pristine / "camera.toml", "--frames", 4, "--output", tmp_path / "out")
+    done = gavo(*arguments, "--preset", "fast", "--methods", "gauss-newton,gauss-newton:default")
+    assert done.status == 0, done.err
+    found = {(run["method"], run["preset"]) for run in read_json(tmp_path / "out" / "comparison.json")}
+    assert found == {("gauss-newton", "fast"), ("gauss-newton", "default")} and "gauss-newton:default" in done.out
+    names = {path.name for path in (tmp_path / "out").glob("*.txt")}
+    assert names == {"gauss-newton.txt", "gauss-newton-default.txt"}
+    for methods, words in (
+        ("gauss-newton:fast,gauss-newton", "--methods: gauss-newton is given twice"),
+        ("orb-pnp:fast", "orb-pnp:fast: another library's method has no preset"),
+        ("gauss-newton:slow", "'slow'"),
+        ("newton:fast", "unknown method 'newton'"),
+    ):
+        assert is_refused(gavo(*arguments, "--preset", "fast", "--methods", methods), words)
+    assert gavo(*arguments, "--methods", "orb-pnp").status == 0
+    assert {path.name for path in (tmp_path / "out").glob("*.txt")} == {"orb-pnp.txt"}
+
+
 def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch):
     """It printed its table and `files in`, as if it were whole."""
-    run_method = compare._run_method
+    run_contender = compare._run_contender
 
-    def interrupted(sequence, method, *rest):
-        if method == "opencv-rgb":
+    def interrupted(sequence, contender, *rest):
+        if contender.method == "opencv-rgb":
             raise KeyboardInterrupt
-        return run_method(sequence, method, *rest)
+        return run_contender(sequence, contender, *rest)
 
-    monkeypatch.setattr(compare, "_run_method", interrupted)
+    monkeypatch.setattr(compare, "_run_contender", interrupted)
     names = "opencv-rgbd,opencv-rgb,sift-pnp"
     arguments = ("compare", pristine, "--camera", pristine / "camera.toml", "--frames", 5, "--methods", names)
     done = gavo(*arguments, "--output", tmp_path / "out")

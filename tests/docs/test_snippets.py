@@ -127,7 +127,7 @@ def check_gavo(arguments: list[str]) -> None:
         if parsed.settings is None or parsed.settings.is_file():
             choose_settings(parsed)
     if isinstance(parsed, Compare):
-        assert set(parsed.methods.split(",")) <= {*presets.methods(), *PEERS}
+        assert {name.partition(":")[0] for name in parsed.methods.split(",")} <= {*presets.methods(), *PEERS}
     if isinstance(parsed, Download):
         folder_of(parsed.name)
     if isinstance(parsed, Inspect) and Path(parsed.sequence).is_dir():
