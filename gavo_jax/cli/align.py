@@ -14,7 +14,6 @@ from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
-from gavo_jax.datasets.assembly import DepthImage, refuse_mixed
 from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
 from gavo_jax.datasets.files import (
     Entry,
@@ -50,8 +49,6 @@ def align(options: Align) -> int:
     calibration, depth_scale = _cameras(options)
     pair = open_pair(images, calibration, Reading(depth_scale=depth_scale))
     (reference, target), camera = pair, pair.camera
-    if options.depth_scale is None:
-        refuse_mixed([DepthImage(pair.raw_depth(k), str(images[k][1])) for k in range(2)])
     if not options.force:
         faults = [
             (options.depth0, lack_of_depth(pair)),
@@ -121,7 +118,7 @@ def _cameras(options: Align) -> tuple[Calibration, float | None]:
         try:
             sequence = open_source(source, Reading(options.camera, options.depth_scale))
             if isinstance(sequence, FileSequence):
-                return sequence.calibration, sequence.depth_unit.file
+                return sequence.calibration.with_depth_scale(sequence.depth_unit.file), options.depth_scale
         except GavoError as error:  # what is wrong with its other frames is nothing to this pair
             fault = error
     size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])

@@ -68,7 +68,7 @@ def run_live(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **run_identity(device.name, method, unchanged_preset(options), options.seed),
+            **run_identity(device.name, method, unchanged_preset(settings, options), options.seed),
             "complete": end.fault is None,
             **finish_run(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
             "frames_received": newest.received,

@@ -199,7 +199,7 @@ def _track(
         write_loops(folder.path, outcome.loops)
         viewer.show_corrected(outcome.trajectory, outcome.loops)
     metrics = {
-        **run_identity(sequence.name, options.method, unchanged_preset(options), options.seed),
+        **run_identity(sequence.name, options.method, unchanged_preset(odometry.settings, options), options.seed),
         "complete": len(outcome.steps) == len(sequence) - 1,
         "left_out": left_out(sequence),
         **outcome.figures,

@@ -83,14 +83,6 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
 
-def unchanged_preset(search: SearchOptions) -> str | None:
-    """The name of the preset whose settings are the ones that the options say; None where `--set` or a file has changed
-    one.
-    """
-    method, preset, settings = choose_settings(search)
-    return preset if settings == presets.preset(method, preset) else None
-
-
 FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_scale", "rate", "moving", "seed")
 """Options of a run that are no settings."""
 
@@ -105,6 +97,12 @@ def with_shortcuts(settings: Settings, options: Run) -> Settings:
     if options.bodies is not None:
         odometry = replace(odometry, bodies=options.bodies)
     return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
+
+
+def unchanged_preset(settings: Settings, options: Run) -> str | None:
+    """The name of a run's preset; None where something else than an option of its own has changed its settings."""
+    unchanged = with_shortcuts(presets.preset(options.method, options.preset), options)
+    return options.preset if settings == unchanged else None
 
 
 def settings_line(options: Run) -> str | None:

@@ -87,24 +87,16 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
-    if given is None:
-        refuse_mixed(samples)
-    floats = any(map(_is_of_floats, clean))
+    kinds = [_is_of_floats(image) for image in clean]
+    whole, floats = (
+        [image.name for image, own in zip(samples, kinds, strict=True) if own is kind] for kind in (False, True)
+    )
+    if whole and floats and given is None:
+        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     file = given or _likely_unit(readings, calibration, samples[0].name if samples else "")
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
     return DepthUnit(file, FINE if far < FARTHEST_FINE else COARSE, True if floats and given is None else None)
-
-
-def refuse_mixed(samples: Iterable[DepthImage]) -> None:
-    """Raise GavoError where some depth images hold whole numbers and others do not: they may be in two units."""
-    names: dict[bool | None, str] = {}
-    for image in samples:
-        names.setdefault(_is_of_floats(without_invalid(image.raw)), image.name)
-    if False in names and True in names:
-        raise GavoError(
-            f"{names[False]}: depth in whole numbers, and in floats in {names[True]}: say --depth-scale, of both"
-        )
 
 
 def _is_of_floats(readings: np.ndarray) -> bool | None:
