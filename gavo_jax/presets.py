@@ -205,12 +205,12 @@ def names_of(settings: Settings) -> tuple[str | None, str | None]:
     known = {(method, name): _own(method, name) for method in METHODS for name in PRESETS}
     known |= {(method, "default"): own for method, own in _registered.items()}
     for names, one in known.items():
-        if _equal(one, settings):
+        if are_same(one, settings):
             return names
     return next((method for method in METHODS if type(settings.solver) is type(_DEFAULT[method])), None), None
 
 
-def _equal(one: Settings, other: Settings) -> bool:
+def are_same(one: Settings, other: Settings) -> bool:
     """Whether settings are the same, arrays among them included."""
     leaves, others = jax.tree.leaves(one), jax.tree.leaves(other)
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, leaves, others))

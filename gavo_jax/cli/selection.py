@@ -102,7 +102,7 @@ def with_shortcuts(settings: Settings, options: Run) -> Settings:
 def unchanged_preset(settings: Settings, options: Run) -> str | None:
     """The name of a run's preset; None where something else than an option of its own has changed its settings."""
     unchanged = with_shortcuts(presets.preset(options.method, options.preset), options)
-    return options.preset if settings == unchanged else None
+    return options.preset if presets.are_same(settings, unchanged) else None
 
 
 def settings_line(options: Run) -> str | None:

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camera_from_table, load_calibration
+from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camera_from_table
 from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_matrices
@@ -40,11 +40,8 @@ class ScanNetPlusPlus(NumberedFolder):
         return (path / cls.STAMPS).is_file() and all(plain_files(path))
 
     @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the frames' cameras have in common."""
-        size = size_of_most(entries)
-        if (file := own_camera_file(path)) is not None:
-            return load_calibration(file, size, MILLIMETRES)
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """What the frames' cameras have in common."""
         file = path / cls.STAMPS
         matrices = [frame["intrinsic"] for frame in _frames(file).values() if "intrinsic" in frame]
         return of_matrices(file, matrices, size, MILLIMETRES)
@@ -85,11 +82,8 @@ class ScannerApp(NumberedFolder):
         return file is not None and cls.POSE in read_text(file, MAX_JSON_BYTES) and all(plain_files(path))
 
     @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the frames' cameras have in common."""
-        size = size_of_most(entries)
-        if (file := own_camera_file(path)) is not None:
-            return load_calibration(file, size, MILLIMETRES)
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """What the frames' cameras have in common."""
         matrices = [matrix for _, matrix in cls._said(path, "intrinsics").values()]
         return of_matrices(path / cls.STAMPS, matrices, size, MILLIMETRES)
 
@@ -108,9 +102,10 @@ class ScannerApp(NumberedFolder):
     @classmethod
     def _said(cls, path: Path, key: str) -> dict[int, tuple[Path, Any]]:
         """What the frames' files say by a key, by the frames' numbers."""
-        files = {int(number): file for file in path.glob(cls.STAMPS) if (number := file.stem[6:]).isdecimal()}
-        found = {number: (file, read_json_object(file).get(key)) for number, file in sorted(files.items())}
-        return {number: (file, value) for number, (file, value) in found.items() if value is not None}
+        numbers = {file: file.stem.removeprefix("frame_") for file in sorted(path.glob(cls.STAMPS))}
+        written = tuple((file, file.stat().st_mtime_ns) for file, number in numbers.items() if number.isdecimal())
+        found = {file: said.get(key) for file, said in _read_files(written).items()}
+        return {int(numbers[file]): (file, value) for file, value in found.items() if value is not None}
 
 
 class Polycam(PlainFolder):
@@ -162,6 +157,12 @@ class Polycam(PlainFolder):
             if values and (pose := pose_of_rows(str(file), rows)) is not None:
                 poses[entry.stamp] = pose @ FLIP
         return by_stamp(poses) if poses else None, unread
+
+
+@lru_cache(maxsize=1)
+def _read_files(written: tuple[tuple[Path, int], ...]) -> dict[Path, dict[str, Any]]:
+    """What each of some files says that were written then; read once for stamps, cameras and poses."""
+    return {file: read_json_object(file) for file, _ in written}
 
 
 def _seconds(file: Path, stamp: Any) -> float:

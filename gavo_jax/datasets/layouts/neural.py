@@ -1,6 +1,5 @@
 """Scenes that neural mapping is tried on: Replica as Semantic-NeRF and vMAP have it, and those of Neural RGB-D."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -8,14 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from gavo_jax.datasets.files import Size
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP
-from gavo_jax.datasets.layouts.numbered import NumberedFolder
-from gavo_jax.datasets.names import Found, by_number, images_among
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, found_among
+from gavo_jax.datasets.names import Found
 from gavo_jax.datasets.truth import in_order, pose_of
 from gavo_jax.errors import GavoError, number, read_text
 
@@ -34,11 +32,9 @@ class NeuralScene(NumberedFolder):
         raise NotImplementedError
 
     @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else one by the focal length."""
-        size = width, height = size_of_most(entries)
-        if (file := own_camera_file(path)) is not None:
-            return load_calibration(file, size, MILLIMETRES)
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """One by the focal length."""
+        width, height = size
         focal, origin = cls.focal(path, width)
         middle = (width - 1) / 2, (height - 1) / 2
         return Calibration(Camera(focal, focal, *middle, width, height, depth_scale=MILLIMETRES), origin=origin)
@@ -89,8 +85,7 @@ class NeuralRgbd(NeuralScene):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Depth is what the method itself takes, which is always there."""
-        color = images_among((path / "images").glob("*"), COLOR_SUFFIXES)
-        return by_number(color, images_among((path / cls.DEPTH).glob("*"), DEPTH_SUFFIXES))
+        return found_among((path / "images").glob("*"), (path / cls.DEPTH).glob("*"))
 
     @classmethod
     def focal(cls, path: Path, width: int) -> tuple[float, str]:

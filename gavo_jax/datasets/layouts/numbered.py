@@ -22,6 +22,7 @@ from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
     Reading,
+    Size,
     depth_size_of_most,
     info_of_scan,
     own_camera_file,
@@ -74,10 +75,20 @@ class NumberedFolder(FileSequence):
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera that the folder, or the dataset, brings.
+        """The camera that the folder, or the dataset, brings: a camera file in the folder goes before its own.
 
         Raises:
             GavoError: there is none, or it cannot be read.
+        """
+        size, file = size_of_most(entries), own_camera_file(path)
+        return cls.own_camera(path, size) if file is None else load_calibration(file, size, cls.DEPTH_SCALE)
+
+    @classmethod
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """The camera of images of a size, as the dataset itself says it.
+
+        Raises:
+            GavoError: as `calibrate`.
         """
         raise NotImplementedError
 
@@ -161,7 +172,7 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Both kinds lie in the folder itself."""
-        return _found(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
+        return found_among(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
@@ -203,7 +214,7 @@ class ScanNet(NumberedFolder):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Each kind has a folder."""
-        return _found((path / "color").glob("*"), (path / "depth").glob("*"))
+        return found_among((path / "color").glob("*"), (path / "depth").glob("*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
@@ -243,7 +254,7 @@ class Replica(NumberedFolder):
     def find(cls, path: Path) -> Found:
         """Both kinds lie in one folder."""
         results = path / "results"
-        return _found(results.glob("frame*"), results.glob("depth*"))
+        return found_among(results.glob("frame*"), results.glob("depth*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
@@ -385,7 +396,8 @@ def _any(folder: Path, pattern: str) -> Path | None:
     return next(folder.glob(pattern), None)
 
 
-def _found(color: Iterable[Path], depth: Iterable[Path]) -> Found:
+def found_among(color: Iterable[Path], depth: Iterable[Path]) -> Found:
+    """The images of either kind among files, by their numbers."""
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
@@ -403,7 +415,7 @@ def _check_identity(file: Path) -> None:
         raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
 
 
-def of_matrices(file: Path, matrices: list[Any], size: tuple[int, int], depth_scale: float) -> Calibration:
+def of_matrices(file: Path, matrices: list[Any], size: Size, depth_scale: float) -> Calibration:
     """The camera that the frames' own have in common, see `common_camera`.
 
     Args:

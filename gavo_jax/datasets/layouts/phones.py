@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, by_rate, of_each_frame, told_in
 from gavo_jax.datasets.layouts.pairing import Paired
@@ -41,11 +41,9 @@ class StrayScan(NumberedFolder):
         return all((path / name).is_file() for name in (cls.STAMPS, cls.MATRIX)) and all(plain_files(path))
 
     @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else the film's camera, at the size of the images."""
-        width, height = size_of_most(entries)
-        if (file := own_camera_file(path)) is not None:
-            return load_calibration(file, (width, height), MILLIMETRES)
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """The film's, at the size of the images."""
+        width, height = size
         if width * cls.FILM[1] != height * cls.FILM[0]:
             film = "x".join(map(str, cls.FILM))
             raise GavoError(

@@ -13,9 +13,8 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import METRES
 from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
-from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.layouts.numbered import NumberedFolder
-from gavo_jax.datasets.names import Found, by_number, images_among
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, found_among
+from gavo_jax.datasets.names import Found
 from gavo_jax.datasets.truth import in_order, numbers_in, posed
 from gavo_jax.errors import GavoError
 
@@ -61,10 +60,7 @@ class TartanAir(NumberedFolder):
             if not folder.is_dir():
                 raise GavoError(f"{folder}: no such folder beside {other.name}: download it, too")
         color, depth = folders
-        return by_number(
-            images_among(color.glob(f"*_{camera}.*"), COLOR_SUFFIXES),
-            images_among(depth.glob(f"*_{camera}_depth.*"), DEPTH_SUFFIXES),
-        )
+        return found_among(color.glob(f"*_{camera}.*"), depth.glob(f"*_{camera}_depth.*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
