@@ -19,7 +19,7 @@ from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightness
-from gavo_jax.objective.points import swept
+from gavo_jax.objective.points import SATURATED, swept
 
 WIDEST = 160
 """Pixels: the finest level searched that is not wider is the one that bodies are seen on."""
@@ -81,8 +81,6 @@ GREY_NOISE = 4.0
 """Grey levels, interpolation and compression included."""
 DEPTH_NOISE = 0.006
 """1/m: twice the quantisation of a structured-light sensor."""
-SATURATED = 250.0
-"""Grey level from which an image may have been cut off."""
 SLACK = 0.4
 """Pixels that a true motion may seem off by: shutter, stamps and registration of depth."""
 SLACK_OF_FLOW = 0.04
@@ -160,6 +158,7 @@ def compare(
     grey, depth = sample_grey(words, itself), sample_depth(words, itself)
     q = jnp.where((depth.valid > 0) & (u < width - 1) & (v < height - 1), depth.value, 0.0)
     points = swept(Points(*to_ray(plane, u, v), q), here.sweep, -row_time(v, plane))
+    lit = (grey.value < SATURATED).astype(jnp.float32)
 
     def against(image: Target, sweep: Float[Array, " 6"], other_T_here: Float[Array, "4 4"]) -> Residuals:
         first = warp(points, other_T_here, plane)
@@ -174,6 +173,7 @@ def compare(
             grey=sample.value - grey.value,
             depth=depth,
             inside=seen.inside,
+            lit=lit,
             depth_valid=surface.valid * seen.inside,
             warped=seen,
             grey_sample=sample,

@@ -50,6 +50,8 @@ class Residuals(NamedTuple):
     depth: Float[Array, "*n"]
     """Inverse depth, 1/m, along the surface normal; 0 where `depth_valid` is 0."""
     inside: Float[Array, "*n"]
+    lit: Float[Array, "*n"]
+    """The reference's, see `Reference`."""
     depth_valid: Float[Array, "*n"]
     warped: Warped
     """Before any delay by the shutter."""
@@ -178,6 +180,7 @@ class Objective:
             grey=jnp.where(seen.inside > 0, grey, 0.0),
             depth=jnp.where(depth_valid > 0, depth, 0.0),
             inside=seen.inside,
+            lit=reference.lit,
             depth_valid=depth_valid,
             warped=warped,
             grey_sample=grey_sample,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gavo_jax.objective.error import Objective, Residuals, Scales
+from gavo_jax.objective.points import SATURATED
 
 ROUNDS = 6
 """Rounds of the re-weighted estimates below; each contracts the remaining error several times."""
@@ -68,14 +69,21 @@ def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], s
     """Factor on depth's weight, from 1 to a third where its residuals, more than grey's, err by whole surfaces."""
     r = objective.residuals(target_T_reference)
     depth = _independent_share(r.depth, r.depth_valid, scales.depth, objective.columns)
-    grey = _independent_share(r.grey, r.inside, scales.grey, objective.columns)
+    grey = _independent_share(r.grey, lit_in_both(r), scales.grey, objective.columns)
     return jnp.clip(depth / grey / FULL_DEPTH_RATIO, LEAST_DEPTH_TRUST, 1.0)
+
+
+def lit_in_both(r: Residuals) -> Float[Array, "*n"]:
+    """1 where a point is inside and neither image was cut off there: two of those that are white agree whatever the
+    motion, and would make the noise seem smaller than it is.
+    """
+    return r.inside * r.lit * (r.grey_sample.value < SATURATED)
 
 
 def estimate_scales(r: Residuals, depth_weight: jax.Array | float) -> Scales:
     """Scales of the grey and the depth residuals of one motion, with the weight that depth is given."""
     residual = jnp.stack([r.grey, r.depth]).reshape(2, -1)
-    mask = jnp.stack([r.inside, r.depth_valid]).reshape(2, -1)
+    mask = jnp.stack([lit_in_both(r), r.depth_valid]).reshape(2, -1)
     found = jnp.maximum(_t_scales(residual, mask), jnp.array([SMALLEST_GREY_SCALE, SMALLEST_DEPTH_SCALE]))
     return Scales(found[0], found[1], jnp.float32(depth_weight))
 
@@ -92,8 +100,8 @@ class Brightness(NamedTuple):
         return cls(jnp.ones(views), jnp.zeros(views))
 
     def seen(self, grey: Float[Array, "v n"]) -> Float[Array, "v n"]:
-        """Grey of the views' points as the target shows them."""
-        return self.gain[:, None] * grey + self.bias[:, None]
+        """Grey of the views' points as the target shows them, which is nowhere brighter than white."""
+        return jnp.minimum(self.gain[:, None] * grey + self.bias[:, None], WHITE)
 
 
 def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
@@ -101,7 +109,7 @@ def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
 
     The gain leans to 1 where the image has little contrast.
     """
-    mask = r.inside
+    mask = lit_in_both(r)
     sample = jnp.where(mask > 0, r.grey_sample.value, MIDDLE_GREY) - MIDDLE_GREY
     features = jnp.stack([jnp.ones_like(grey), grey - MIDDLE_GREY, sample], axis=1)
 
@@ -123,6 +131,8 @@ def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
     return jax.lax.fori_loop(0, ROUNDS, refine, start)[0]
 
 
+WHITE = 255.0
+"""Grey level of what is as bright as an image can show."""
 MIDDLE_GREY = 128.0
 """Grey levels that moments are taken about, so that they lose no digits."""
 LARGEST_GAIN = 1.8
@@ -148,10 +158,11 @@ def explained_share(residuals: Residuals) -> ExplainedShare:
     where both see nothing.
     """
     r = residuals
+    grey = jnp.where(r.lit > 0, r.grey, jnp.minimum(r.grey, 0.0))  # what was cut off may have been brighter
 
     def share(residual: jax.Array, mask: jax.Array, large: float) -> jax.Array:
         return jnp.sum(mask * (jnp.abs(residual) < large)) / jnp.sum(mask)
 
     return ExplainedShare(
-        share(r.grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)
+        share(grey, r.inside, LARGE_GREY_RESIDUAL), share(r.depth, r.depth_valid, LARGE_DEPTH_RESIDUAL)
     )

@@ -14,6 +14,9 @@ from gavo_jax.image.sampling import inverse_depth_slopes
 from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, moved
 
+SATURATED = 250.0
+"""Grey level from which an image may have been cut off: what was seen was at least as bright."""
+
 
 class Reference(NamedTuple):
     """What the objective keeps of a level of the reference frame: arrays of N points, with an axis of views before it
@@ -32,6 +35,8 @@ class Reference(NamedTuple):
     """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""
     row_time: Float[Array, "*views n"]
     """When the point's row was exposed; see `Shutter`."""
+    lit: Float[Array, "*views n"]
+    """1 where the grey is below `SATURATED`, else 0."""
 
 
 def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
@@ -75,8 +80,8 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Referen
     u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
     near = jnp.maximum(q, 1e-3)
     facing = jax.lax.rsqrt(1.0 + (plane.fx * slope_u / near) ** 2 + (plane.fy * slope_v / near) ** 2)
-    rays = Points(*to_ray(plane, u, v), q)
-    return Reference(rays, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, plane))
+    rays, lit = Points(*to_ray(plane, u, v), q), (grey < SATURATED).astype(jnp.float32)
+    return Reference(rays, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, plane), lit)
 
 
 def _steepest_of_blocks(steepness: Float[Array, "h w"], cell: int) -> tuple[Integer[Array, "r c"], ...]:

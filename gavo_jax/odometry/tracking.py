@@ -259,7 +259,7 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
     levels = levels_of(camera, solver, alignment)
     row: Any = np.zeros((len(levels.numbers), levels.most_points), np.float32)
     words: Any = np.zeros((levels.layout.height, levels.layout.width), np.uint32)
-    reference = Reference(Points(row, row, row), row, row, row, row, row, row, row)
+    reference = Reference(Points(row, row, row), *[row] * 8)
     zero: Any = np.float32(0.0)
     still: Any = np.zeros(6, np.float32)
     return TrackerState(

@@ -215,7 +215,7 @@ def _points(scene: equations.Scene) -> Points:
 def _objective(scene: equations.Scene) -> Objective:
     """E with robust loss and depth term, as a level's search has it: one view, its points counted."""
     nothing = np.zeros_like(scene.q)
-    leaves = (scene.grey, *[nothing] * 4, scene.facing, nothing)
+    leaves = (scene.grey, *[nothing] * 4, scene.facing, nothing, np.ones_like(scene.q))
     points, leaves = _given(jax.tree.map(lambda leaf: leaf[None], ([scene.x, scene.y, scene.q], leaves)))
     view = Reference(Points(*points), *leaves)
     grey, depth, depth_weight, outside_cost, min_overlap = _given([np.float32(value) for value in WEIGHING])

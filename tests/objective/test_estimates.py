@@ -1,6 +1,7 @@
 """What is estimated from the data: scales, brightness, the share explained, and how far depth is trusted."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from observed import build, noisy_pair, random_pair, smooth_pair
 from gavo_jax.objective.error import Objective
 from gavo_jax.objective.estimates import Brightness, depth_trust, estimate_brightness, estimate_scales, explained_share
 
+GREYS = ("reference_grey", "target_grey")
 jit_scales = jax.jit(lambda objective, motion, weight: estimate_scales(objective.residuals(motion), weight))
 jit_trust = jax.jit(depth_trust)
 
@@ -59,6 +61,41 @@ def test_scale_survives_outliers() -> None:
     rng = np.random.default_rng(1)
     noise = np.where(rng.random((48, 64)) < 0.15, rng.uniform(-100, 100, (48, 64)), rng.normal(0, 3, (48, 64)))
     assert 2.0 < float(jit_scales(build(noisy_pair(noise)), jnp.eye(4), 1.0).grey) < 8.0
+
+
+def test_white_that_both_images_show_does_not_make_the_noise_smaller() -> None:
+    pair = noisy_pair(np.random.default_rng(4).normal(0, 4, (48, 64)))
+    scales = [float(jit_scales(build(one), jnp.eye(4), 1.0).grey) for one in (pair, _partly_white(pair))]
+    assert scales[1] == pytest.approx(scales[0], rel=0.1)
+
+
+def test_white_tells_nothing_of_a_gain() -> None:
+    pair = noisy_pair(np.random.default_rng(5).normal(0, 1.0, (48, 64)), gain=0.8)
+    gain, _ = jit_brightness(build(_partly_white(pair)), jnp.eye(4))
+    assert float(gain) == pytest.approx(0.8, abs=0.02)
+
+
+def test_nothing_is_brighter_than_white() -> None:
+    brightness = Brightness(jnp.array([1.5]), jnp.array([-10.0]))
+    np.testing.assert_allclose(brightness.seen(jnp.array([[100.0, 200.0]])), [[140.0, 255.0]])
+
+
+def test_what_was_cut_off_may_have_been_brighter() -> None:
+    pair = smooth_pair(rim=1)
+    white = np.full((48, 64), 255.0)
+    shares = []
+    for target in (white - 40.0, white):
+        objective = build(pair._replace(reference_grey=white, target_grey=target))
+        seen = Brightness(jnp.array([0.9]), jnp.array([0.0])).seen(objective.reference.grey[None])[0]
+        darker = objective.reference._replace(grey=seen)
+        shares.append(float(jit_explained(replace(objective, reference=darker), jnp.eye(4)).grey))
+    assert shares == [0.0, 1.0]
+
+
+def _partly_white(pair: Any) -> Any:
+    """A pair whose upper two thirds are white in both images."""
+    white = (np.arange(48) < 32)[:, None]
+    return pair._replace(**{name: np.where(white, 255.0, getattr(pair, name)) for name in GREYS})
 
 
 def test_scales_never_vanish() -> None:

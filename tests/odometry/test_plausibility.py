@@ -206,6 +206,19 @@ def test_a_change_of_gain_loses_nothing(frames: list[Frame], gain: float, bias: 
     assert all(step.alignment.status is Status.OK for step in steps_of(frames, change))
 
 
+def test_exposures_that_differ_lose_nothing_where_much_is_white(frames: list[Frame]) -> None:
+    """What was cut off hid how much brighter the next image was: half of all pairs were `HIGH_ERROR`."""
+
+    def expose(frames: list[Frame]) -> list[Frame]:
+        white = 255.0 / np.quantile(frames[0].grey, 0.6)
+        gains = white * (1.0 + 0.2 * np.sin(2.1 * np.arange(len(frames))))
+        return [
+            replace(f, grey=np.minimum(g * f.grey, 255).astype(np.uint8)) for f, g in zip(frames, gains, strict=True)
+        ]
+
+    assert all(step.alignment.status is Status.OK for step in steps_of(frames, expose))
+
+
 def test_the_trajectory_breaks_where_the_motion_is_unknown(frames: list[Frame], tmp_path: Any) -> None:
     covered = replace(frames[0], grey=np.zeros_like(frames[0].grey))
     elsewhere = [replace(f, grey=f.grey[::-1, ::-1].copy(), depth=f.depth[::-1, ::-1].copy()) for f in frames]
