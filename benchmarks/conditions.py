@@ -142,7 +142,7 @@ CONDITIONS: dict[str, Condition] = {
     "every second blurred": grey(lambda index, levels: blurred(3.0, levels) if index % 2 else levels),
     "a tenth of the light": grey(lambda index, levels: 0.1 * levels),
     "twice the light": grey(lambda index, levels: 2.0 * levels),
-    "overexposed, flicker of 20 %": grey(lambda index, levels: 1.4 * levels * (1.0 + 0.2 * np.sin(2.1 * index))),
+    "overexposed flicker of 20 %": grey(lambda index, levels: 1.4 * levels * (1.0 + 0.2 * np.sin(2.1 * index))),
     "gamma 0.5": grey(lambda index, levels: 255 * (levels / 255) ** 0.5),
     "gamma 2": grey(lambda index, levels: 255 * (levels / 255) ** 2),
     "flicker of 20 %": grey(lambda index, levels: levels * (1.0 + 0.2 * np.sin(2.1 * index))),
