@@ -26,8 +26,8 @@ BAD_INPUT, BROKEN_PIPE = 2, 141
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""
-BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
-"""Errors of a name that no file can have, or that leads in a circle."""
+BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
+"""Errors of a name that no file can have, that leads in a circle, or to where this user may not go."""
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "

@@ -1,6 +1,7 @@
 """Sequences of the TUM RGB-D benchmark: resumed where a download broke off, checked by size, unpacked safely."""
 
 import difflib
+import gzip
 import os
 import re
 import shutil
@@ -31,6 +32,8 @@ ATTEMPTS, PAUSE = 5, 1.0
 TIMEOUT = (10.0, 30.0)
 """Seconds without a connection, and without a byte, after which a try has failed."""
 CHUNK = 2**18
+DAMAGED = (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error)
+"""What readers of a broken archive raise."""
 SIZE = "[0-9]{1,18}"
 """A number of bytes in a server's words; what is none tells nothing."""
 
@@ -180,13 +183,16 @@ def _unpack(archive: Path, target: Path) -> None:
     shutil.rmtree(scratch, ignore_errors=True)  # left by a kill
     scratch.mkdir()
     try:
-        with tarfile.open(archive, "r:gz") as tar:
-            for member in tar:
-                _unpack_member(tar, member, scratch, target.name)
+        with gzip.open(archive) as stream:
+            with tarfile.open(fileobj=stream, mode="r:") as tar:
+                for member in tar:
+                    _unpack_member(tar, member, scratch, target.name)
+            while stream.read(CHUNK):  # to its end, where the checksum of all stands
+                pass
         if not (scratch / target.name / "rgb.txt").is_file():
             raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
         os.replace(scratch / target.name, target)
-    except (tarfile.TarError, EOFError, zlib.error, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+    except (*DAMAGED, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         archive.unlink()
         raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {line_of(error)}") from None
     finally:

@@ -101,7 +101,7 @@ class RayExecutor:
     def slots(self) -> int:
         """Count how many runs the cluster's processors and GPUs allow now."""
         resources = self._ray.cluster_resources()
-        return max(1, int(min(resources.get(name, 0.0) // n for name, n in self._wanted.items() if n)))
+        return max(1, int(min((resources.get(name, 0.0) // n for name, n in self._wanted.items() if n), default=1)))
 
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
         """Hand all of them to the cluster and yield them in the order in which they come back."""

@@ -128,7 +128,9 @@ def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
         if pattern == SYNTHETIC:
             return [SYNTHETIC]
         for root in roots:
-            found = sorted(match for match in glob.glob(os.path.join(root, pattern)) if os.path.isdir(match))
+            found = sorted(
+                match for match in glob.glob(os.path.join(glob.escape(root), pattern)) if os.path.isdir(match)
+            )
             if found:
                 return found
     return []

@@ -60,10 +60,12 @@ def _fault_of_values(loss: Loss) -> str:
         value, slope = jax.jit(lambda s: jax.jvp(loss, (s,), (jnp.ones_like(s),)))(s)
     except Exception as error:  # somebody else's code may fail in any way
         return f"cannot be used: {line_of(error)}"
-    if value.shape != s.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+    if not isinstance(value, jax.Array) or value.shape != s.shape or not jnp.issubdtype(value.dtype, jnp.floating):
         return "must return as many real numbers as it is given"
     if not jnp.isfinite(value).all():
         return "must be finite, from 0 on"
+    if (value < 0).any():
+        return "must not be negative: a point out of view is told by its cost"
     if not jnp.isfinite(slope).all():
         return "must have a finite derivative, at 0 too: covariance and status take it"
     return ""

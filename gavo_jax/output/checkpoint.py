@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gavo_jax.camera import MAX_SIDE
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
@@ -28,6 +29,8 @@ from gavo_jax.odometry.way import Fix, Way
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
 LAST_GREY, SAME_LEVEL = "last_grey", "same_level"
+MOST_BESIDE = 2**20 + 5 * MAX_SIDE**2 // 4
+"""Bytes at most beside the tracker: a float and a count for every fourth pixel of the largest image, and numbers."""
 
 
 class Mark(NamedTuple):
@@ -105,7 +108,7 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
     """
     expected, structure = jax.tree.flatten(blank)
     try:
-        arrays = _sealed_arrays(path, most=2**20 + sum(leaf.nbytes for leaf in expected))
+        arrays = _sealed_arrays(path, most=MOST_BESIDE + sum(leaf.nbytes for leaf in expected))
         numbers = json.loads(str(arrays[NUMBERS]))
         files = {name: Mark(*mark) for name, mark in numbers.pop("files").items()}
         images = numbers.pop("images")

@@ -1,5 +1,6 @@
 """Names of files and sequences are other people's words: whatever they are, they do not command the terminal."""
 
+import errno
 import io
 import os
 import pty
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command import runner
@@ -99,3 +101,14 @@ def test_any_encoding_of_the_screen(monkeypatch, encoding, words):
         stream.flush()
         printed[name] = stream.buffer.getvalue().decode(encoding)
     assert printed["stdout" if "--help" in words else "stderr"].strip()
+
+
+def test_a_folder_that_is_closed_to_this_user_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """`Path.is_dir` raises what no other question about a file does."""
+
+    def refuse(self: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "is_dir", refuse)
+    assert main(["view", "closed"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -217,6 +217,7 @@ UNSAFE = {
     "another folder": archive(folder="rgbd_dataset_freiburg1_desk"),
     "no archive": b"<html>moved</html>" * 100,
     "torn archive": archive()[:-2000],
+    "wrong checksum": archive()[:-8] + bytes(4) + archive()[-4:],
 }
 
 

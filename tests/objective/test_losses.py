@@ -43,6 +43,8 @@ class Unhashable:
         (lambda s: 1, "must return as many real numbers as it is given"),
         (jnp.sum, "must return as many real numbers"),
         (lambda s: s > 4, "must return as many real numbers"),
+        (lambda s: (s, s), "must return as many real numbers"),
+        (lambda s: -jnp.exp(-s), "must not be negative"),
         (jnp.log, "must be finite, from 0 on"),
         (lambda s: np.sqrt(s), "cannot be used: "),
         (lambda s: jax.pure_callback(np.abs, s, s), "cannot be used: Pure callbacks do not support JVP"),

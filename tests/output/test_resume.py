@@ -21,6 +21,7 @@ from gavo_jax.cli import main, run
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.composition import blank_of
+from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.progress import Progress
@@ -447,3 +448,10 @@ def test_killed_at_twenty_random_moments(clip, tmp_path, method):
         assert same_ending(output, whole), f"killed after {rows} rows and {delay:.3f} s"
         shutil.rmtree(output)
     assert killed >= 15
+
+
+def test_a_checkpoint_of_large_images_can_be_read(tmp_path: Path) -> None:
+    """From 1920x1080 on each was larger than was allowed."""
+    drawn = Drawn().after(np.zeros((1080, 1920), np.float32))
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress()._replace(drawn=drawn), {}))
+    assert load_checkpoint(tmp_path / "checkpoint.npz", ()).progress.drawn.last is not None
