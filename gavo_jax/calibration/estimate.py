@@ -165,11 +165,13 @@ def estimate_camera(
         on_progress: is told what is being found.
 
     Raises:
-        GavoError: too few frames that can be read, or no two of them agree in any way.
+        GavoError: something else is wanted, too few frames can be read, or no two of them agree in any way.
     """
     guessed = getattr(sequence, "times_guessed", "")
     sequence = without_distortion(sequence)
     wanted, camera = tuple(wanted), sequence.camera
+    if unknown := set(wanted) - {"depth_scale", *_STAGES}:
+        raise GavoError(f"wanted: not one of depth_scale, {', '.join(_STAGES)}: {', '.join(sorted(unknown))}")
     found: dict[str, Found] = {}
     if "depth_scale" in wanted:
         found["depth_scale"] = _depth_scale(sequence)
@@ -370,7 +372,7 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
 
 
 def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
-    """The longest run of frames that can be read, with stamps that go forward and depth."""
+    """The longest run of frames that can be read, with stamps that go forward."""
     runs: list[list[Frame]] = [[]]
     for index in range(start, start + length):
         try:

@@ -98,7 +98,10 @@ def evened(stamps: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
     would make the speed jump by a tenth from frame to frame, and so hide how the camera really speeds up.
     """
     intervals = np.diff(stamps)
-    ticks = np.concatenate([[0.0], np.cumsum(np.round(intervals / np.median(intervals)))])
+    usual = np.median(intervals)
+    if not usual > 0:  # most of them repeat
+        return stamps
+    ticks = np.concatenate([[0.0], np.cumsum(np.round(intervals / usual))])
     interval, start = np.polyfit(ticks, stamps, 1)
     even = start + interval * ticks
     fits = len(np.unique(ticks)) == len(ticks) and np.abs(stamps - even).max() < MOST_JITTER * interval

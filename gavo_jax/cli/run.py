@@ -114,10 +114,10 @@ def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str
     """Begin the files of a run, in place of an earlier one's."""
     if options.resume:
         say(f"nothing to resume in {folder.path}: a new run")
-    remove_trajectories(folder.path)
     if folder.has_run():
         say(f"the earlier run in {folder.path} is replaced")
     folder.start(config, float(sequence.timestamps[0]))
+    remove_trajectories(folder.path)
 
 
 def _go_on(

@@ -199,6 +199,14 @@ def test_stamps_with_jitter_are_those_of_an_even_clock():
     np.testing.assert_allclose(np.diff(evened(stamps)), np.diff(ticks) / 30, atol=5e-4)
     uneven = np.cumsum(rng.uniform(0.02, 0.2, 30))
     np.testing.assert_array_equal(evened(uneven), uneven)
+    repeated = np.repeat(np.arange(10) / 10, 3)
+    np.testing.assert_array_equal(evened(repeated), repeated)
+
+
+def test_something_else_that_is_wanted_is_refused():
+    """A name alone became its letters, and nothing was found."""
+    with pytest.raises(GavoError, match="wanted: not one of depth_scale, readout"):
+        estimate_camera(SyntheticSequence(3, noise=NONE, camera=CAMERA), "readout")  # pyright: ignore
 
 
 def test_a_camera_file_holds_what_was_found(tmp_path):

@@ -97,6 +97,13 @@ def test_a_comparison_leaves_no_trajectory_of_an_earlier_one(gavo, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").glob("*.txt")) == ["notes.txt", "opencv-rgb.txt"]
 
 
+def test_a_run_that_is_refused_a_comparisons_folder_leaves_it_alone(gavo, tmp_path):
+    assert gavo(*COMPARE).status == 0
+    (tmp_path / "out" / "trajectory.csv").write_text("of somebody")
+    before = figures(tmp_path / "out")
+    assert gavo(*RUN).status == 2 and figures(tmp_path / "out") == before
+
+
 def test_two_runs_at_once(gavo, tmp_path):
     """One of them has the folder; the other leaves it alone, and the first one's files are whole."""
     commands = [[sys.executable, "-m", "gavo_jax", *RUN, "--seed", str(seed)] for seed in (1, 2)]
