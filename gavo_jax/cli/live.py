@@ -57,7 +57,6 @@ def run_live(options: Run) -> int:
         odometry = Odometry(camera.rectified(), settings, seed=options.seed, record=viewer.wants_populations)
         with waiting(f"{device.name}: compiling …"):
             compile_seconds = interruptible(lambda: odometry.warm_up(wholly=True))
-        remove_trajectories(folder.path)
         say(f"{device.name}: live, {camera.width}x{camera.height}; Ctrl-C ends the run")
         scene = None if options.map is None else LiveMap(MapBuilder(odometry.camera, options.voxel))
         end = _track(options, newest, camera, odometry, folder, viewer, settings, scene)
@@ -120,6 +119,7 @@ def _track(
             if count == 0:
                 viewer.open(newest.device.name, odometry.camera, np.array([timestamp]), None)
                 folder.start({"options": options, "sequence": sequence, **circumstances(settings)}, timestamp)
+                remove_trajectories(folder.path)
                 stopwatch = Stopwatch()
             step = odometry.register(frame, timestamp)
             viewer.watch(frame if isinstance(frame, Frame) else None, step, odometry.candidates)
