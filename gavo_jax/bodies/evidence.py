@@ -18,7 +18,7 @@ from gavo_jax.image.sampling import INVERSE_DEPTH_STEP, GreySample, Target, look
 from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, Warped, warp
 from gavo_jax.objective.error import Residuals
-from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightness
+from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightness, lit_in_both
 from gavo_jax.objective.points import SATURATED, swept
 
 WIDEST = 160
@@ -188,8 +188,7 @@ def compare(
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
     as_bright = brightness.seen(seen_grey)
     residual = r.grey_sample.value - as_bright
-    is_told = jnp.maximum(r.grey_sample.value, grey.value) < SATURATED
-    same = r.inside * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL) * is_told
+    same = lit_in_both(r) * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL)
     shape = (-1, -(-height // stride), -(-width // stride))
     light = light_change(*(one.reshape(shape) for one in (residual, as_bright, same))).reshape(residual.shape)
     r = r._replace(grey=residual - as_bright * light)

@@ -80,7 +80,8 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Referen
     u, v = (axis.astype(jnp.float32) for axis in (place % layout.width - column, place // layout.width - row))
     near = jnp.maximum(q, 1e-3)
     facing = jax.lax.rsqrt(1.0 + (plane.fx * slope_u / near) ** 2 + (plane.fy * slope_v / near) ** 2)
-    rays, lit = Points(*to_ray(plane, u, v), q), (grey < SATURATED).astype(jnp.float32)
+    rays = Points(*to_ray(plane, u, v), q)
+    lit = (grey < SATURATED).astype(jnp.float32)
     return Reference(rays, grey, grey_u, grey_v, slope_u, slope_v, facing, row_time(v, plane), lit)
 
 
