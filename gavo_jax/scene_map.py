@@ -20,7 +20,7 @@ from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified, without_distortion
-from gavo_jax.errors import PARTIAL, GavoError, GavoWarning
+from gavo_jax.errors import GavoError, GavoWarning, partial_of
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_with_libusb
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
@@ -91,7 +91,7 @@ class SceneMap:
             raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
         open3d = import_open3d()
         vector = open3d.utility.Vector3dVector
-        partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix.lower()}")
+        partial = path.with_name(partial_of(path).name + path.suffix.lower())  # which Open3D goes by
         if self.triangles is None:
             cloud: Any = open3d.geometry.PointCloud(vector(self.points))
             cloud.colors, cloud.normals = vector(self.colors / 255.0), vector(self.normals)

@@ -163,7 +163,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
     given = {name: part for name, part in parts.items() if part is not None}
     if given:
         words = "options and alignment are parts of the settings now: dataclasses.replace(settings, alignment=…)"
-        warnings.warn(words, DeprecationWarning, stacklevel=3)
+        warnings.warn(words, DeprecationWarning, stacklevel=4)  # the caller of what calls this, which is wrapped
     if solver is not None:
         given["solver"] = solver
     settings = replace(settings, **given)

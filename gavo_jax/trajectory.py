@@ -375,4 +375,4 @@ def write_lines(path: str | Path, lines: Iterable[str]) -> None:
     Raises:
         GavoError: the file cannot be written.
     """
-    write_bytes(path, ("\n".join(lines) + "\n").encode("utf-8"))
+    write_bytes(path, ("\n".join(lines) + "\n").encode("utf-8", "surrogateescape"))

@@ -1,5 +1,6 @@
 """Trajectory files, interpolation and association."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from gavo_jax.trajectory import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     segment_comment,
+    write_lines,
 )
 
 GOOD = "1.0 1 2 3 0 0 0 1\n"
@@ -29,6 +31,11 @@ def random_trajectory(count: int, seed: int, step: float = 0.01) -> Trajectory:
     world_T_camera[:, :3, :3] = Rotation.from_quat(rng.normal(size=(count, 4))).as_matrix()
     world_T_camera[:, :3, 3] = rng.normal(size=(count, 3)) * 3
     return Trajectory(1305031102.175304 + np.arange(count) * step, world_T_camera)
+
+
+def test_a_note_may_name_a_folder_whose_name_is_not_utf_8(tmp_path: Path):
+    write_lines(tmp_path / "notes.txt", [os.fsdecode(b"# runs/caf\xe9")])
+    assert (tmp_path / "notes.txt").read_bytes() == b"# runs/caf\xe9\n"
 
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3)

@@ -25,7 +25,7 @@ from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
-from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
 from gavo_jax.rigid_motions import exp, log
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
@@ -104,7 +104,8 @@ class BodyAware:
     @cached_property
     def segmenter(self) -> MotionSegmenter:
         """What sees bodies."""
-        return MotionSegmenter(self.search.camera, self.search.settings)
+        settings = self.search.settings
+        return MotionSegmenter(as_exposed(self.search.camera, settings.odometry), settings)
 
     @property
     def search_of_bodies(self) -> Aligner | None:

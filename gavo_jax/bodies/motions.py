@@ -16,7 +16,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.objective.points import Reference, apply_rolling_shutter
 from gavo_jax.odometry.aligners import Aligner
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS, Usual
-from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.odometry.tracking import Clock, TrackerState, readout_share
 from gavo_jax.status import AlignmentStatus
 
 
@@ -92,7 +92,7 @@ def _align(
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
     """A frame's points where its rows saw them: the shutter was undone by the camera's motion, not by a body's."""
-    twist = tracker.instant_motion * (segmenter.full.readout / tracker.seconds)
+    twist = tracker.instant_motion * readout_share(segmenter.full, tracker.seconds)
     return apply_rolling_shutter(whole, twist, segmenter.planes)
 
 

@@ -20,7 +20,7 @@ from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.image.levels import ImagePlane, Levels
 from gavo_jax.image.sampling import Target
 from gavo_jax.objective.points import Reference
-from gavo_jax.odometry.tracking import TrackerState
+from gavo_jax.odometry.tracking import TrackerState, readout_share
 from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
@@ -108,7 +108,7 @@ class MotionSegmenter:
 
     def view(self, tracker: TrackerState) -> View:
         """Return a tracker's last frame, on the host: to slice a device's array takes a program."""
-        sweep = np.asarray(tracker.instant_motion) * (self.full.readout / np.asarray(tracker.seconds))
+        sweep = np.asarray(tracker.instant_motion) * readout_share(self.full, np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
     def blank(self) -> Scene:
@@ -189,7 +189,7 @@ def _look(
     """One program for all that is asked about every frame: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
     image, instant_motion, seconds = new
-    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
+    here = view_of(image, levels, instant_motion * readout_share(camera, seconds))
     views = views.moving_as(here.sweep)
     views_T_here = views_T_last @ rigid_inverse(target_T_reference)
     two = jax.tree.map(lambda leaf: leaf[:2], views)
@@ -214,7 +214,7 @@ def _look_back(
     """One program, so that it is kept between processes: it is asked for in the middle of a run."""
     before, views = known
     image, instant_motion, seconds = new
-    here = view_of(image, levels, instant_motion * (camera.readout / seconds))
+    here = view_of(image, levels, instant_motion * readout_share(camera, seconds))
     last = jax.tree.map(lambda leaf: leaf[0], views)
     seen = camera.level(levels.numbers[seen_level(levels)])
     here = jax.tree.map(lambda leaf: leaf[None], here)

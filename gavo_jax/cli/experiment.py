@@ -24,6 +24,8 @@ def experiment(options: Experiment) -> int:
     if options.file == REPORT:
         if options.folder is None:
             raise GavoError("report: which folder? gavo experiment report DIR")
+        if options.dry_run or options.output is not None or options.executor != "local":
+            raise GavoError("report: nothing is run: --dry-run, --output and --executor say nothing")
         return report(options.folder, options.markdown)
     if options.folder is not None:
         raise GavoError(f"unexpected argument {str(options.folder)!r}: the folder for results is --output DIR")

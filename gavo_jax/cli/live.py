@@ -64,12 +64,13 @@ def run_live(options: Run) -> int:
             tracked = odometry.progress.last_index + 1
             seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
             raise end.fault or GavoError(f"{device.name}: ended after {seen}: at least two are needed")
+        steps = folder.steps()  # without what an interruption left of one, from here on
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
             **run_identity(device.name, method, unchanged_preset(settings, options), options.seed),
             "complete": end.fault is None,
-            **finish_run(first, folder.steps(), None, None, end.seconds, compile_seconds + end.waited).figures,
+            **finish_run(first, steps, None, None, end.seconds, compile_seconds + end.waited).figures,
             "frames_received": newest.received,
             "frames_dropped": newest.dropped,
         }

@@ -96,5 +96,5 @@ def _is_private(folder: Path) -> bool:
         return False
     if fault:
         words = f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others"
-        warnings.warn(words, GavoWarning, stacklevel=3)
+        warnings.warn(words, GavoWarning, stacklevel=4)
     return fault is None

@@ -4,7 +4,7 @@ import importlib
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache, partial
@@ -13,11 +13,12 @@ from typing import Any, Protocol
 
 import jax
 
+from gavo_jax.camera import Camera
 from gavo_jax.compilation.cache import cache_folder, enable_compilation_cache
 from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, line_of
-from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration
+from gavo_jax.experiments.plan import Batch, RayOptions, Run, configuration, frames_of
 from gavo_jax.experiments.together import track_stacked, track_together
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry, Step
@@ -164,11 +165,11 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
         steps = tracker.track(on_pairs)
         seconds, compile_seconds = stopwatch.seconds / len(batch.runs), compile_seconds + stopwatch.waited
         first = float(sequence.timestamps[0])
-        rows = []
+        rows, frames = [], frames_of(batch.part.name, sequence)
         for run, own in zip(batch.runs, steps, strict=True):
             truth = sequence.ground_truth
             metrics = compute_metrics(trajectory_of(first, own), truth, own, seconds, compile_seconds)
-            rows.append(_row(experiment, batch, run, sequence, metrics))
+            rows.append(_row(experiment, batch, run, frames, metrics))
     except GavoError as error:
         return Outcome(batch, (), str(error))
     return Outcome(batch, tuple(rows))
@@ -186,7 +187,7 @@ def _mapped(
 
     metrics = run_odometry(sequence, settings, seed=run.seed or 0, on_step=on_step).metrics
     own: Any = {name: metrics[name] for name in Metrics.__annotations__}
-    return _row(experiment, batch, run, sequence, own)
+    return _row(experiment, batch, run, frames_of(run.part.name, sequence), own)
 
 
 class _Tracker:
@@ -227,7 +228,7 @@ def _odometry(run: Run, sequence: FrameSequence) -> Odometry:
     return Odometry(sequence.camera, run.settings, seed=run.seed or 0)
 
 
-def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metrics: Metrics) -> Row:
+def _row(experiment: str, batch: Batch, run: Run, frames: Mapping[str, Any], metrics: Metrics) -> Row:
     commit, modified = git_state()
     return {
         "run": run.id,
@@ -241,8 +242,8 @@ def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metri
         **metrics,
         "runs_together": len(batch.runs),
         "pixels": run.pixels,
-        "configuration": configuration(run, sequence),
-        "versions": environment() | _peer_versions(run, sequence),
+        "configuration": configuration(run, frames),
+        "versions": environment() | _peer_versions(run, frames["camera"]),
         "git_commit": commit,
         "git_modified": modified,
         "host": platform.node(),
@@ -250,8 +251,8 @@ def _row(experiment: str, batch: Batch, run: Run, sequence: FrameSequence, metri
     }
 
 
-def _peer_versions(run: Run, sequence: FrameSequence) -> dict[str, str]:
-    return dict(make_peer(run.method, sequence.camera).versions) if run.settings is None else {}
+def _peer_versions(run: Run, camera: Camera) -> dict[str, str]:
+    return dict(make_peer(run.method, camera).versions) if run.settings is None else {}
 
 
 @cache

@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -136,11 +135,13 @@ def programs(runs: Iterable[Run]) -> int:
     return len({(run.pixels, program_of(run.settings)) for run in runs if run.settings is not None})
 
 
-def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
-    """The full configuration of a run, without what belongs to a machine: equal ones are one run."""
+def configuration(run: Run, frames: Mapping[str, Any]) -> dict[str, Any]:
+    """The full configuration of a run on frames as `frames_of` tells them, without what belongs to a machine: equal
+    ones are one run.
+    """
     return describe(
         {
-            "sequence": frames_of(run.part.name, sequence),
+            "sequence": frames,
             "method": run.method,
             "preset": run.preset,
             "variant": run.variant,
@@ -150,7 +151,6 @@ def configuration(run: Run, sequence: FrameSequence) -> dict[str, Any]:
     )
 
 
-@lru_cache(maxsize=64)  # of a sequence there are many runs
 def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
     """Which frames a sequence has, by which camera, and what is true of them, without where they lie.
 

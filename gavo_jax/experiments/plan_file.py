@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax import presets
-from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.errors import GavoError, read_toml
-from gavo_jax.experiments.plan import Part, Plan, RayOptions, Run, configuration
+from gavo_jax.experiments.plan import Part, Plan, RayOptions, Run, configuration, frames_of
 from gavo_jax.experiments.values import (
     MAX_RUNS,
     flag_of,
@@ -144,8 +143,6 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
     try:
         if os.path.isfile(beside / camera):
             camera = str(beside / camera)
-        if camera != "auto":
-            load_camera(camera)
     except GavoError as error:
         raise GavoError(f"{place}: camera: {one_line(error)}") from None
     name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
@@ -228,12 +225,13 @@ def require_what_loops_need(place: str, settings: Settings) -> None:
 
 
 def _runs(part: Part, sequence: FrameSequence, variant: _Variant) -> list[Run]:
+    frames = frames_of(part.name, sequence)
     pairs, pixels = len(sequence) - 1, sequence.camera.width * sequence.camera.height
     shared = (part, pairs, pixels, variant.method, variant.preset, variant.text)
     runs = []
     for seed in variant.seeds:
         run = Run("", *shared, seed, variant.settings)
-        canonical = json.dumps(configuration(run, sequence), sort_keys=True, allow_nan=False)
+        canonical = json.dumps(configuration(run, frames), sort_keys=True, allow_nan=False)
         identity = hashlib.sha256(canonical.encode()).hexdigest()[:32]
         runs.append(Run(identity, *shared, seed, variant.settings))
     return runs

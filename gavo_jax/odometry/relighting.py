@@ -4,7 +4,7 @@ A search knows one gain and bias of each reference. Where a lamp flickers while 
 shadow, neither fits, and the motion is drawn to one that explains the light.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from gavo_jax.objective.estimates import LARGE_GREY_RESIDUAL
 from gavo_jax.objective.points import Reference
 from gavo_jax.odometry.aligners import Attempt, FrameSearch
 from gavo_jax.odometry.second_thoughts import SecondThought
-from gavo_jax.odometry.tracking import Clock, TrackerState
+from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed, readout_share
 from gavo_jax.settings import Settings
 
 UNEXPLAINED = 0.7
@@ -90,9 +90,8 @@ class Relighting(SecondThought):
         self, new: "NewFrame", state: TrackerState, motion: Float[np.ndarray, "4 4"]
     ) -> tuple[TrackerState, Float[Array, ""]]:
         """Run `_with_light` for the search's camera and levels."""
-        camera, settings = self.camera, self.settings
-        if not settings.odometry.rolling_shutter:
-            camera = replace(camera, readout=0.0)
+        settings = self.settings
+        camera = as_exposed(self.camera, settings.odometry)
         levels = levels_of(camera, settings.solver, settings.alignment)
         return _with_light(state, new, motion, camera, levels=levels)
 
@@ -115,9 +114,9 @@ def _with_light(
     that light leaves.
     """
     is_moving = jnp.any(state.motion != 0.0)  # as far as is known: rows of a first frame are as they were exposed
-    sweep = jnp.where(is_moving, state.instant_motion * (camera.readout / state.seconds), jnp.nan)
+    sweep = jnp.where(is_moving, state.instant_motion * readout_share(camera, state.seconds), jnp.nan)
     here = view_of(state.previous_image, levels, sweep)
-    there = view_of(new.image, levels, new.instant_motion * (camera.readout / new.elapsed))
+    there = view_of(new.image, levels, new.instant_motion * readout_share(camera, new.elapsed))
     level = camera.level(levels.numbers[seen_level(levels)])
     compared = compare(here, jax.tree.map(lambda leaf: leaf[None], there), target_T_reference[None], level)
     light, residual = compared.light[0], compared.residuals.grey[0]

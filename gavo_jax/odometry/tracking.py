@@ -3,6 +3,7 @@
 One compiled program does all of it, and what it needs of earlier frames stays on the device.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -127,9 +128,14 @@ class Moved(NamedTuple):
         return cls(is_first, jnp.where(is_first, jnp.eye(4), result.target_T_reference), motion, sway, motion + sway)
 
 
-def _readout(camera: Camera, clock: Clock) -> Float[Array, ""]:
-    """A readout over the time between the frames; 0 where it is longer than that, as stamps may be off."""
-    return jnp.where(camera.readout > 1.5 * clock.elapsed, 0.0, camera.readout / clock.elapsed)
+def as_exposed(camera: Camera, options: OdometryOptions) -> Camera:
+    """The camera that is reckoned with: its rows are exposed at once where options leave the rolling shutter out."""
+    return camera if options.rolling_shutter else replace(camera, readout=0.0)
+
+
+def readout_share(camera: Camera, elapsed: Any) -> Any:
+    """A readout over the time between two frames; 0 where it is longer than that, as stamps may be off."""
+    return camera.readout / elapsed * (camera.readout <= 1.5 * elapsed)
 
 
 def _undo_rolling_shutter(
@@ -189,7 +195,7 @@ def track_frame(
     delay = clock.depth_delay / clock.elapsed
     target = _synchronised(raw, camera, delay * guess, finest) if options.synchronise else raw
     packed = prepare_target(target, levels)
-    readout = _readout(camera, clock) if options.rolling_shutter else None
+    readout = readout_share(camera, clock.elapsed) if options.rolling_shutter else None
     previous, keyframe = (in_exposure(view, state.exposure, exposure) for view in (state.previous, state.keyframe))
     exchanged = None
     if alignment.symmetric:

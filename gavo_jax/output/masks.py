@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Integer
 
-from gavo_jax.errors import GavoError, write_bytes
+from gavo_jax.errors import PARTIAL, GavoError, write_bytes
 from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import stamp_name
 
@@ -82,7 +82,7 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
     if inside.is_symlink() or not inside.is_dir():
         return
     try:
-        for path in inside.glob("*.png"):
+        for path in (*inside.glob("*.png"), *inside.glob(f"*.png.*{PARTIAL}")):  # also what a kill left half written
             if _stamp(path) > float(stamp_name(after)):  # as names have it
                 path.unlink()
         if not any(inside.iterdir()):
@@ -98,6 +98,6 @@ def _path(folder: Path, timestamp: float) -> Path:
 def _stamp(path: Path) -> float:
     """Return the stamp of the frame, seconds; not-a-number where the file is not of a run."""
     try:
-        return float(path.stem)
+        return float(path.name.partition(".png")[0])
     except ValueError:
         return float("nan")

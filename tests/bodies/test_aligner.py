@@ -12,7 +12,7 @@ import pytest
 from carded import CAMERA, FRAMES, TRACKED, Carded, beliefs, view
 
 from gavo_jax.alignment.result import Alignment, no_alignment
-from gavo_jax.bodies.aligner import SUSPECTED, MotionCandidate, _judged
+from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief
 from gavo_jax.bodies.evidence import gather_evidence
 from gavo_jax.bodies.identity import BodyTracks, associate, body_components
@@ -21,7 +21,7 @@ from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.compilation import programs
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
-from gavo_jax.odometry.aligners import Attempt
+from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track
 from gavo_jax.odometry.tracking import blank_state
@@ -66,6 +66,15 @@ def test_a_large_body_leaves_the_brightness_of_the_rest_alone() -> None:
     seen = gather_evidence(now, others, jnp.eye(4)[None], segmenter.camera)
     screen = np.asarray(seen.grey[0, 4:24, 4:-4])
     assert np.median(screen) < 0.5
+
+
+def test_bodies_take_rows_as_exposed_as_the_search_does() -> None:
+    """With the rolling shutter left out of the search only, what is at rest would seem to move."""
+    camera = replace(CAMERA, readout=0.02)
+    for reckons in (True, False):
+        settings = replace(TRACKED, odometry=replace(TRACKED.odometry, rolling_shutter=reckons))
+        search = Search(camera, settings, jax.random.key(0))
+        assert (BodyAware(search, search).segmenter.full.readout > 0) == reckons
 
 
 def test_what_is_at_rest_supports_the_motion() -> None:

@@ -3,6 +3,7 @@
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small import CAMERA
@@ -10,7 +11,7 @@ from small import CAMERA
 from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches, frames_of
+from gavo_jax.experiments.plan import Part, batches, frames_of
 from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
@@ -73,6 +74,25 @@ def test_other_images_or_another_truth_are_another_sequence():
     kinds = [frames_of("room", sequence) for sequence in (one, same, other)]
     assert kinds[0] == kinds[1] and kinds[0]["timestamps_sha256"] == kinds[2]["timestamps_sha256"]
     assert kinds[0]["images_sha256"] != kinds[2]["images_sha256"] and frames_of("hall", one) != kinds[0]
+
+
+def test_a_camera_file_without_a_size_takes_the_images(write_experiment, tmp_path):
+    """`gavo run` took such a file, and an experiment refused it."""
+    write_tum(SyntheticSequence(frames=3, camera=CAMERA), tmp_path / "walk")
+    (tmp_path / "matrix.txt").write_text("131 0 79.5\n0 131 59.5\n0 0 1\n")
+    path = tmp_path / "walk.toml"
+    path.write_text('[[sequences]]\npath = "walk"\ncamera = "matrix.txt"\n[[methods]]\nname = "ga"\n')
+    (run,) = read_plan(path).runs
+    assert run.pixels == 160 * 120 and run.pairs == 2
+
+
+def test_a_dataset_of_ones_own_need_not_be_hashable(write_experiment, monkeypatch):
+    class Own(SyntheticSequence):
+        __hash__: Any = None
+
+    monkeypatch.setattr(Part, "open", lambda part: Own(3, camera=CAMERA))
+    (run,) = read_plan(write_experiment("", '[[methods]]\nname = "ga"\n')).runs
+    assert run.pairs == 2
 
 
 def test_globs_parts_and_missing_sequences(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from gavo_jax.mapping.correction import Doubts, correct, joined
+from gavo_jax.mapping.correction import Doubts, _placed, correct, joined
 from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import Solution, _leverage, optimise
@@ -92,6 +92,13 @@ def test_corrections_change_over_between_keyframes():
     corrected = correct(Trajectory(np.arange(5.0), poses), loops)
     np.testing.assert_allclose(corrected.world_T_camera[:, 1, 3], [0.0, 0.01, 0.02, 0.03, 0.04], atol=1e-9)
     np.testing.assert_allclose(corrected.world_T_camera[:, 0, 3], poses[:, 0, 3], atol=1e-9)
+
+
+def test_two_keyframes_of_one_stamp_have_a_place_each() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    twice = [keyframe(0, 1.0, poses[1], poses[1]), keyframe(1, 1.0, poses[2], poses[2])]
+    placed = _placed(twice, Trajectory(np.array([0.0, 1.0, 1.0, 2.0]), poses))
+    assert [place for _, place in placed] == [1, 2]
 
 
 def test_a_map_that_is_ahead_of_an_interrupted_run_corrects_what_there_is() -> None:

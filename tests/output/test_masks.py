@@ -72,8 +72,16 @@ def test_a_damaged_image_is_one_line(tmp_path: Path, data: bytes):
 def test_files_of_others_stay(tmp_path: Path):
     write_masks(tmp_path, stepped(1, body(1, 0, 4)))
     (tmp_path / MASKS / "mine.png").touch()
+    (tmp_path / MASKS / "mine.png.1-2.partial").touch()
     remove_masks(tmp_path)
-    assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["mine.png"]
+    assert sorted(path.name for path in (tmp_path / MASKS).iterdir()) == ["mine.png", "mine.png.1-2.partial"]
+
+
+def test_what_a_kill_left_half_written_goes_too(tmp_path: Path):
+    write_masks(tmp_path, stepped(1, body(1, 0, 4)))
+    (tmp_path / MASKS / "1.000000.png.17-4.partial").touch()
+    remove_masks(tmp_path)
+    assert not (tmp_path / MASKS).exists()
 
 
 def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
