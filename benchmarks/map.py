@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gavo_jax import Camera, Frame, Reading, open_source, run_odometry
+from gavo_jax.libusb import import_open3d
 from gavo_jax.output.screen import number
-from gavo_jax.scene_map import VOXEL, SceneMap, build_map, import_open3d
+from gavo_jax.scene_map import VOXEL, SceneMap, build_map
 from gavo_jax.trajectory import inverse
 
 FARTHEST = 4.0
@@ -36,7 +37,7 @@ BACKGROUND = 45
 
 def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Metres from points to the mesh."""
-    open3d = import_open3d()
+    open3d = import_open3d("map")
     tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
     rays = open3d.t.geometry.RaycastingScene()
     rays.add_triangles(tensor(scene.points.astype(np.float32)), tensor(faces))
@@ -53,7 +54,7 @@ def points_of(frame: Frame, camera: Camera, world_T_camera: Float[np.ndarray, "4
 
 def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """RGB of the mesh as a camera sees it, by casting a ray through each pixel; dark where there is nothing."""
-    open3d = import_open3d()
+    open3d = import_open3d("map")
     tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
     rays = open3d.t.geometry.RaycastingScene()
     rays.add_triangles(tensor(scene.points.astype(np.float32)), tensor(faces))

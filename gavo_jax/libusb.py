@@ -5,6 +5,8 @@ import importlib
 import warnings
 from typing import Any
 
+from gavo_jax.errors import GavoError
+
 
 def import_with_libusb(name: str) -> Any:
     """Import a library, if need be with the package's libusb; its warnings are not shown.
@@ -21,6 +23,18 @@ def import_with_libusb(name: str) -> Any:
                 raise
             _load_libusb(error)
             return importlib.import_module(name)
+
+
+def import_open3d(extra: str) -> Any:
+    """Open3D, of one of this package's extras.
+
+    Raises:
+        GavoError: it cannot be imported.
+    """
+    try:
+        return import_with_libusb("open3d")
+    except (ImportError, OSError) as error:
+        raise GavoError(f"Open3D cannot be imported ({error}): install 'gavo-jax[{extra}]'") from None
 
 
 def _load_libusb(error: ImportError) -> None:

@@ -22,7 +22,7 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified, without_distortion
 from gavo_jax.errors import GavoError, GavoWarning, partial_of
 from gavo_jax.image.numbers import grey_bytes
-from gavo_jax.libusb import import_with_libusb
+from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.se3 import is_rigid
@@ -89,7 +89,7 @@ class SceneMap:
         check_map(path, self.shape)
         if len(self.points) == 0:
             raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
-        open3d = import_open3d()
+        open3d = import_open3d("map")
         vector = open3d.utility.Vector3dVector
         partial = path.with_name(partial_of(path).name + path.suffix.lower())  # which Open3D goes by
         if self.triangles is None:
@@ -143,7 +143,7 @@ class MapBuilder:
         check_voxel(voxel)
         self._recorded = camera
         self.camera, self.voxel, self.farthest = camera.rectified(), voxel, farthest
-        self._open3d = import_open3d()
+        self._open3d = import_open3d("map")
         core = self._open3d.core
         self._intrinsic = core.Tensor(self.camera.matrix)
         types = (core.float32, core.float32, core.float32)
@@ -399,18 +399,6 @@ def check_voxel(voxel: float) -> None:
     is_number = isinstance(voxel, int | float | np.integer | np.floating) and not isinstance(voxel, bool)
     if not is_number or not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
         raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel!r}")
-
-
-def import_open3d() -> Any:
-    """Open3D.
-
-    Raises:
-        GavoError: it cannot be imported.
-    """
-    try:
-        return import_with_libusb("open3d")
-    except (ImportError, OSError) as error:
-        raise GavoError(f"a map needs Open3D, which cannot be imported ({error}): install 'gavo-jax[map]'") from None
 
 
 def warn_of(scene: SceneMap, path: str | Path) -> None:

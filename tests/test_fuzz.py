@@ -18,7 +18,7 @@ from gavo_jax.camera import MAX_SIDE, Camera
 from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import batches
+from gavo_jax.experiments.plan import batches, programs
 from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.tuning import read_tuning
 from gavo_jax.trajectory import Trajectory
@@ -184,7 +184,7 @@ def read_experiment(folder: Path, content: bytes) -> None:
     (folder / "camera.toml").write_text(SMALL_CAMERA)
     plan = read_plan(folder / "experiment.toml")
     assert plan.runs and len({run.id for run in plan.runs}) == len(plan.runs) and plan.batch >= 1
-    assert all(run.pairs >= 1 for run in plan.runs) and 0 <= plan.programs <= len(plan.runs)
+    assert all(run.pairs >= 1 for run in plan.runs) and 0 <= programs(plan.runs) <= len(plan.runs)
     assert sum(len(batch.runs) for batch in batches(plan.runs, plan.batch)) == len(plan.runs)
 
 

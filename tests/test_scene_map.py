@@ -16,6 +16,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.libusb import import_open3d
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
 from gavo_jax.scene_map import (
@@ -26,7 +27,6 @@ from gavo_jax.scene_map import (
     build_map,
     check_map,
     check_voxel,
-    import_open3d,
 )
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
@@ -66,7 +66,7 @@ def test_absurd_voxels_are_refused(voxel: Any) -> None:
 def test_without_open3d_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(GavoError, match=r"install 'gavo-jax\[map\]'"):
-        import_open3d()
+        import_open3d("map")
 
 
 def test_a_run_without_its_sequence_has_no_map():
@@ -193,7 +193,7 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
     v, u = np.nonzero((frame.depth > 0) & (frame.depth < 3.5 * CAMERA.depth_scale))
     seen = CAMERA.back_project(np.stack([u, v], -1).astype(float), frame.depth[v, u] / CAMERA.depth_scale)
     seen = seen @ poses[2][:3, :3].T + poses[2][:3, 3]
-    open3d = import_open3d()
+    open3d = import_open3d("map")
     cloud, mesh = builder.extract("cloud"), builder.extract("mesh")
     for scene, reach in ((cloud, 0.02), (mesh, 0.02)):
         tree = open3d.core.nns.NearestNeighborSearch(open3d.core.Tensor(scene.points))

@@ -5,10 +5,11 @@ from pathlib import Path
 from gavo_jax.cli.options import Run
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
+from gavo_jax.libusb import import_open3d
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
-from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, import_open3d, warn_of
+from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, warn_of
 from gavo_jax.trajectory import Trajectory
 
 
@@ -30,7 +31,7 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
         raise GavoError(f"{path}: no such folder: {path.parent}")
     if path.is_dir():
         raise GavoError(f"{path}: a folder: name a file for the map")
-    import_open3d()
+    import_open3d("map")
     return shape
 
 

@@ -109,11 +109,6 @@ class Plan:
     batch: int
     ray: RayOptions
 
-    @property
-    def programs(self) -> int:
-        """Number of compiled programs that all runs take."""
-        return programs(self.runs)
-
 
 def batches(runs: Iterable[Run], size: int) -> list[Batch]:
     """Put runs of one part and one program together, at most `size` of them; peers go one by one, and so do runs with a

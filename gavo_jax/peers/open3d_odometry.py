@@ -6,9 +6,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.errors import GavoError
 from gavo_jax.image.numbers import grey_bytes
-from gavo_jax.libusb import import_with_libusb
+from gavo_jax.libusb import import_open3d
 from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 
 
@@ -35,7 +34,7 @@ class Open3DLegacyPeer:
             max_depth: metres; readings beyond are not used.
         """
         self.name = name
-        self._open3d = _import_open3d()
+        self._open3d = import_open3d("peers")
         self.versions = {"open3d": self._open3d.__version__}
         self._camera = camera
         self._max_depth = max_depth
@@ -86,7 +85,7 @@ class Open3DTensorPeer:
     def __init__(self, name: str, camera: Camera, method: str) -> None:
         """Set up the odometry; method is a member of `open3d.t.pipelines.odometry.Method`."""
         self.name = name
-        self._open3d = _import_open3d()
+        self._open3d = import_open3d("peers")
         self.versions = {"open3d": self._open3d.__version__}
         self._camera = camera
         odometry = self._open3d.t.pipelines.odometry
@@ -122,10 +121,3 @@ class Open3DTensorPeer:
                 raise
             return failure()
         return result_of(result.transformation.numpy(), True)
-
-
-def _import_open3d() -> Any:
-    try:
-        return import_with_libusb("open3d")
-    except (ImportError, OSError) as error:
-        raise GavoError(f"Open3D cannot be imported ({error}): install 'gavo-jax[peers]'") from error

@@ -11,7 +11,7 @@ from small import CAMERA
 from gavo_jax.datasets.layouts.tum_writing import write_tum
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.plan import Part, batches, frames_of
+from gavo_jax.experiments.plan import Part, batches, frames_of, programs
 from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import fitted_batches
 
@@ -39,7 +39,7 @@ def test_a_grid(write_experiment, tmp_path):
     assert labels[-2:] == ["gauss-newton", "opencv-rgb"]
     assert [run.seed for run in plan.runs[-2:]] == [7, None]
     # the loss and the preset shape a program, the rate does not
-    assert plan.programs == 2 * 2 + 1
+    assert programs(plan.runs) == 2 * 2 + 1
     assert sorted(len(batch.runs) for batch in batches(plan.runs, 100)) == [1, 1, 6, 6, 6, 6]
     assert max(len(batch.runs) for batch in batches(plan.runs, 4)) == 4
     assert len(fitted_batches(plan.runs, 100, slots=13)) == 14
@@ -49,7 +49,7 @@ def test_runs_with_loops_are_alone_with_their_maps(write_experiment, monkeypatch
     loops = '[[methods]]\nname = "ga"\nsweep.odometry.loops = [true, false]\n'
     plan = read_plan(write_experiment("seeds = 3", loops))
     assert [len(batch.runs) for batch in batches(plan.runs, 100)] == [1, 1, 1, 3]
-    assert plan.programs == 1
+    assert programs(plan.runs) == 1
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(GavoError, match=r"methods\[1\]: loops need GTSAM: pip install") as refused:
         read_plan(write_experiment("seeds = 3", loops))
