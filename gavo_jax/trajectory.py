@@ -32,7 +32,9 @@ NO_POSE = "numbers that are not finite, or a zero quaternion"
 """What a row of a trajectory holds where a tracker saw nothing."""
 
 
-TRAJECTORY_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, seconds and metres)"
+COLUMNS = "timestamp tx ty tz qx qy qz qw"
+
+TRAJECTORY_HEADER = f"# {COLUMNS} (camera to world, seconds and metres)"
 
 
 SEGMENT_COMMENT = re.compile(r"# segment (\d{1,9})\b")
@@ -44,6 +46,13 @@ W_FIRST = re.compile(
     rf"^#.*\bq\w*w{_APART}q\w*x{_APART}q\w*y{_APART}q\w*z[^\w\n]*$", re.MULTILINE | re.IGNORECASE | re.ASCII
 )
 """A comment that ends with the names of the last columns, as EuRoC's does: w before x."""
+
+
+_TURN_FIRST = re.compile(
+    rf"^#.*\bq\w*[wz]{_APART}(?!q)\w*x{_APART}(?!q)\w*y{_APART}(?!q)\w*z[^\w\n]*$",
+    re.MULTILINE | re.IGNORECASE | re.ASCII,
+)
+"""A comment that ends with a position, after a quaternion."""
 
 
 W_FIRST_ORDER = "wxyz"
@@ -132,6 +141,8 @@ class Trajectory:
         text = read_text(path)
         heading, all_places = without_heading(rows_of(text, path))
         order = _order_of(heading, path)
+        if comment := _TURN_FIRST.search(text):
+            raise GavoError(f"{path}: {comment[0][:100]}: expected {COLUMNS}")
         parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
         if not parsed:
             raise GavoError(f"{path}: holds no trajectory (no rows)")
@@ -346,7 +357,7 @@ def _order_of(heading: list[str], path: str | Path) -> str:
     ends = "".join(word[-1].lower() for word in heading[1:])
     turn_first = any(word.lower().startswith("q") for word in heading[1:4])
     if heading and (turn_first or ends not in ("xyzxyzw", "xyz" + W_FIRST_ORDER)):
-        raise GavoError(f"{path}: columns {' '.join(heading)[:100]}: expected timestamp tx ty tz qx qy qz qw")
+        raise GavoError(f"{path}: columns {' '.join(heading)[:100]}: expected {COLUMNS}")
     return ends[3:]
 
 

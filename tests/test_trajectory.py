@@ -33,6 +33,14 @@ def random_trajectory(count: int, seed: int, step: float = 0.01) -> Trajectory:
     return Trajectory(1305031102.175304 + np.arange(count) * step, world_T_camera)
 
 
+def test_a_comment_that_names_the_quaternion_first_is_refused(tmp_path: Path):
+    (tmp_path / "poses.txt").write_text("# timestamp qx qy qz qw tx ty tz\n" + GOOD)
+    with pytest.raises(GavoError, match="qw tx ty tz: expected timestamp tx ty tz qx qy qz qw"):
+        Trajectory.read_tum(tmp_path / "poses.txt")
+    (tmp_path / "poses.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + GOOD)
+    assert len(Trajectory.read_tum(tmp_path / "poses.txt")) == 1
+
+
 def test_a_note_may_name_a_folder_whose_name_is_not_utf_8(tmp_path: Path):
     write_lines(tmp_path / "notes.txt", [os.fsdecode(b"# runs/caf\xe9")])
     assert (tmp_path / "notes.txt").read_bytes() == b"# runs/caf\xe9\n"

@@ -37,6 +37,9 @@ WIDEST_HALF, SQUARE = 1.5, (0.67, 1.5)
 """Of a row of numbers without names: the principal point over the focal length at most, and how far pixels may be from
 square. Else the numbers are in another order."""
 
+ALIKE = 0.03
+"""Share of a focal length by which that of rows differs from that of columns, mostly by much less."""
+
 MOST_SKEW = 0.5
 """Pixels: pixels whose rows and columns are so far from square to each other are no camera's of ours."""
 
@@ -306,10 +309,8 @@ def _parse_numbers(path: Path, text: str) -> Table:
         rows = [[number(field) for field in line] for line in lines if line != [""]]
         if len(rows) == 1 and len(rows[0]) == 9 and not any(rows[0][at] for at in (1, 3, 6, 7)):
             return of_matrix(str(path), rows[0])
-        if len(rows) == 1 and len(rows[0]) == 6 and all(side.is_integer() for side in rows[0][:2]):
-            width, height, fx, fy, cx, cy = rows[0]
-            _check_order(path, fx, fy, cx, cy)
-            return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        if len(rows) == 1 and len(rows[0]) == 6:
+            return _with_size(path, rows[0])
         if len(rows) == 1 and len(rows[0]) >= 4:
             fx, fy, cx, cy, *distortion = rows[0]
             _check_order(path, fx, fy, cx, cy)
@@ -327,9 +328,19 @@ def _parse_numbers(path: Path, text: str) -> Table:
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 
 
+def _with_size(path: Path, row: list[float]) -> Table:
+    """The camera of a row whose images' size stands first or last: the two numbers between which the centre lies."""
+    for width, height, fx, fy, cx, cy in (row, row[4:] + row[:4]):
+        if width.is_integer() and height.is_integer() and 0 < cx < width and 0 < cy < height:
+            _check_order(path, fx, fy, cx, cy)
+            return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    raise ValueError
+
+
 def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None:
     is_wide = cx > fx * WIDEST_HALF or cy > abs(fy) * WIDEST_HALF
-    if is_wide or not SQUARE[0] * abs(fy) < fx < SQUARE[1] * abs(fy):
+    is_turned = abs(cx - fx) < ALIKE * fx and abs(fy - fx) > 5 * ALIKE * fx  # fx cx fy cy
+    if is_turned or is_wide or not SQUARE[0] * abs(fy) < fx < SQUARE[1] * abs(fy):
         raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
 
 

@@ -154,7 +154,8 @@ def doubt_of_scale(sequence: FrameSequence) -> str | None:
     sample, scale = sample_sequence(sequence)
     if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
         return None
-    other = _most_usual(sample, [unit for unit in COMMON if unit != scale])
+    others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
+    other = _most_usual(sample, others)
     if other is None:
         return None
     as_it_is, in_other = (f"{sample.median / unit:.3g} m" for unit in (scale, other))

@@ -1,26 +1,27 @@
 """Sequences whose frames lie as image files."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, NamedTuple, overload
+from typing import Any, ClassVar, NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera, preset_for_sequence
-from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, Size, load_calibration
+from gavo_jax.camera_files.calibration import DEPTH_SCALE, MAX_JSON_BYTES, Calibration, Size, load_calibration
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.films import file_of, film_of, read_frame
 from gavo_jax.datasets.images import read_bytes, read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
-from gavo_jax.errors import GavoError, read_text
+from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.trajectory import Trajectory
 
 SAMPLED = 3
@@ -238,7 +239,7 @@ CAMERA_FILES = (
     *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
     *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
     *("camera-intrinsics.txt", "camera_intrinsics.txt", "camera_intrinsic.txt", "intrinsics.txt", "calibration.txt"),
-    *("intrinsics_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic_color.txt"),
+    *("intrinsics_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic_color.txt", "colorIntrinsics.txt"),
 )
 """Names by which a camera file in a folder, or in the one above, is known."""
 
@@ -252,6 +253,14 @@ EXPORTED_CAMERA_FILES = (
 """Names that other programs give their cameras, which may be estimates: asked where nothing else tells the camera."""
 
 
+def told_in(file: Path) -> dict[str, Any]:
+    """The names and values that a file of JSON beside the images holds; none where it is something else."""
+    try:
+        return read_json_object(file, MAX_JSON_BYTES)
+    except GavoError:
+        return {}
+
+
 def own_camera_file(folder: Path) -> Path | None:
     """The camera file that lies in a folder, if one does.
 
@@ -261,7 +270,7 @@ def own_camera_file(folder: Path) -> Path | None:
     file = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
     if file is None:
         return info_of_scan(folder)
-    other = file.with_name(file.name.replace("_color", "_depth"))
+    other = file.with_name(re.sub("(_|^)color", r"\1depth", file.name))
     if other.is_file() and read_text(other).split() != read_text(file).split():
         raise GavoError(
             f"{file}: {other.name} beside it is of another camera: say --camera with a file of both cameras "
@@ -286,7 +295,7 @@ def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calib
         return preset_by_name(folder)
     except GavoError:
         files = (folder / name for name in EXPORTED_CAMERA_FILES if (folder / name).is_file())
-        file = next((file for file in files if file.stem != "metadata" or '"K"' in read_text(file)), None)
+        file = next((file for file in files if file.stem != "metadata" or "K" in told_in(file)), None)
         if file is None:
             raise
     return load(file)

@@ -10,6 +10,7 @@ from gavo_jax.datasets import unrecognised
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.layouts.arkit import Polycam, ScannerApp, ScanNetPlusPlus
+from gavo_jax.datasets.layouts.bonn import Bonn
 from gavo_jax.datasets.layouts.bop import BopScene
 from gavo_jax.datasets.layouts.neural import NeuralRgbd, SemanticReplica
 from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
@@ -49,6 +50,7 @@ class Dataset(Protocol):
 BUILT_IN: tuple[Dataset, ...] = (
     *(
         OpenLoris,
+        Bonn,
         TumSequence,
         SevenScenes,
         BopScene,

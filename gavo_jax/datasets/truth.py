@@ -70,7 +70,11 @@ def truth_in(
         GavoError: it cannot be read.
     """
     if (folder / TRUTH).exists():
-        return _timed(Trajectory.read_tum(folder / TRUTH), folder / TRUTH, list(frames), seconds)
+        try:
+            truth = Trajectory.read_tum(folder / TRUTH)
+        except GavoError as error:
+            raise GavoError(f"{error}; by another name it is not read") from None
+        return _timed(truth, folder / TRUTH, list(frames), seconds)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None

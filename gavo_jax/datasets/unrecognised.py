@@ -107,8 +107,8 @@ def _stereo(place: Place) -> str | None:
         return None
     if (stereo / "depth0" / "data").is_dir():
         return (
-            f"{stereo / 'depth0'}: as InteriorNet has it, whose depth is the length of a ray: write z = length / "
-            "sqrt(1 + x^2 + y^2) for each pixel into depth/, beside rgb/"
+            f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays, "
+            "have to be written there as z = length / sqrt(1 + x^2 + y^2)"
         )
     return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
 

@@ -324,6 +324,12 @@ def test_numbers_alone_need_the_images_size(tmp_path, text, camera):
         load_calibration(path, (8, 8))
 
 
+def test_the_size_may_stand_first_or_last_in_a_row(tmp_path):
+    for name, row in (("first", "640 480 500 510 319.5 239.5"), ("last", "500 510 319.5 239.5 640 480")):
+        (tmp_path / f"{name}.txt").write_text(f"{row}\n")
+        assert load_calibration(tmp_path / f"{name}.txt").color == NONE
+
+
 @pytest.mark.parametrize("make", ["ros", "open3d"])
 def test_a_matrix_may_be_a_list_of_rows(tmp_path, make):
     path = tmp_path / ("a.yaml" if make == "ros" else "a.json")
@@ -436,6 +442,8 @@ FAULTS = {
     "size first.txt": ("640 480 500 510 319.5 239.5 0 0\n", "distortion"),
     "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: must be a number from -1 to 1, not 40"),
     "larger image.txt": ("1170 1170 647 483\n", "middle of an image of about 1294x966, not of 640x480"),
+    "columns first.txt": ("500 319.5 510 239.5\n", "hardly fx fy cx cy"),
+    "columns of a wide image.txt": ("910.5 640.2 910.1 360.3\n", "hardly fx fy cx cy"),
     "smaller image.toml": (TOML.replace("640", "1280").replace("480", "960"), "about 639x479, not of 1280x960"),
     "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: turn fx"),
     "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),

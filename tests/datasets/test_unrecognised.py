@@ -26,7 +26,10 @@ def made(folder: Path, *names: str) -> Path:
         (("walk.oni", "notes.md"), r"walk\.oni: a recording of OpenNI: write its images and depth"),
         (("walk.MP4", "notes.md"), r"walk\.MP4: a film: write its frames as images"),
         (("mav0/cam0/data/1.png",), "cam0: a recording as EuRoC has it, of stereo images without depth"),
-        (("cam0/data/1.png", "depth0/data/1.png"), "depth0: as InteriorNet has it, whose depth is the length of a ray"),
+        (
+            ("cam0/data/1.png", "depth0/data/1.png"),
+            "depth0: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays",
+        ),
         (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI"),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),

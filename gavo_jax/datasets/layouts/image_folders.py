@@ -34,6 +34,9 @@ PAIR = re.compile(r"(.*)(?<![a-z])(?:colou?r|rgb)(?![a-z])(.*)")
 DEPTH_WORD = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
 """In the names of depth images that lie beside colour, as a part of its own, where some have it so."""
 
+NO_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?r(?:ed)?)(?![a-z])")
+"""In the names of folders of what is made of depth, or said of it."""
+
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img", "left", r"^\d+\.")
 """In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
 say nothing. Of a stereo camera depth is that of the left image."""
@@ -54,7 +57,10 @@ def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
     registered = sorted(filter(_is_registered, children), key=lambda name: (name not in DEPTH_FOLDERS, name))
     names = COLOR_FOLDERS, dict.fromkeys((*registered, *DEPTH_FOLDERS))
     color, depth = ([children[name] for name in some if name in children] for some in names)
-    return (color, depth) if color or depth else _named_alike(children)
+    if color and depth:
+        return color, depth
+    alike = _named_alike(children)
+    return alike if all(alike) else (color, depth)
 
 
 def _named_alike(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
@@ -63,9 +69,14 @@ def _named_alike(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
     found = [
         ([children[match[0]]], depth)
         for match in matches
-        if (depth := [child for name, child in children.items() if name.startswith(f"{match[1]}depth{match[2]}")])
+        if (depth := [children[name] for name in children if _is_depth_beside(match, name)])
     ]
     return found[0] if len(found) == 1 else ([], [])
+
+
+def _is_depth_beside(color: re.Match[str], name: str) -> bool:
+    """Whether a folder's name is that of depth, beside colour's."""
+    return name.startswith(f"{color[1]}depth{color[2]}") and not NO_DEPTH.search(name)
 
 
 def _folders(path: Path) -> tuple[Path | None, Path | None]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camera_from_table, load_calibration
+from gavo_jax.camera_files.calibration import Calibration, camera_from_table, load_calibration
 from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.makes import of_matrix
 from gavo_jax.camera_files.words import REQUIRED
@@ -24,11 +24,11 @@ from gavo_jax.datasets.files import (
     Reading,
     Size,
     depth_size_of_most,
-    info_of_scan,
     own_camera_file,
     preset_or_export,
     resolve_folder,
     size_of_most,
+    told_in,
 )
 from gavo_jax.datasets.films import film_of, rate_of
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
@@ -37,7 +37,7 @@ from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
-from gavo_jax.errors import GavoError, read_json_object
+from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
@@ -172,12 +172,13 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def find(cls, path: Path) -> Found:
         """Both kinds lie in the folder itself."""
-        return found_among(path.glob("frame-*.color.*"), path.glob("frame-*.depth.*"))
+        color, depth = (sorted(path.glob(f"frame-*.{kind}.*")) for kind in ("color", "depth"))
+        return found_among(_recorded(color), _recorded(depth))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera file beside the frames, or a scan's info.txt, there or one folder up, else the dataset's."""
-        file = own_camera_file(path) or info_of_scan(path.parent)
+        """The camera file beside the frames or one folder up, a scan's info.txt, too, else the dataset's."""
+        file = own_camera_file(path) or own_camera_file(path.resolve().parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
         return _millimetres(load_calibration(file, partial(size_of_most, entries), MILLIMETRES))
@@ -384,16 +385,13 @@ def by_rate(rate: Any) -> Seconds | None:
     return lambda numbers: numbers / rate
 
 
-def told_in(file: Path) -> dict[str, Any]:
-    """The names and values that a file of JSON beside the images holds; none where it is something else."""
-    try:
-        return read_json_object(file, MAX_JSON_BYTES)
-    except GavoError:
-        return {}
-
-
 def _any(folder: Path, pattern: str) -> Path | None:
     return next(folder.glob(pattern), None)
+
+
+def _recorded(files: list[Path]) -> list[Path]:
+    """Files of names of three parts, where some are: those of more are made of others, by projecting or rendering."""
+    return [file for file in files if file.name.count(".") == 2] or files
 
 
 def found_among(color: Iterable[Path], depth: Iterable[Path]) -> Found:

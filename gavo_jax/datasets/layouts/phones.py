@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file
+from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file, told_in
 from gavo_jax.datasets.layouts.image_folders import plain_files
-from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, by_rate, of_each_frame, told_in
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, by_rate, of_each_frame
 from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.truth import Seconds, numbers_in, posed
-from gavo_jax.errors import GavoError, data_rows, read_text
+from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, inverse
 
 
@@ -110,7 +110,7 @@ class Record3D(PlainFolder):
     def recognises(cls, path: Path) -> bool:
         """Recognise a folder by the camera in its file, beside images."""
         file = path / cls.FILE
-        return file.is_file() and '"K"' in read_text(file, MAX_JSON_BYTES) and super().recognises(path)
+        return file.is_file() and "K" in told_in(file) and super().recognises(path)
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, load_calibration
+from gavo_jax.datasets.clocks import in_seconds
 from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
@@ -40,6 +41,9 @@ MAX_PATH = 1000
 
 MAX_STAMP = 1e10
 """Seconds, three centuries since 1970: what is larger counts something else."""
+
+COLOR = "color.txt"
+"""The list of colour, by the name that some give it."""
 
 ASSOCIATIONS = tuple(f"{name}.txt" for name in ("associations", "association", "associated", "associate", "assoc"))
 """Both lists in one, as ICL-NUIM has it and `associate.py` prints it: `stamp path stamp path`."""
@@ -130,6 +134,11 @@ class TumSequence(FileSequence):
         )
         self.times_guessed = "stamps are numbers" if rate is None and lists.unit == 1 / INDEX_RATE else ""
 
+    @property
+    def unit_is_assumed(self) -> bool:
+        """Whether nothing says the unit of depth, so that it is taken for the benchmark's."""
+        return not self.calibration.states_depth_scale
+
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a list lies in the folder."""
@@ -216,6 +225,8 @@ class _Lists(NamedTuple):
 def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | None) -> _Lists:
     """Read both lists, or the one in their place."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
+    if not (folder / names[0]).exists() and (folder / COLOR).exists():
+        names = (COLOR, names[1])
     if any((folder / name).exists() for name in names):
         both = None
     if both is None:
@@ -234,10 +245,12 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
         raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
     stamps = [row.stamp for row in color]
     unit = _unit(stamps, rate) if are_whole else decimal_unit(stamps) or 1.0
+    counts = [row.stamp for row in (*color, *depth)]
+    seconds = dict(zip(counts, in_seconds(counts, unit), strict=True))
     for row in (*color, *depth):
-        if not abs(unit * row.stamp) < MAX_STAMP:
+        if not abs(seconds[row.stamp]) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
-    color, depth = ([row._replace(stamp=unit * row.stamp) for row in rows] for rows in (color, depth))
+    color, depth = ([row._replace(stamp=seconds[row.stamp]) for row in rows] for rows in (color, depth))
     return _Lists(color, depth, unit, are_paired=both is not None, repeated=repeated)
 
 
@@ -255,7 +268,8 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
     pairs = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 4:
-            raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields")
+            aside = ": without this file, images are paired by their names" if len(fields) == 2 else ""
+            raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields{aside}")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
         pairs.append(pair[::-1] if fields[1].count("depth") > fields[3].count("depth") else pair)
     color, depth = (_in_time(path, [pair[at] for pair in pairs]) for at in (0, 1))

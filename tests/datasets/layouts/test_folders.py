@@ -56,6 +56,34 @@ def wrote(folder: Path, name: str) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("name", ["../camera-intrinsics.txt", "colorIntrinsics.txt"])
+def test_a_folder_named_as_7_scenes_has_a_camera_of_its_own(folder, name):
+    """3DMatch has it one folder up; VolumeDeform beside, in a file of each camera. The run took that of 7-Scenes."""
+    wrote(folder, "seven_scenes")
+    (folder / "camera-intrinsics.txt").unlink(missing_ok=True)
+    for kind in ("color", "depth"):
+        (folder / name.replace("color", kind)).write_text("140 0 79.5 0\n0 140 59.5 0\n0 0 1 0\n0 0 0 1\n")
+    assert open_source(folder).camera.fx == 140
+
+
+def test_what_is_made_of_a_frame_is_not_the_frame(folder):
+    """7-Scenes comes with depth projected into colour, 3RScan with rendered images: two of one number were refused."""
+    wrote(folder, "seven_scenes")
+    count = len(open_source(folder))
+    for file in sorted(folder.glob("frame-*.depth.*")):
+        shutil.copy(file, file.with_name(file.name.replace(".depth.", ".depth.proj.")))
+    assert len(open_source(folder)) == count
+
+
+@pytest.mark.parametrize("names", [("align_rgb", "align_depth"), ("rgb", "depth_png"), ("colour", "depth_noise")])
+def test_one_folder_of_each_kind_is_enough(folder, names):
+    wrote(folder, "plain")
+    for new, kind in zip(names, ("rgb", "depth"), strict=True):
+        next(child for child in folder.iterdir() if child.name == kind).rename(folder / new)
+    (folder / "depth_confidence").mkdir()
+    assert len(open_source(folder)) == len(GREYS)
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_layout_gives_the_same_frames(folder, name):
     sequence = open_source(wrote(folder, name))

@@ -59,6 +59,28 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
+def test_a_unit_that_nobody_says_is_a_guess(folder):
+    """A recorder of another camera writes millimetres: the run took 5000 to a metre for known."""
+    numbers = "fx = 50.0\nfy = 50.0\ncx = 31.5\ncy = 23.5\nwidth = 64\nheight = 48\n"
+    (folder / "camera.toml").write_text(numbers)
+    assert TumSequence(folder).unit_is_assumed
+    (folder / "camera.toml").write_text(numbers + "depth_scale = 1000.0\n")
+    assert not TumSequence(folder).unit_is_assumed and not TumSequence(folder, "fr1").unit_is_assumed
+
+
+def test_lists_may_count_ticks_of_windows(folder):
+    for name in ("rgb.txt", "depth.txt"):
+        lines = [line.split() for line in (folder / name).read_text().splitlines()[1:]]
+        ticks = [f"{round(1e7 * (1.6e9 + float(stamp))) + 116444736000000000} {path}" for stamp, path in lines]
+        (folder / name).write_text("\n".join(ticks) + "\n")
+    np.testing.assert_allclose(TumSequence(folder, CAMERA).timestamps, 1.6e9 + np.array(STAMPS), atol=1e-5)
+
+
+def test_the_list_of_colour_may_be_called_so(folder):
+    (folder / "rgb.txt").rename(folder / "color.txt")
+    assert len(TumSequence(folder, CAMERA)) == len(STAMPS)
+
+
 def test_frames_come_as_written(folder):
     sequence: Sequence = TumSequence(folder, CAMERA, color=True)
     sequence.check()
@@ -325,6 +347,7 @@ def test_undistortion_belongs_to_the_sequence(folder):
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "rgb/\0.png"), "rgb.txt:5: not a usable path"),
         (lambda f: edit(f / "depth.txt", "100.", "900."), "no stamps"),
         (lambda f: (f / "groundtruth.txt").write_text(""), "groundtruth.txt: "),
+        (lambda f: (f / "groundtruth.txt").write_text("1,2,3,4\n"), "found 4 fields; by another name it is not read"),
         (lambda f: (f / "groundtruth.txt").write_text("nan nan nan nan nan nan nan nan\n"), "groundtruth.txt:1: "),
     ],
 )
