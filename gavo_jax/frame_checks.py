@@ -113,6 +113,8 @@ MAX_USUAL_INTERVAL = 1.5
 MIN_INTERVALS = 3
 """Intervals that have to be known before one can be unusual."""
 ROW_STEP = 4
+THUMBNAIL = 5
+"""Pixels that a side of the thumbnail has at least, where the image has so many."""
 DEPTH_STEP = 7
 """Pixels of a depth image, row after row, of which one is looked at: some of every row and, as few widths are
 multiples of this, of every column. Every fourth row may be one of those that a spinning sensor leaves out."""
@@ -146,7 +148,8 @@ def check_frame(
     status, clipped = _check_image(grey)
     if status is not AlignmentStatus.OK:
         return _refused(status), history
-    thumbnail = grey[::ROW_STEP, :: ROW_STEP**2].astype(int)
+    rows, columns = _steps(grey)
+    thumbnail = grey[::rows, ::columns].astype(int)
     before = np.array(history.thumbnail)
     near = before.size == thumbnail.size and np.abs(thumbnail.ravel() - before).max() <= MAX_DUPLICATE_DIFFERENCE
     if checksum == repeated or near:  # the next one is compared with what this one repeats: small changes add up
@@ -244,9 +247,16 @@ def _check_image(grey: np.ndarray) -> tuple[AlignmentStatus, float]:
     return AlignmentStatus.OK, clipped
 
 
+def _steps(grey: np.ndarray) -> tuple[int, int]:
+    """Rows and columns between the pixels of a thumbnail, which of a small image are nearer to each other."""
+    height, width = grey.shape
+    return max(1, min(ROW_STEP, height // THUMBNAIL)), max(1, min(ROW_STEP**2, width // THUMBNAIL))
+
+
 def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray) -> bool:
     """Whether much of an image is to the digit what it was, where there is something to see, and much of it is not."""
-    beside = grey[::ROW_STEP, ROW_STEP // 2 :: ROW_STEP**2]
+    rows, step = _steps(grey)
+    beside = grey[::rows, min(ROW_STEP // 2, step - 1) :: step]
     columns = beside.shape[1]
     now, was = thumbnail[:, :columns], before[:, :columns]
     seen, change = np.abs(beside - now) > 2 * MAX_DUPLICATE_DIFFERENCE, np.abs(now - was)

@@ -109,9 +109,9 @@ WIDE_OBJECTIVE = AlignmentOptions(
     scout_spread=(0.2, 0.5),
     min_overlap=0.2,
     outside_cost=1.0,
-    bounds=(1.0, 1.2),
+    bounds=(1.0, 1.7),
 )
-"""Motions of up to 1 m and 70° from the guess: thousands of scouts, then 96 populations at level 4, of which the 16
+"""Motions of up to 1 m and 97° from the guess: thousands of scouts, then 96 populations at level 4, of which the 16
 that most speaks for go on to level 3 and 4 are refined; beside them what the features of a single pair ask for. A point
 out of view costs as much as a typical one in view, so that leaving the view neither pays nor is shunned. Exposure
 changes over such motions, so residuals are taken about their mean. Once a mode is refined, grey alone tells its

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.sensor_noise import NONE
@@ -213,6 +214,19 @@ def test_no_part_of_a_real_image_stands_still(data_dir: Path, clip: str) -> None
         finding, history = check_frame(frame, frame.timestamp, sequence.camera, history)
         findings.append(finding.status)
     assert Status.MOVING_BODY not in findings
+
+
+@pytest.mark.parametrize("size", [(16, 16), (32, 24), (64, 48)])
+def test_small_images_are_not_frozen(size: tuple[int, int]) -> None:
+    """Of 16x16 pixels one was looked at."""
+    width, height = size
+    camera = Camera(0.8 * width, 0.8 * width, (width - 1) / 2, (height - 1) / 2, width, height)
+    walk = list(SyntheticSequence(frames=12, camera=camera))
+    history, statuses = History(), []
+    for frame in walk:
+        finding, history = check_frame(frame, frame.timestamp, camera, history)
+        statuses.append(finding.status)
+    assert Status.FROZEN not in statuses
 
 
 def test_a_slow_camera_without_noise_is_not_frozen_for_ever() -> None:

@@ -328,8 +328,14 @@ def _moved(
     xi: Any = log(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
+    before = state.tracker  # what the search made of the wrong motion is of no use
     tracker = tracker._replace(
-        keyframe=tracker.previous, motion=xi, guess=xi, instant_motion=xi, usual=state.tracker.usual
+        keyframe=tracker.previous,
+        motion=xi,
+        guess=xi,
+        instant_motion=xi,
+        velocity_change=before.velocity_change,
+        usual=before.usual,
     )
     return attempt._replace(state=tracker, result=result, usable=True)
 

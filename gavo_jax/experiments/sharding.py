@@ -11,14 +11,16 @@ from jaxtyping import Float, PRNGKeyArray
 from gavo_jax.alignment.pairs import align_rows, starts_of
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.alignment.review import review
-from gavo_jax.alignment.stacking import Images, stacked_pairs
+from gavo_jax.alignment.stacking import Images, require_untraced, stacked_pairs
 from gavo_jax.camera import Camera
+from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.settings import Settings, as_settings
 from gavo_jax.solvers.base import Solver
 
 PAIRS = PartitionSpec("pairs")
 
 
+@in_32_bits
 def align_batch_sharded(
     references: Any,
     targets: Any,
@@ -48,6 +50,7 @@ def align_batch_sharded(
     Raises:
         GavoError: as `align_batch`.
     """
+    require_untraced(references, targets, camera, settings, keys, guesses)
     settings = as_settings(settings)
     sides, keys = stacked_pairs(references, targets, camera, keys)
     count, starts = len(keys), starts_of(guesses, sides, camera, settings)

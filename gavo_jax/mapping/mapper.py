@@ -107,9 +107,10 @@ class Mapper:
             return
         seconds = step.timestamp - step.reference_timestamp
         motion = np.asarray(step.alignment.target_T_reference, np.float64)
-        twist = log(motion) / max(seconds, 1e-3)
+        twist = log(motion) / max(seconds, 1e-3) if seconds > 0 else np.zeros(6)
         if self._first is not None and not self.keyframes.all:
-            self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist))
+            is_reference = stamp_name(self._first.timestamp) == stamp_name(step.reference_timestamp)
+            self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist if is_reference else np.zeros(6)))
         self._first = None
         due, is_found = self.is_due(step), step.origin == "relocalised"
         if is_found:
@@ -123,6 +124,8 @@ class Mapper:
             self._add(keyframe)
             if is_found:
                 self._tie(keyframe)
+            else:
+                self._look_back(step)
             self._newest = None
         elif frame is not None and _may_be_keyframe(step):
             self._newest = frame, step, twist
@@ -220,12 +223,18 @@ class Mapper:
     def _follow(self, step: Step, motion: np.ndarray) -> None:
         """Keep the covariance of the motion since the last keyframe."""
         before = self._known.get(stamp_name(step.reference_timestamp))
-        covariance = mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
+        covariance = _covariance(step)
         if before is not None and np.isfinite(covariance).all():
             covariance = transport_covariance(motion, before.covariance + covariance)
             self._known[stamp_name(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
+
+    def _look_back(self, step: Step) -> None:
+        """Keep the covariance of the motion from a new keyframe to its reference, by which later frames may go on."""
+        covariance = _covariance(step)
+        if np.isfinite(covariance).all():
+            self._known[stamp_name(step.reference_timestamp)] = _Way(covariance, is_in_doubt(step))
 
     def _add(self, keyframe: Keyframe) -> None:
         self.keyframes.add(keyframe)
@@ -280,6 +289,11 @@ class Mapper:
                 covariance = covariance + DOUBTED**2 * np.eye(6)
             edges.append(Edge(a.number, b.number, inverse(a.world_T_odometry) @ b.world_T_odometry, covariance))
         return edges
+
+
+def _covariance(step: Step) -> Float64[np.ndarray, "6 6"]:
+    """Covariance of a step's motion in the reference's camera."""
+    return mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
 
 
 def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:

@@ -149,7 +149,8 @@ def _plausible(
     for edge in loops:
         said = inverse(chain[edge.earlier]) @ chain[edge.later]
         residual = log(inverse(edge.earlier_T_later) @ said)
-        drifted = transport_covariance(inverse(chain[edge.later]), spread[edge.later] - spread[edge.earlier])
+        first, last = sorted((edge.earlier, edge.later))  # numbers may fall where a segment was found again
+        drifted = transport_covariance(inverse(chain[edge.later]), spread[last] - spread[first])
         squared = residual @ np.linalg.solve(MISTRUST * drifted + edge.covariance, residual)
         result.append(squared < _chi_squared_below(IMPOSSIBLE))
     return np.array(result)

@@ -68,8 +68,9 @@ class Problem:
         if self.centre is None or self.reach is None:
             return jnp.zeros(motions.shape[:-2], bool)
         offset = rigid_inverse(self.centre) @ motions
-        cosine = 0.5 * (jnp.trace(offset, axis1=-2, axis2=-1) - 1.0)
-        return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (cosine < jnp.cos(self.reach[1]))
+        turned = jnp.linalg.norm(offset[..., :3, :3] - jnp.eye(3), axis=(-2, -1))
+        farthest = 2.0**1.5 * jnp.sin(0.5 * jnp.minimum(self.reach[1], jnp.pi))  # ‖R − I‖ of that angle
+        return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (turned > farthest)
 
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
         """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""

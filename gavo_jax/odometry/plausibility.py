@@ -143,10 +143,13 @@ def image_shift(translation: Any, rotation: Any) -> Any:
 
 
 def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, " 2"]:
-    """How far translation and rotation are from what was predicted, which may take that share more or less of time."""
+    """How far translation and rotation are from what was predicted, which may take that share more or less of time.
+
+    It is never turned round.
+    """
     moved, expected = twist.reshape(2, 3), predicted.reshape(2, 3)
     along = jnp.sum(moved * expected, axis=1) / jnp.maximum(jnp.sum(expected**2, axis=1), 1e-12)
-    stretched = jnp.clip(along, 1.0 - share, 1.0 + share)[:, None] * expected
+    stretched = jnp.clip(along, jnp.maximum(1.0 - share, 0.0), 1.0 + share)[:, None] * expected
     return jnp.linalg.norm(moved - stretched, axis=1)
 
 

@@ -13,6 +13,7 @@ from gavo_jax.odometry.depth_watch import DepthWatch
 from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.odometry.way import Way
 
@@ -66,6 +67,9 @@ class Progress(NamedTuple):
         return self._replace(segment=number, last_segment=number, adrift=1)
 
     def clock(self, frame: Frame) -> Clock:
-        """When a frame was taken, which is counted as the last one already."""
+        """When a frame was taken, which is counted as the last one already; of a clock that was set back since the
+        reference, it is not known how long that took.
+        """
         elapsed = frame.timestamp - self.reference_timestamp
-        return Clock(np.float32(max(elapsed, 1e-3)), np.float32(frame.depth_delay), np.uint32(self.last_index))
+        elapsed = max(elapsed, 1e-3) if elapsed > 0 else UNKNOWN_SECONDS
+        return Clock(np.float32(elapsed), np.float32(frame.depth_delay), np.uint32(self.last_index))

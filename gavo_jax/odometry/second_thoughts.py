@@ -14,7 +14,7 @@ from gavo_jax.alignment.result import with_finding
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Aligner, Attempt, Search, agree
 from gavo_jax.odometry.tracking import Clock, TrackerState
-from gavo_jax.status import AlignmentStatus
+from gavo_jax.status import AlignmentStatus, bit
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Recovering(SecondThought):
         again = self.second.align(state, frame, clock)
         if again.usable:
             return again
-        confirmed = attempt.result.status == again.result.status == AlignmentStatus.HIGH_ERROR
+        confirmed = int(attempt.result.findings) == int(again.result.findings) == bit(AlignmentStatus.HIGH_ERROR)
         return attempt._replace(usable=confirmed and agree(attempt.result, again.result), fit=False)
 
 

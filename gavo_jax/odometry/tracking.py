@@ -81,6 +81,8 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
 
 KEYFRAME_SHARES = 16
 """Number of shares that a keyframe's points are dealt into, each renewed on its own."""
+LEFT = 0.5
+"""Points of a share, over those that a new one would have, below which those that bodies took count as out of view."""
 KEYFRAME_SPREAD = 0.2
 """Width of the range over which the overlaps at which they are renewed are evenly spread."""
 
@@ -101,10 +103,10 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
     places = np.arange(keyframe.grey.shape[-1])
     share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each all over the image
     dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
-    finest = jax.tree.map(lambda leaf: leaf[-1], keyframe.points)
+    finest, newest_points = (jax.tree.map(lambda leaf: leaf[-1], view.points) for view in (keyframe, newest))
     inside = warp(finest, jnp.eye(4), camera).inside
-    readings = (finest.q > 0).astype(jnp.float32) @ dealt
-    in_view = (inside @ dealt) / jnp.maximum(readings, 1.0)
+    readings, newer = ((points.q > 0).astype(jnp.float32) @ dealt for points in (finest, newest_points))
+    in_view = (inside @ dealt) / jnp.maximum(jnp.maximum(readings, LEFT * newer), 1.0)
     thresholds = overlap + KEYFRAME_SPREAD * np.linspace(-0.5, 0.5, KEYFRAME_SHARES)
     renewed = ((in_view < thresholds) | (readings == 0))[share]
     return jax.tree.map(lambda new, old: jnp.where(renewed, new, old), newest, keyframe)

@@ -28,7 +28,9 @@ class Way(NamedTuple):
     fixes: tuple[Fix, ...] = ()
 
     def after(self, seconds: float, xi: Float64[np.ndarray, " 6"]) -> Self:
-        """Add one more frame."""
+        """Add one more frame; of one before the reference, after which a clock was set back, nothing is foretold."""
+        if not seconds > 0:
+            return self._replace(fixes=())
         return self._replace(fixes=(*self.fixes, Fix(seconds, tuple(map(float, xi))))[-REMEMBERED:])
 
     def at(self, seconds: float) -> Float64[np.ndarray, " 6"] | None:

@@ -145,6 +145,22 @@ def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:
     return steps
 
 
+@pytest.mark.parametrize("poor", [None, 5, 6, 10])
+def test_a_keyframe_that_is_no_reference_ties_what_refers_to_the_one_before(poor: int | None) -> None:
+    """Depth that is partly missing makes a keyframe and no reference: the next way was one that nobody knows."""
+    mapper, truth, reference = Mapper(CAMERA), WALK.ground_truth.world_T_camera, 0
+    mapper.watch(WALK[0], None)
+    for i in range(1, len(WALK)):
+        alignment = no_alignment(AlignmentStatus.OK)._replace(
+            target_T_reference=inverse(truth[i]) @ truth[reference], covariance=1e-6 * np.eye(6)
+        )
+        pose = inverse(truth[0]) @ truth[i]
+        mapper.watch(WALK[i], Step(i, reference / RATE, i / RATE, alignment, pose, 0.0, False))
+        reference = reference if i == poor else i
+    edges = mapper.odometry_edges()
+    assert len(edges) > 1 and max(edge.covariance.max() for edge in edges) < 0.01
+
+
 def test_a_guessed_frame_becomes_no_keyframe():
     """Others were found against it, and a way that nobody knows counted as one that is known."""
     mapper, steps = Mapper(CAMERA), drifting(WALK, np.zeros(6))

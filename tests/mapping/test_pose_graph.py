@@ -9,7 +9,7 @@ from scipy.sparse import csc_array
 from gavo_jax.mapping.correction import Doubts, _placed, correct, joined
 from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.mapper import Loops
-from gavo_jax.mapping.pose_graph import Solution, _leverage, optimise
+from gavo_jax.mapping.pose_graph import Solution, _leverage, _plausible, optimise
 from gavo_jax.mapping.verification import Edge
 from gavo_jax.rigid_motions import exp
 from gavo_jax.trajectory import Trajectory, inverse
@@ -73,6 +73,15 @@ def test_false_loops_alone_leave_the_odometry_as_it_was():
     start = dead_reckoned()
     np.testing.assert_allclose(optimise(start, ODOMETRY, FALSE).world_T_camera, start, atol=1e-6)
     np.testing.assert_array_equal(optimise(start, ODOMETRY, []).world_T_camera, start)
+
+
+def test_a_loop_is_as_plausible_from_either_end():
+    """A segment that was found again ties keyframes to later ones: their odometry's variance was negative."""
+    off = np.eye(4)
+    off[0, 3] = 0.5
+    chain = [Edge(i, i + 1, np.eye(4), 1e-4 * np.eye(6)) for i in range(9)]
+    loops = [Edge(a, b, by, 1e-6 * np.eye(6)) for a, b, by in ((6, 9, off), (9, 6, inverse(off)), (9, 6, np.eye(4)))]
+    assert _plausible(np.stack([np.eye(4)] * 10), chain, loops).tolist() == [False, False, True]
 
 
 def keyframe(number: int, timestamp: float, odometry: np.ndarray, corrected: np.ndarray, segment: int = 0) -> Keyframe:

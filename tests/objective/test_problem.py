@@ -28,6 +28,17 @@ def test_transform_goes_from_the_origin_along_the_basis() -> None:
     np.testing.assert_allclose(problem.transform(jnp.stack([jnp.asarray(x)] * 2))[1], motion, atol=1e-6)
 
 
+@pytest.mark.parametrize("reach", [1e-3, 0.2, 0.8, 1.7, 4.0])
+def test_a_search_is_held_within_its_angle(reach: float) -> None:
+    """The angle came from the trace of all four rows: 0.2 rad let motions of 1.07 rad through."""
+    centre = jnp.asarray(oracle.expm(np.array([0.1, 0.2, 0.3, 0.1, -0.2, 0.3])), jnp.float32)
+    problem = Problem(build(random_pair(0)), jnp.eye(4), jnp.eye(6), centre=centre, reach=jnp.array([1.0, reach]))
+    for angle in (0.97 * min(reach, 3.1), 1.03 * reach):
+        offset = oracle.expm(np.array([0.0, 0.0, 0.0, 0.6 * angle, 0.8 * angle, 0.0]))
+        is_out = bool(problem.is_out_of_reach(centre @ jnp.asarray(offset, jnp.float32)))
+        assert is_out == (reach < angle < np.pi)
+
+
 @pytest.mark.parametrize(
     "solver",
     [

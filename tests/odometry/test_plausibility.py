@@ -17,7 +17,7 @@ from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequen
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import MAX_DOUBTED, MAX_HELD, Odometry, Step
-from gavo_jax.odometry.plausibility import MIN_REMEMBERED, Usual, judge_by_history
+from gavo_jax.odometry.plausibility import MIN_REMEMBERED, STAMP_JITTER, Usual, _change, judge_by_history
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.second_thoughts import DoubtingDepth
 from gavo_jax.odometry.stream import track
@@ -83,6 +83,14 @@ def test_a_pair_is_judged_by_those_before(
     judged = judge_by_history(result, usual(), jnp.float32(50.0), predicted, *clock)
     assert judged.findings == (0 if finding is None else bit(finding))
     assert judged.status == (Status.OK if finding is None else finding)
+
+
+@pytest.mark.parametrize("rate", [30, 60, 200])
+def test_no_stamp_turns_a_motion_round(rate: int) -> None:
+    """From 50 frames a second on, the stamps' error exceeds the time between two frames."""
+    expected = jnp.array([2.0, 0.0, 0.0, 0.0, 3.0, 0.0]) / rate
+    change = _change(-0.9 * expected, expected, jnp.float32(STAMP_JITTER * rate))
+    assert np.all(np.asarray(change) >= 0.9 * np.array([2.0, 3.0]) / rate - 1e-6)
 
 
 def test_nothing_is_unusual_before_anything_is_known() -> None:

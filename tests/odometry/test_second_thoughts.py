@@ -5,13 +5,16 @@ import pytest
 from driving import CAMERA, SEARCH_ALONE, Told, found
 from small import Rendered
 
-from gavo_jax.alignment.result import Alignment
+from gavo_jax.alignment.result import Alignment, with_finding
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.odometry.aligners import BEGINNING
 from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.second_thoughts import Polished, Recovering
 from gavo_jax.status import AlignmentStatus
+
+IMPLAUSIBLE = with_finding(found(AlignmentStatus.HIGH_ERROR, 0.02), AlignmentStatus.IMPLAUSIBLE_MOTION)
+"""A high error is the gravest of what speaks against it, and not all."""
 
 
 @pytest.mark.parametrize(
@@ -22,6 +25,7 @@ from gavo_jax.status import AlignmentStatus
         (found(AlignmentStatus.HIGH_ERROR, 0.02), found(AlignmentStatus.HIGH_ERROR, 0.03), 0.02),
         (found(AlignmentStatus.HIGH_ERROR, 0.02), found(AlignmentStatus.HIGH_ERROR, 0.1), None),
         (found(AlignmentStatus.LOW_OVERLAP, 0.02), found(AlignmentStatus.LOW_OVERLAP, 0.02), None),
+        (IMPLAUSIBLE, IMPLAUSIBLE, None),
     ],
 )
 def test_a_second_aligner_is_asked_where_the_first_is_not_sure(

@@ -110,6 +110,18 @@ def test_a_keyframe_without_readings_takes_all_of_the_newest(overlap: float) -> 
     assert np.all(renewed.points.q == 1)
 
 
+def test_shares_that_bodies_have_emptied_are_renewed() -> None:
+    """Of a share that had lost all points but some, these were all in view, so that it was never renewed."""
+    blank = blank_state(CAMERA, SOLVER, AlignmentOptions()).keyframe
+    q = np.ones_like(blank.points.q)
+    newest = blank._replace(points=blank.points._replace(q=q), grey=np.ones_like(blank.grey))
+    for left, is_renewed in ((0.1, True), (0.7, False)):
+        kept = np.where(np.arange(q.shape[1]) % 10 < 10 * left, q, 0.0)
+        keyframe = blank._replace(points=blank.points._replace(q=kept))
+        renewed = jax.jit(renew_keyframe)(keyframe, newest, CAMERA.level(1), 0.5)
+        assert np.all(renewed.grey == is_renewed)
+
+
 def test_frame_to_frame(sequence: SyntheticSequence) -> None:
     result = run(sequence[:6], FRAME_TO_FRAME)
     assert result.metrics["lost_pairs"] == 0

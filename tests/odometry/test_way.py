@@ -8,6 +8,8 @@ from small import ALONE, CAMERA
 
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.way import Way
 from gavo_jax.rigid_motions import exp, length_and_angle
 from gavo_jax.settings import Settings
@@ -29,6 +31,15 @@ def test_the_way_goes_on_at_the_last_velocity() -> None:
     way = way.after(0.3, 3 * step)
     assert way.at(0.5) == pytest.approx(3 * step) and len(way.fixes) == 2
     assert way.at(0.3) is None and way.at(0.1) is None
+
+
+def test_a_clock_that_is_set_back_tells_no_velocity() -> None:
+    """The motion since the reference counted as that of a millisecond, and all that followed as implausible."""
+    step = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert Way().after(0.1, step).after(-49.9, step).at(-49.86) is None
+    frame = replace(SyntheticSequence(1, camera=CAMERA)[0], timestamp=40.0)
+    clocks = [Progress(reference_timestamp=stamp).clock(frame) for stamp in (frame.timestamp - 0.1, 50.0)]
+    assert [float(clock.elapsed) for clock in clocks] == pytest.approx([0.1, UNKNOWN_SECONDS])
 
 
 def swinging(frames: int) -> SyntheticSequence:
