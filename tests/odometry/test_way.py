@@ -38,7 +38,7 @@ def test_a_clock_that_is_set_back_tells_no_velocity() -> None:
     step = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert Way().after(0.1, step).after(-49.9, step).at(-49.86) is None
     frame = replace(SyntheticSequence(1, camera=CAMERA)[0], timestamp=40.0)
-    clocks = [Progress(reference_timestamp=stamp).clock(frame) for stamp in (frame.timestamp - 0.1, 50.0)]
+    clocks = [Progress(reference_timestamp=stamp, last_index=1).clock(frame) for stamp in (frame.timestamp - 0.1, 50.0)]
     assert [float(clock.elapsed) for clock in clocks] == pytest.approx([0.1, UNKNOWN_SECONDS])
 
 
