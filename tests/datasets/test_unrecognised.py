@@ -27,7 +27,7 @@ def made(folder: Path, *names: str) -> Path:
         (("walk.MP4", "notes.md"), r"walk\.MP4: a film: write its frames as images"),
         (("mav0/cam0/data/1.png",), "cam0: a recording as EuRoC has it, of stereo images without depth"),
         (("cam0/data/1.png", "depth0/data/1.png"), "depth0: as InteriorNet has it, whose depth is the length of a ray"),
-        (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI"),
+        (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI: .* sai-cli process, and"),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
