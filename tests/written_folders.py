@@ -138,6 +138,19 @@ def nerf(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames[::-1]}))
 
 
+def nerfstudio(folder: Path) -> None:
+    """The same, and the file names depth, which counts otherwise; that in `depth/` is another's."""
+    nerf(folder)
+    (folder / "lidar").mkdir()
+    for i in range(1, 5):
+        (folder / f"depths/frame_{i:05}.png").rename(folder / f"lidar/{9 - i}.png")
+        image(folder / f"depth/frame_{i:05}.png", np.full((120, 160), 2000, np.uint16))
+    values = json.loads((folder / "transforms.json").read_text())
+    for frame in values["frames"]:
+        frame["depth_file_path"] = f"./lidar/{9 - int(frame['file_path'][-9:-4])}.png"
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
 PLUS_STAMPS = [round(71234.25 + i / 60, 6) for i in range(4)]
 
 
@@ -425,5 +438,6 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "rtabmap": ("export of RTAB-Map", rtabmap),
     "rtabmap_export": ("export of RTAB-Map", rtabmap_export),
     "nerf": ("folder of colour and depth images", nerf),
+    "nerfstudio": ("nerfstudio folder", nerfstudio),
 }
 """By name: what the layout is recognised as, and who writes it."""

@@ -12,6 +12,7 @@ from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.layouts.arkit import Polycam, ScannerApp, ScanNetPlusPlus
 from gavo_jax.datasets.layouts.bonn import Bonn
 from gavo_jax.datasets.layouts.bop import BopScene
+from gavo_jax.datasets.layouts.nerfstudio import Nerfstudio
 from gavo_jax.datasets.layouts.neural import NeuralRgbd, SemanticReplica
 from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.layouts.openloris import OpenLoris
@@ -68,6 +69,7 @@ BUILT_IN: tuple[Dataset, ...] = (
         NeuralRgbd,
         RtabMap,
         Open3DFolder,
+        Nerfstudio,
         PlainFolder,
     ),
 )

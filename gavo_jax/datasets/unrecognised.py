@@ -125,7 +125,9 @@ def _nyu(place: Place) -> str | None:
 def _spectacular(place: Place) -> str | None:
     if not all((place.path / name).is_file() for name in ("data.jsonl", "calibration.json")):
         return None
-    return "a recording of Spectacular AI: write rgb/ and depth/ of it with sai-cli process first"
+    return (
+        "a recording of Spectacular AI: write its images with sai-cli process, and name the folder of transforms.json"
+    )
 
 
 def _recording(place: Place) -> str | None:

@@ -291,6 +291,13 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["lowres_wide.traj:1: expected 7"],
     ),
     "nerf: poses of prose": ("nerf", edit("transforms.json", "0.0, 1.0", "0.0, 2.0"), ["transforms.json: frames[0]"]),
+    "nerfstudio: half a file": ("nerfstudio", cut("transforms.json", 0.5), ["transforms.json: not JSON"]),
+    "nerfstudio: depth of another folder": (
+        "nerfstudio",
+        edit("transforms.json", "./lidar/6.png", "../lidar/6.png"),
+        ["transforms.json: frames[1]: depth_file_path: path leaves"],
+    ),
+    "nerfstudio: depth that is missing": ("nerfstudio", remove("lidar/6.png"), ["lidar/6.png: image is missing"]),
     "openloris: no sensors": ("open_loris", remove("sensors.yaml"), ["sensors.yaml: no such file", "--camera"]),
     "openloris: sensors of prose": (
         "open_loris",

@@ -30,7 +30,7 @@ def made(folder: Path, *names: str) -> Path:
             ("cam0/data/1.png", "depth0/data/1.png"),
             "depth0: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays",
         ),
-        (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI"),
+        (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI: .* sai-cli process, and"),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),

@@ -9,13 +9,16 @@ from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES
 from gavo_jax.datasets.truth import by_stamp, pose_of
-from gavo_jax.errors import read_json
+from gavo_jax.errors import GavoError, read_json, shown
 from gavo_jax.trajectory import Trajectory
 
 TRANSFORMS = "transforms.json"
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From our camera's axes to NeRF's: its y points up, and it looks along -z."""
+
+LARGEST_SCALE = 1e6
+"""Of a pose's shift, or how small it may be: what is beyond is no scale."""
 
 WITHOUT_SCALE = ("colmap_im_id", "sharpness", "colmap_pose")
 """Keys of frames whose poses structure from motion made: how long its unit is, is open."""
@@ -33,26 +36,47 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
         (`WITHOUT_SCALE`). None and no line where the file has no poses.
 
     Raises:
-        GavoError: no JSON, or a pose that is none.
+        GavoError: no JSON, or a pose or a scale that is none.
     """
-    frames = [(at, frame) for at, frame in enumerate(_frames(path)) if frame.get("transform_matrix") is not None]
+    values = read_json(path, MAX_JSON_BYTES)
+    frames = [(at, frame) for at, frame in _frames(values) if frame.get("transform_matrix") is not None]
     if any(key in frame for _, frame in frames for key in WITHOUT_SCALE):
         return None, [f"{path.name}: its poses are of structure from motion, whose unit is open"]
+    scale = _scale(path, values) if frames else 1.0
     poses: dict[float, np.ndarray] = {}
     for at, frame in frames:
         stamp = stamps.get(PureWindowsPath(str(frame.get("file_path"))).stem)
         pose = pose_of_rows(f"{path}: frames[{at}]", frame["transform_matrix"])
         if stamp is not None and pose is not None:
+            pose[:3, 3] /= scale
             poses[stamp] = pose @ FLIP
     if not poses:
         return None, [f"{path.name}: has no pose of any of these images"] if frames else []
     return by_stamp(poses), []
 
 
-def _frames(path: Path) -> list[dict[str, Any]]:
-    values = read_json(path, MAX_JSON_BYTES)
+def _frames(values: Any) -> list[tuple[int, dict[str, Any]]]:
+    """What is said of each frame, with its place."""
     frames = values.get("frames") if isinstance(values, dict) else None
-    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+    listed = frames if isinstance(frames, list) else []
+    return [(at, frame) for at, frame in enumerate(listed) if isinstance(frame, dict)]
+
+
+def _scale(path: Path, values: dict[str, Any]) -> float:
+    """What the shifts of the poses were multiplied by, as nerfstudio says it; the world may be turned and moved, too.
+
+    Raises:
+        GavoError: it is no scale, or the world was changed otherwise.
+    """
+    if (moved := values.get("applied_transform")) is not None:
+        pose_of_rows(f"{path}: applied_transform", moved)
+    scale = values.get("applied_scale")
+    if scale is None:
+        return 1.0
+    is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
+    if not is_number or not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
+        raise GavoError(f"{path}: applied_scale: expected a number above 0, found {shown(scale)}")
+    return scale
 
 
 def pose_of_rows(place: str, matrix: Any) -> Float[np.ndarray, "4 4"] | None:

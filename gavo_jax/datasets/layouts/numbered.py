@@ -312,23 +312,40 @@ class PlainFolder(FileSequence):
             GavoError: no frame, no camera.
         """
         root = resolve_folder(path)
-        color, depth = plain_files(path)
+        color, depth, others = cls.images(path)
         film = film_of(color[0]) if color else None
         told = None if reading.rate else cls.clock(path)
         usual = reading.rate or (film and rate_of(film)) or RATE
-        seconds = told or (lambda numbers: numbers / usual)
-        paired = paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
+        paired = cls.pair(path, color, depth, reading, told or (lambda numbers: numbers / usual))
         own = partial(cls.calibrate, path, paired.entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
         if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + passed_over(path) + unread + unread_truth(path, truth, cls.ESTIMATES)
+        left_out = paired.left_out + others + unread + unread_truth(path, truth, cls.ESTIMATES)
         sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
         is_open = paired.seconds is not None and not reading.rate and told is None
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
         return sequence
+
+    @classmethod
+    def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
+        """Colour and depth images, and a line for each kind of others that are not read.
+
+        Raises:
+            GavoError: what names them cannot be read.
+        """
+        return *plain_files(path), passed_over(path)
+
+    @classmethod
+    def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
+        """The frames that these images are; `seconds` are times by numbers, where the names are no stamps.
+
+        Raises:
+            GavoError: no frame, or which images are one is open.
+        """
+        return paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:

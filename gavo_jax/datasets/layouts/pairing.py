@@ -129,6 +129,26 @@ def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
     return _Timed(usual, *found, tuple(odd))
 
 
+def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Reading, clock: Seconds) -> Paired:
+    """Frames of a colour and a depth image at the same place of the lists; colour's names say when, as in all folders.
+
+    Raises:
+        GavoError: they do not, or two have the same number.
+    """
+    found = paired_by_stamp(path, color, color, reading) or paired_by_number(path, color, color, clock)
+    partners = dict(zip(color, depth, strict=True))
+    told = stamps([file.stem for file in depth]) if found.seconds is None else None
+    of_depth = dict(zip(depth, told.seconds, strict=True)) if told else {}
+    entries = []
+    for stamp, image, *_ in found.entries:
+        own = of_depth.get(partners[image])
+        is_near = own is not None and abs(own - stamp) < reading.max_difference  # else of another clock
+        entries.append(Entry(stamp, image, partners[image], own if is_near else None))
+    others = sorted(partners.keys() - {entry.color for entry in entries})
+    left_out = [f"{len(others)} frames: names of another form than most, as {others[0].name}"] if others else []
+    return found._replace(entries=entries, left_out=left_out)
+
+
 def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
     """Frames by the numbers in the names, whose times a clock says."""
     found = by_number(color, depth)

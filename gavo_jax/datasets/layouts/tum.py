@@ -287,13 +287,22 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
 
 
 def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
-    """Check a stamp and a path, which as it is written stays below `root`; links are the user's own, and followed."""
+    """Check a stamp and a path."""
     try:
         stamp = number(time)
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):
         raise GavoError(f"{place}: not a time stamp: {time[:60]!r}")
+    return _Row(stamp, path.parent / path_below(root, place, image), place, time)
+
+
+def path_below(root: Path, place: str, image: str) -> str:
+    """A path that a file at `place` names, which as it is written stays below `root`; links are followed.
+
+    Raises:
+        GavoError: it leaves the folder, or is no usable path.
+    """
     try:
         if "\\" in image and not (root / image).exists():
             image = image.replace("\\", "/")  # as Windows has it
@@ -304,7 +313,7 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
         raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
     if not any(found.is_relative_to(root) for found in places) or PureWindowsPath(image).drive:
         raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}: {_back(root, image)}")
-    return _Row(stamp, path.parent / image, place, time)
+    return image
 
 
 def _back(root: Path, image: str) -> str:

@@ -18,7 +18,7 @@ from gavo_jax.datasets.files import FileSequence, Reading, open_pair
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 
-PHONES = ("stray", "scannet_plus_plus", "polycam", "scanner_app", "nerf", "rtabmap")
+PHONES = ("stray", "scannet_plus_plus", "polycam", "scanner_app", "nerf", "nerfstudio", "rtabmap")
 
 
 def enlarge(folder: Path, times: int) -> None:

@@ -101,7 +101,7 @@ def test_every_layout_gives_the_same_frames(folder, name):
         "open_loris": LORIS_STAMPS,
         "rtabmap": RTABMAP_STAMPS,
     }
-    from_one = ("bop", "nerf", "open3d", "open3d_image", "rtabmap_export")
+    from_one = ("bop", "nerf", "nerfstudio", "open3d", "open3d_image", "rtabmap_export")
     first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
     expected = np.arange(4) / {"stray": 60, "scannet_plus_plus": 60, "scanner_app": 15, "tartan_air_2": 10}.get(
         name, 30
@@ -245,6 +245,7 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
     [
         *("seven_scenes", "replica", "scannet", "stray", "arkit_scenes", "nerf", "open_loris", "tartan_air"),
         *("tartan_air_2", "scannet_plus_plus", "polycam", "scanner_app", "bop", "neural_rgbd", "semantic_replica"),
+        "nerfstudio",
     ],
 )
 def test_poses_are_the_truth(folder, name):
