@@ -223,7 +223,9 @@ def write_bytes(path: str | Path, data: bytes) -> None:
         with partial.open("xb") as file:
             file.write(data)
         os.replace(partial, path)
-    except OSError as error:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None

@@ -183,6 +183,8 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     true, valid = truth.interpolate(estimate.timestamps, max_gap)
     if not valid.any():
         raise GavoError("distance error: the ground truth covers no pose of the estimate")
+    truth = _sorted(truth)
+    estimate = _in_segments_of_both(estimate, truth.segments[_closest_index(truth.timestamps, estimate.timestamps)])
     estimated, true, segments = estimate.world_T_camera[valid], true[valid], estimate.segments[valid]
     first = np.unique(segments, return_index=True)[1][np.unique(segments, return_inverse=True)[1]]
     from_first = inverse(estimated[first]) @ estimated
@@ -242,6 +244,7 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     if len(start) == 0 and apart > delta:
         raise GavoError(f"relative pose error: no two poses about {delta:g} s apart: the estimate's are {apart:.3g} s")
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
+    estimate = _in_segments_of_both(estimate, truth.segments[nearest])
     far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
     covered = ~far[start] & ~far[end] & (estimate.segments[start] == estimate.segments[end])
     start, end = start[covered], end[covered]
@@ -302,7 +305,13 @@ def _associated(
     i, j = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(i) < 2:
         raise GavoError(f"{what}: only {len(i)} poses of estimate and ground truth within {max_difference:g} s")
-    return estimate[i], truth.world_T_camera[j]
+    return _in_segments_of_both(estimate[i], truth.segments[j]), truth.world_T_camera[j]
+
+
+def _in_segments_of_both(estimate: Trajectory, others: Int[np.ndarray, " n"]) -> Trajectory:
+    """The estimate in as many segments as there are pairs of its own and of the truth's at its poses."""
+    pairs = np.stack([estimate.segments, others], axis=1)
+    return replace(estimate, segments=np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1))
 
 
 def _sorted(trajectory: Trajectory) -> Trajectory:

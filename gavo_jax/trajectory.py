@@ -198,11 +198,12 @@ class Trajectory:
             max_gap: seconds; a stamp between two samples further apart than this is not valid.
 
         Returns:
-            Transforms, NaN where not valid, and the mask of the valid ones: those on a sample or between two near ones.
+            Transforms, NaN where not valid, and the mask of the valid ones: those on a sample or between two near
+            ones of one segment.
         """
         timestamps = np.asarray(timestamps, np.float64)
         order = np.argsort(self.timestamps, kind="stable")
-        times, samples = self.timestamps[order], self.world_T_camera[order]
+        times, samples, segments = self.timestamps[order], self.world_T_camera[order], self.segments[order]
         result = np.full((len(timestamps), 4, 4), np.nan)
         valid = np.zeros(len(timestamps), bool)
         if len(times) == 0:
@@ -211,6 +212,7 @@ class Trajectory:
         left = np.where(times[right] == timestamps, right, np.maximum(right - 1, 0))
         gap = times[right] - times[left]
         valid = (times[left] <= timestamps) & (timestamps <= times[right]) & (gap <= max_gap)
+        valid &= segments[left] == segments[right]
         fraction = np.divide(timestamps - times[left], gap, out=np.zeros_like(gap), where=gap > 0)[valid]
         start, end = samples[left[valid]], samples[right[valid]]
         between = np.zeros((len(fraction), 4, 4))

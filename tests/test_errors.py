@@ -20,6 +20,16 @@ def test_a_planted_link_is_not_followed(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign.txt", "metrics.json"]
 
 
+def test_what_an_interruption_cut_short_goes(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_bytes(tmp_path / "camera.toml", b"")
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_a_kill_left_is_replaced(tmp_path):
     partial_of(tmp_path / "rows.txt").write_bytes(b"half")
     write_bytes(tmp_path / "rows.txt", b"whole")

@@ -237,6 +237,20 @@ def test_distance_error_follows_the_stamps_whatever_the_order_of_the_poses():
     assert found.final == pytest.approx(expected.final)
 
 
+@pytest.mark.parametrize("error", [distance_error, absolute_trajectory_error, relative_pose_error])
+def test_segments_of_the_truth_count_as_the_estimates(error):
+    """Of two runs that are compared, the one that stands for the truth may be in segments: its jump was an error."""
+    whole = smooth_truth()
+    segments = (np.arange(len(whole)) >= 150).astype(int)
+    jumped = whole.world_T_camera.copy()
+    jumped[150:, 0, 3] += 5.0
+    pieces = replace(whole, world_T_camera=jumped, segments=segments)
+    for estimate, truth in ((pieces, whole), (whole, pieces)):
+        found = error(estimate[::3], truth)
+        values = found.values if hasattr(found, "values") else found.translation.values
+        assert np.max(values) < 1e-6
+
+
 def test_a_segment_of_one_pose_says_nothing_of_the_absolute_error():
     """Aligned by itself it had no error: a trajectory in pieces looked perfect."""
     truth = smooth_truth()

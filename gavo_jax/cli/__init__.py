@@ -64,10 +64,10 @@ def _stop(words: str) -> int:
 
 def _run(arguments: list[str]) -> int:
     """Parse and execute; return the exit status."""
-    if arguments == ["--version"]:
-        print(f"gavo-jax {__version__}")
-        return 0
     try:
+        if arguments == ["--version"]:
+            print(f"gavo-jax {__version__}", flush=True)
+            return 0
         command = _parse(arguments)
         status = 0 if command is None else _execute(command)
         sys.stdout.flush()

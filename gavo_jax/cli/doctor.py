@@ -101,14 +101,21 @@ def _cache() -> tuple[str, bool]:
             return f"{_without_home(folder)}, NOT private, so NOT in use: {fault}", False
     except OSError as error:
         return f"{_without_home(folder)}, NOT writable: {error.strerror}", False
-    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-atime")]
-    megabytes = sum(path.stat().st_size for path in files) / 2**20
-    words = f"{_without_home(folder)}, {len(files)} programs, {megabytes:.1f} MiB"
+    sizes = [_size(path) for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-atime")]
+    words = f"{_without_home(folder)}, {len(sizes)} programs, {sum(sizes) / 2**20:.1f} MiB"
     try:
         with tempfile.NamedTemporaryFile(dir=folder):
             return f"{words}, writable", True
     except OSError as error:
         return f"{words}, NOT writable: {error.strerror}", False
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; none where another process has just removed it."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _without_home(path: Path) -> str:

@@ -138,10 +138,13 @@ def _notes(
 
 def _without_drift(summaries: Sequence[Summary]) -> list[str]:
     """A sentence for the sequences without drift, and why."""
-    none = {summary.sequence: summary.per_frame for summary in summaries if summary.drift is None}
-    short = [name for name, per_frame in none.items() if per_frame is not None]
-    blind = [name for name, per_frame in none.items() if per_frame is None]
-    notes = [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
+    told = {summary.sequence for summary in summaries if summary.drift is not None}
+    by_frame = {summary.sequence for summary in summaries if summary.per_frame is not None}
+    none = [name for name in dict.fromkeys(summary.sequence for summary in summaries) if name not in told]
+    short, blind = ([name for name in none if (name in by_frame) is known] for known in (True, False))
+    lost = [summary for summary in summaries if summary.drift is None and summary.sequence in told]
+    notes = [f"No drift of {one.sequence} by {one.label}: no part that it followed lasts 1 s." for one in lost]
+    notes += [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
     return notes + ([f"No errors of {', '.join(blind)}: no ground truth covers it."] if blind else [])
 
 

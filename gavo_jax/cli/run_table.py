@@ -155,6 +155,8 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
     apart = float(np.median(np.diff(np.sort(trajectory.timestamps))))
     if apart > 1:
         return f"No drift over 1 s: the frames are {apart:.2f} s apart; see the errors per frame and of the whole run."
+    if metrics.get("segments", 1) > 1:
+        return "No drift over 1 s: the trajectory is in segments, of which none lasts 1 s: see the other errors."
     return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart: see the other errors."
 
 

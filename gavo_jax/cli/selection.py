@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax import presets
+from gavo_jax.camera import PRESETS
 from gavo_jax.cli.options import Run, SearchOptions, Source
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
@@ -124,12 +125,16 @@ def _said(value: Any) -> str:
     return "not given" if value is None else str(value)
 
 
+WORDS = (SYNTHETIC, "auto", *PRESETS)
+"""What stands for a source or a camera, whatever lies here by that name."""
+
+
 def with_whole_paths(options: Run) -> Run:
     """The options with paths that hold from any folder."""
     places = {
         name: str(Path(place).resolve())
         for name, place in (("sequence", options.sequence), ("camera", options.camera), ("settings", options.settings))
-        if place is not None and Path(place).exists()
+        if place is not None and place not in WORDS and Path(place).exists()
     }
     return replace(options, **places)  # pyright: ignore[reportArgumentType]
 

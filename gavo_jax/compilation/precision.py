@@ -24,6 +24,9 @@ USUAL: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "jax_debug_infs": (False, jax.debug_infs),
     "jax_debug_key_reuse": (False, jax.debug_key_reuse),
     "jax_transfer_guard": (None, lambda _: jax.transfer_guard("allow")),
+    "jax_transfer_guard_host_to_device": (None, lambda _: jax.transfer_guard_host_to_device("allow")),
+    "jax_transfer_guard_device_to_device": (None, lambda _: jax.transfer_guard_device_to_device("allow")),
+    "jax_transfer_guard_device_to_host": (None, lambda _: jax.transfer_guard_device_to_host("allow")),
     "jax_default_prng_impl": ("threefry2x32", jax.default_prng_impl),
     "jax_threefry_partitionable": (True, jax.threefry_partitionable),
 }

@@ -50,7 +50,7 @@ def read_bodies(path: Path) -> list[BodyRow]:
         return []
     try:
         return [_row(*fields) for fields in csv.reader(read_text(path).splitlines()[1:])]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, csv.Error):
         raise GavoError(f"{path}: not the bodies of a run") from None
 
 

@@ -50,7 +50,10 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     by_stamp, found_at = ({stamp_name(t): i for i, t in enumerate(one.timestamps)} for one in (poses, found))
     steps: list[Step] = []
     place = now = 0
-    for number, row in enumerate(_rows_of(folder / FRAMES), start=1):
+    rows = _rows_of(folder / FRAMES)
+    while len(rows) > 1 and len(rows) >= len(poses) and rows[-1]["timestamp"] not in {**by_stamp, **found_at}:
+        rows.pop()  # its pose was not written yet
+    for number, row in enumerate(rows, start=1):
         try:
             stamp = float(row["timestamp"])
             if int(row["index"]) != number:

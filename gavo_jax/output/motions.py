@@ -36,10 +36,11 @@ def with_motions(steps: list[Step], path: Path) -> list[Step]:
     Raises:
         GavoError: It cannot be read, or is of other steps.
     """
-    rows = list(csv.reader(read_text(path).splitlines()[1:]))
+    lines = read_text(path).splitlines()[1:]
     try:
+        rows = list(csv.reader(lines))
         return [_with_motion(step, *row) for step, row in zip(steps, rows, strict=True)]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, csv.Error):
         raise GavoError(f"{path}: not the motions of this run") from None
 
 

@@ -42,7 +42,7 @@ from gavo_jax.output.files import (
     write_json,
 )
 from gavo_jax.output.frames import FRAME_COLUMNS, as_line, frame_row, read_steps, with_hindsight
-from gavo_jax.output.masks import read_masks, remove_masks, write_masks
+from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
 from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
@@ -109,6 +109,10 @@ class _GrowingFile:
         return GavoError(f"{self.path}: cannot be written to: {error.strerror or error}")
 
 
+FOREIGN = ("trajectory.*", MASKS)
+"""What a run replaces that may be somebody's own, where no run has left its configuration."""
+
+
 class RunFolder:
     """A folder that receives the files of one run; use it in a `with` block, for which no other process has it.
 
@@ -140,6 +144,16 @@ class RunFolder:
         """Whether an earlier run left its configuration here."""
         return (self.path / CONFIG).exists()
 
+    def _refuse_foreign(self) -> None:
+        """Refuse a folder with files that this run would replace and no other one has left."""
+        refuse_foreign(self.path, COMPARISON, "a comparison")
+        try:
+            is_of_run = "odometry" in read_json_object(self.path / CONFIG)
+        except GavoError:
+            is_of_run = False
+        if found := [] if is_of_run else [path for name in FOREIGN for path in sorted(self.path.glob(name))]:
+            raise GavoError(f"{found[0]}: was left by no run, which would replace it: name another folder")
+
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
 
@@ -150,7 +164,7 @@ class RunFolder:
         Raises:
             GavoError: a file cannot be written.
         """
-        refuse_foreign(self.path, COMPARISON, "a comparison")
+        self._refuse_foreign()
         growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
         remove_files(self.path, METRICS, CHECKPOINT, CONFIG, LOOPS, RECORDING, VIEW, *growing)
         remove_figures(self.path)

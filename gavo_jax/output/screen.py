@@ -80,7 +80,7 @@ def waiting(words: str) -> Iterator[None]:
     if not console.is_terminal:
         yield
         return
-    with console.status(words):
+    with console.status(Text(printable(words))):
         yield
 
 

@@ -203,7 +203,7 @@ class RerunViewer(Viewer):
             stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
             return
         except RuntimeError:
-            pass
+            self._process.terminate()
         raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
 
     def _serve(self, stream: RecordingStream) -> None:

@@ -69,8 +69,10 @@ def test_where_it_is_switched_off_nothing_changes() -> None:
         partial(jax.debug_infs, True),
         partial(jax.debug_key_reuse, True),
         partial(jax.transfer_guard, "disallow"),
+        partial(jax.transfer_guard_host_to_device, "disallow"),
+        partial(jax.transfer_guard_device_to_host, "disallow"),
     ],
-    ids=["ranks", "types", "not-a-number", "infinity", "keys", "transfers"],
+    ids=["ranks", "types", "not-a-number", "infinity", "keys", "transfers", "transfers there", "transfers back"],
 )
 def test_modes_that_look_for_errors_do_not_look_here(mode: Callable[[], Any], wanted: list[np.ndarray]) -> None:
     """They ended in tracebacks: ours leaves promotion to JAX, and not-a-number stands for what is not known. Images

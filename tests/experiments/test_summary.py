@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from gavo_jax.cli.experiment_report import _without_drift
 from gavo_jax.experiments.summary import ALL, compare, summarise
 
 
@@ -31,6 +32,13 @@ def test_median_and_quartiles():
     assert (found.runs, found.lost, found.together) == (5, 4, 4) and found.milliseconds == pytest.approx(1e3 / 150)
     (unknown,) = summarise(rows("a", "ga", [None, None]))
     assert unknown.drift is None and unknown.rotation is None and unknown.per_frame == pytest.approx(0.0015)
+
+
+def test_a_method_that_got_lost_does_not_speak_for_the_sequence():
+    table = summarise(rows("desk", "ga", [0.01, 0.02]) + rows("desk", "orb-pnp", [None, None]))
+    assert _without_drift(table) == ["No drift of desk by orb-pnp: no part that it followed lasts 1 s."]
+    (alone,) = _without_drift(summarise(rows("desk", "orb-pnp", [None])))
+    assert alone.startswith("No drift of desk: no two frames")
 
 
 def test_a_clear_difference_is_significant_and_none_is_not():

@@ -84,6 +84,21 @@ def test_what_a_kill_left_half_written_goes_too(tmp_path: Path):
     assert not (tmp_path / MASKS).exists()
 
 
+@pytest.mark.parametrize("name", ["masks/0001.png", "trajectory.csv"])
+def test_a_run_replaces_no_files_that_a_run_did_not_leave(tmp_path: Path, name: str):
+    """A dataset's masks were taken for an earlier run's, and removed."""
+    for file in (name, "config.json"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("{}")
+    with RunFolder(tmp_path) as folder, pytest.raises(GavoError, match="was left by no run"):
+        folder.start({"odometry": OdometryOptions()}, 0.0)
+    assert (tmp_path / name).exists()
+    (tmp_path / "config.json").write_text('{"odometry": {}}')
+    with RunFolder(tmp_path) as folder:
+        folder.start({"odometry": OdometryOptions()}, 0.0)
+    assert not (tmp_path / "masks").exists()
+
+
 def test_a_run_folder_has_those_of_its_run(tmp_path: Path):
     config = {"odometry": OdometryOptions()}
     with RunFolder(tmp_path) as folder:

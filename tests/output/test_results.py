@@ -165,6 +165,13 @@ def test_files_that_are_not_of_one_run_are_told(tmp_path, damage, words):
         read_run(tmp_path / "run")
 
 
+def test_a_row_whose_pose_is_not_written_yet_is_left_out(tmp_path):
+    """A run appends the row first: `gavo view` of one that went on refused it."""
+    poses = recorded(tmp_path / "run") / "trajectory.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
+    assert len(read_run(tmp_path / "run").steps) == 2
+
+
 def test_a_run_with_loops_that_was_killed_is_read(tmp_path):
     folder = recorded(tmp_path / "run")
     (folder / "trajectory.txt").rename(folder / "odometry.txt")
