@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import os
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -24,6 +25,8 @@ from gavo_jax.version import __version__
 BAD_INPUT, BROKEN_PIPE = 2, 141
 """Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `early.LOST` (`--strict`)."""
 
+NARROWEST = 20
+"""Columns of a screen for which help is laid out at least."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, quota or file."""
 BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
@@ -139,6 +142,8 @@ def _parse(arguments: list[str]) -> Command | None:
     if fault := empty_argument(arguments):
         raise GavoError(fault)
     messages, page = io.StringIO(), HelpPage(sys.stdout)
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)  # in less, the page of help never ends
     try:
         with contextlib.redirect_stderr(messages), contextlib.redirect_stdout(page):
             return tyro.cli(

@@ -75,11 +75,12 @@ def run_live(options: Run) -> int:
             "frames_dropped": newest.dropped,
         }
         folder.finish(metrics)
-        write_trajectories(trajectory, folder.path, trajectory_formats)
         print_run(name, metrics, folder.path, trajectory, truth=None)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
-    say(f"{newest.dropped} of {newest.received} frames came while another was tracked, and made room for newer ones")
+        write_trajectories(trajectory, folder.path, trajectory_formats)
+    dropped = f"{newest.dropped} of {newest.received} frames came while another was tracked"
+    say(f"{dropped}, or programs were compiled, and made room for newer ones")
     if end.fault is not None:
         raise end.fault
     if end.interrupted:

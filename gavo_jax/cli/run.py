@@ -97,11 +97,11 @@ def run(options: Run) -> int:
                 say(line)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
-        write_trajectories(trajectory, folder.path, trajectory_formats)
         truth, is_rendered = sequence.ground_truth, options.sequence == SYNTHETIC
         print_run(name, metrics, folder.path, trajectory, truth=truth, is_rendered=is_rendered)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
+        write_trajectories(trajectory, folder.path, trajectory_formats)
     if truth is not None and is_w_first(truth, trajectory):
         say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
     if interrupted:

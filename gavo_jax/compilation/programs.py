@@ -102,15 +102,18 @@ class CachedProgram(Generic[P, R]):
         kinds = tuple(map(Kind.of, leaves))
         signature = self._signature(structure, kinds, kwargs)
         program = _loaded.get(signature)
-        if program is not None:
-            return program(*leaves)
-        with _lock:
-            loading = _loading.setdefault(signature, threading.Lock())
-        with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
-            program = _loaded.get(signature)
-            if program is None:
-                program = _loaded[signature] = self._load(leaves, structure, kinds, kwargs)
-            return program(*leaves)  # which compiles it, where `_load` did not
+        try:
+            if program is not None:
+                return program(*leaves)
+            with _lock:
+                loading = _loading.setdefault(signature, threading.Lock())
+            with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
+                program = _loaded.get(signature)
+                if program is None:
+                    program = _loaded[signature] = self._load(leaves, structure, kinds, kwargs)
+                return program(*leaves)  # which compiles it, where `_load` did not
+        except ValueError:  # what is kept is for the usual device, and these inputs may lie on another
+            return self._jitted(*args, **kwargs)
 
     def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:
         """Whether a call would find its program, here or in the folder, and trace nothing."""

@@ -32,8 +32,9 @@ SMALL = 0.1
 
 
 def shown_name(name: str) -> str:
-    """A name of other people's as a figure shows it: no formula, and no command."""
-    return printable(name).replace("$", r"\$")
+    """A name of other people's as a figure shows it: no formula, no command, and none that is left out for its `_`."""
+    shown = printable(name).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def new_figure(width: float, height: float, caption: str) -> Figure:

@@ -17,6 +17,15 @@ from rich.text import Text
 
 from gavo_jax.errors import printable
 
+
+class _Console(Console):
+    """The screen; where who reads has gone, the command is told, as by `print`."""
+
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command."""
+        raise BrokenPipeError
+
+
 DASH = "–"
 """A cell for what is not known."""
 
@@ -29,7 +38,7 @@ def say(line: str) -> None:
 
 def _wrapped(line: str) -> str:
     """A line as several that fit the terminal; a path is never broken."""
-    width = Console().width
+    width = _Console().width
     return textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
@@ -56,7 +65,7 @@ class PairProgress:
 @contextmanager
 def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgress]:
     """Show a bar on standard error while the block runs; nothing where that is no terminal."""
-    console = Console(stderr=True)
+    console = _Console(stderr=True)
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -76,7 +85,7 @@ def _compiling(label: str) -> str:
 @contextmanager
 def waiting(words: str) -> Iterator[None]:
     """Show a few words on standard error while the block runs; nothing where that is no terminal."""
-    console = Console(stderr=True)
+    console = _Console(stderr=True)
     if not console.is_terminal:
         yield
         return
@@ -90,9 +99,9 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     Nothing of it is cut: columns that the screen has no room for follow below, the first column beside them once more.
     """
     say(title)
-    width = Console().width
+    width = _Console().width
     for table in _parts(columns, rows, width):
-        Console(width=max(width, _width(table))).print(table)
+        _Console(width=max(width, _width(table))).print(table)
 
 
 def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -129,7 +138,7 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
 
 
 def _width(table: Table) -> int:
-    unlimited = Console(width=10_000)
+    unlimited = _Console(width=10_000)
     return Measurement.get(unlimited, unlimited.options, table).maximum
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import PARTIAL, GavoError
+from gavo_jax.errors import GavoError, partial_of
 from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, write_lines
 
@@ -136,7 +136,7 @@ def write_bag(trajectory: Trajectory, path: Path) -> None:
     rosbag2, typesys = _import_rosbags()
     if path.exists() and not (path / BAG_METADATA).is_file():
         raise GavoError(f"{path}: is there already, and is no bag")
-    partial = path.with_name(path.name + PARTIAL)
+    partial = partial_of(path)
     try:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()

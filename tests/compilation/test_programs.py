@@ -279,3 +279,15 @@ def slowly_traced(numbers: jax.Array) -> jax.Array:
     """A program that takes its time to trace."""
     time.sleep(0.3)
     return numbers + 1.0
+
+
+def test_inputs_on_another_device_find_a_program_of_their_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is kept is compiled for the usual device, and refuses others' arrays by a ValueError."""
+    elsewhere: Any = CachedProgram(double, static=("points",), returns=(Twice,))
+
+    def refuses(*_: Any) -> Any:
+        raise ValueError("Computation was compiled for input shardings that disagree")
+
+    monkeypatch.setattr(elsewhere, "_load", lambda *_: refuses)
+    found = elsewhere(NUMBERS, replace(OPTIONS, min_overlap=0.5))
+    np.testing.assert_array_equal(found.doubled, NUMBERS)
