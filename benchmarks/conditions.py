@@ -145,6 +145,7 @@ CONDITIONS: dict[str, Condition] = {
     "overexposed flicker of 20 %": grey(lambda index, levels: 1.4 * levels * (1.0 + 0.2 * np.sin(2.1 * index))),
     "gamma 0.5": grey(lambda index, levels: 255 * (levels / 255) ** 0.5),
     "gamma 2": grey(lambda index, levels: 255 * (levels / 255) ** 2),
+    "a slow fade": grey(lambda index, levels: levels * 0.93 ** np.clip(index - 20, 0, 15)),
     "flicker of 20 %": grey(lambda index, levels: levels * (1.0 + 0.2 * np.sin(2.1 * index))),
     "bands of 4 %": bands(0.04),
     "bands of 8 %": bands(0.08),

@@ -191,7 +191,8 @@ def align_views(
     motion, rival = ended.search.islands[0], ended.search.rival
     winner = Winner(motion, rival, centre=ended.centre, history=history, judge=ended.judge)
     objective = level_objective(finest, target, options, ended.search.brightness).merged()
-    return conclude(objective, winner, finest, options, swaying, part), ended.populations
+    alignment = conclude(objective, winner, finest, options, swaying, part)
+    return alignment._replace(brightness=ended.search.brightness), ended.populations
 
 
 def _search_in_contest(

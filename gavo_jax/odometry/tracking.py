@@ -23,8 +23,9 @@ from gavo_jax.image.pyramid import LEVELS, Pyramid, PyramidLevel, build_pyramid,
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.synchronisation import synchronise_depth
 from gavo_jax.image.warp import Points, warp
+from gavo_jax.objective.estimates import Brightness
 from gavo_jax.objective.points import Reference, make_references, move_reference, undo_rolling_shutter
-from gavo_jax.odometry.exposure import Exposure, in_exposure
+from gavo_jax.odometry.exposure import Exposure, in_exposure, in_one_brightness
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS, Usual, judge_by_history
 from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions, OdometryOptions
@@ -224,10 +225,14 @@ def track_frame(
     newest = make_references(target, camera, levels)
     if readout is not None:
         newest, keyframe = _undo_rolling_shutter(newest, keyframe, moved, readout)
-    keyframe = move_reference(keyframe, moved.target_T_reference)
+    keyframe, renewing = move_reference(keyframe, moved.target_T_reference), newest
+    if options.reference == "keyframe":
+        gain, bias = (found[-1] for found in result.brightness)
+        seen = Brightness(jnp.where(moved.is_first, 1.0, gain), jnp.where(moved.is_first, 0.0, bias))
+        keyframe, renewing = in_one_brightness(keyframe, newest, seen)
     after_it = TrackerState(
         previous=newest,
-        keyframe=renew_keyframe(keyframe, newest, camera.level(finest), options.keyframe_overlap),
+        keyframe=renew_keyframe(keyframe, renewing, camera.level(finest), options.keyframe_overlap),
         previous_image=packed,
         motion=moved.motion,
         guess=moved.motion,

@@ -214,6 +214,18 @@ def test_a_change_of_gain_loses_nothing(frames: list[Frame], gain: float, bias: 
     assert all(step.alignment.status is Status.OK for step in steps_of(frames, change))
 
 
+def test_exposure_that_fades_slowly_is_followed(frames: list[Frame]) -> None:
+    """Points of earlier frames kept the brightness of their time, and what a search estimates ends at 1.8."""
+
+    def fade(frames: list[Frame]) -> list[Frame]:
+        gains = 0.93 ** np.arange(len(frames))
+        return [replace(f, grey=np.round(g * f.grey).astype(np.uint8)) for f, g in zip(frames, gains, strict=True)]
+
+    steps = steps_of(frames, fade)
+    assert all(step.alignment.status is Status.OK for step in steps)
+    assert steps[-1].alignment.error < 2.0 * steps[4].alignment.error
+
+
 def test_exposures_that_differ_lose_nothing_where_much_is_white(frames: list[Frame]) -> None:
     """What was cut off hid how much brighter the next image was: half of all pairs were `HIGH_ERROR`."""
 
