@@ -8,7 +8,7 @@ import contextlib
 import os
 import warnings
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -297,6 +297,7 @@ def build_map(
     farthest: float = FARTHEST,
     trajectory: Trajectory | None = None,
     moving: Moving = seen_moving,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> SceneMap:
     """Fuse the frames of a run, read once more, one at a time.
 
@@ -312,6 +313,7 @@ def build_map(
         farthest: depth beyond is left out, metres.
         trajectory: the poses where they are not the steps' own any more: loops have corrected them.
         moving: where bodies are in the frame of a step.
+        on_frame: called after each frame.
 
     Raises:
         GavoError: another shape, an absurd voxel, or Open3D cannot be imported.
@@ -334,6 +336,7 @@ def build_map(
     chosen = max(set(segments), key=lambda segment: (segments.count(segment), -segment), default=0)
     builder = MapBuilder(sequence.camera, voxel, farthest)
     for index, step, world_T_camera, segment in places:
+        on_frame()
         if segment != chosen:
             reasons[ELSEWHERE] += 1
             continue

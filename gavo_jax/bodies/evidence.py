@@ -100,7 +100,7 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     """
     width, height = camera.width, camera.height
     compared = compare(here, others, others_T_here, camera)
-    r, grey, seen_grey, q, (u, v), *_ = compared
+    r, grey, q, (u, v), *_ = compared
     residual = jnp.abs(r.grey)
     views = r.grey.shape[0]
     own = jnp.hypot(grey.along_u, grey.along_v)
@@ -109,8 +109,7 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     flow = jnp.hypot(r.warped.u[0] - u, r.warped.v[0] - v) * r.inside[0]
     slack = SLACK + SLACK_OF_FLOW * flow
     shape = (views, height, width)
-    clipped = jnp.maximum(seen_grey, r.grey_sample.value) > SATURATED
-    told = r.inside * jnp.where(clipped, 0.0, 1.0)
+    told = lit_in_both(r)
     return PixelEvidence(
         grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
         depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
@@ -129,8 +128,6 @@ class Compared(NamedTuple):
     """[V, N]; of grey, with brightness taken off, and the light that changes from place to place."""
     grey: GreySample
     """Grey of the view itself, with its slopes."""
-    seen_grey: Float[Array, "v n"]
-    """The same, once for each of the others."""
     inverse_depth: Float[Array, " n"]
     place: tuple[Float[Array, " n"], Float[Array, " n"]]
     """Column and row of each pixel in the view."""
@@ -192,4 +189,4 @@ def compare(
     shape = (-1, -(-height // stride), -(-width // stride))
     light = light_change(*(one.reshape(shape) for one in (residual, as_bright, same))).reshape(residual.shape)
     r = r._replace(grey=residual - as_bright * light)
-    return Compared(r, grey, seen_grey, q, (u, v), as_bright, light, same)
+    return Compared(r, grey, q, (u, v), as_bright, light, same)

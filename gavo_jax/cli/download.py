@@ -3,14 +3,13 @@
 import os
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from gavo_jax.cli.options import Download
 from gavo_jax.datasets.download import SERVER
 from gavo_jax.datasets.download import download as download_sequence
 from gavo_jax.errors import printable
-from gavo_jax.output.screen import say
+from gavo_jax.output.screen import progress_bar, say
 
 SERVER_VARIABLE = "GAVO_TUM_SERVER"
 """Environment variable that names a mirror of the benchmark."""
@@ -19,15 +18,7 @@ SERVER_VARIABLE = "GAVO_TUM_SERVER"
 def download(options: Download) -> int:
     """Get the sequence under a progress bar on standard error; print its folder."""
     to = options.to or Path(os.environ.get("GAVO_DATA") or "data")
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with progress_bar(DownloadColumn(), TransferSpeedColumn()) as bar:
         task = bar.add_task(printable(options.name), total=None)
 
         def show(have: int, total: int | None) -> None:

@@ -6,7 +6,7 @@ from gavo_jax.cli.options import Inspect
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.inspection import inspect_sequence, unit_of
 from gavo_jax.output.files import json_text
-from gavo_jax.output.screen import counted, say, waiting
+from gavo_jax.output.screen import counted, frame_progress, say
 
 NOTES = {
     "gap": "frames are missing before; used in full",
@@ -21,8 +21,8 @@ NOTES = {
 def inspect(options: Inspect) -> int:
     """Look at every chosen frame and print what there is to say, for people or as JSON."""
     sequence = open_sequence(options, force=True)
-    with waiting(f"looking at {len(sequence)} frames …"):
-        facts = inspect_sequence(sequence)
+    with frame_progress(sequence.name, len(sequence)) as on_frame:
+        facts = inspect_sequence(sequence, on_frame)
     if options.json:
         print(json_text(facts))
     else:

@@ -8,7 +8,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.libusb import import_open3d
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.run_folder import RunFolder
-from gavo_jax.output.screen import say, waiting
+from gavo_jax.output.screen import frame_progress, say
 from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, warn_of
 from gavo_jax.trajectory import Trajectory
 
@@ -44,8 +44,10 @@ def save_map(
         GavoError: it cannot be written.
     """
     steps = folder.steps()
-    with waiting(f"a map of {len(steps) + 1} frames …"):
-        scene = build_map(sequence, revised(steps), shape, voxel, trajectory=trajectory, moving=folder.moving)
+    with frame_progress("the map", len(steps) + 1) as on_frame:
+        scene = build_map(
+            sequence, revised(steps), shape, voxel, trajectory=trajectory, moving=folder.moving, on_frame=on_frame
+        )
     write_map(scene, path)
 
 

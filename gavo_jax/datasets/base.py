@@ -73,6 +73,11 @@ def as_seconds(name: str, stamp: Any) -> float:
     return float(stamp)
 
 
+def index_at(timestamps: Float[np.ndarray, " n"], stamp: float) -> int:
+    """The frame whose colour stamp is nearest to one; the stamps need not rise."""
+    return int(np.argmin(np.abs(timestamps - stamp)))
+
+
 YEAR = 365.25 * 86400
 """Seconds."""
 LATEST = 1e11

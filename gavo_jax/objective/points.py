@@ -38,6 +38,10 @@ class Reference(NamedTuple):
     lit: Float[Array, "*views n"]
     """1 where the grey is below `SATURATED`, else 0."""
 
+    def brightened(self, gain: Float[Array, "*#n"], bias: Float[Array, "*#n"] | float = 0.0) -> "Reference":
+        """The same points as of an image of another gain and bias."""
+        return self._replace(grey=gain * self.grey + bias, grey_u=gain * self.grey_u, grey_v=gain * self.grey_v)
+
 
 def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """∂/∂u and ∂/∂v by central differences of an image with a margin of one pixel; a neighbour that is `NO_PIXEL`

@@ -50,15 +50,11 @@ def in_one_brightness(keyframe: Reference, newest: Reference, brightness: Bright
 
 def _changed(reference: Reference, brightness: Brightness, applies: Bool[Array, ""]) -> Reference:
     gain, bias = jnp.where(applies, brightness.gain, 1.0), jnp.where(applies, brightness.bias, 0.0)
-    return reference._replace(
-        grey=gain * reference.grey + bias, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v
-    )
+    return reference.brightened(gain, bias)
 
 
 def in_exposure(reference: Reference, before: Exposure, after: Exposure) -> Reference:
     """Points as they would be with another exposure, if it differs so much that a search would not find it."""
     gain = after.spread / jnp.maximum(before.spread, 0.1)
     differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
-    gain = jnp.where(differs, gain, 1.0)
-    grey = jnp.where(differs, gain * (reference.grey - before.mean) + after.mean, reference.grey)
-    return reference._replace(grey=grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v)
+    return _changed(reference, Brightness(gain, after.mean - gain * before.mean), differs)

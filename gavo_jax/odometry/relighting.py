@@ -130,10 +130,7 @@ def _with_light(
         u, v = to_pixels(planes, x, y)
         column = _index_at((u + 0.5) / planes.width, level.width)
         row = _index_at((v + 0.5) / planes.height, level.height)
-        gain = 1.0 + light.reshape(level.height, level.width)[row, column]
-        return reference._replace(
-            grey=gain * reference.grey, grey_u=gain * reference.grey_u, grey_v=gain * reference.grey_v
-        )
+        return reference.brightened(1.0 + light.reshape(level.height, level.width)[row, column])
 
     lit = state._replace(previous=in_new_light(state.previous), keyframe=in_new_light(state.keyframe))
     return lit, (after + 1.0) / (before + 1.0)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gavo_jax.alignment.visits import visited_levels
-from gavo_jax.datasets.base import FrameError, Sequence
+from gavo_jax.datasets.base import FrameError, Sequence, index_at
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import distance_error
 from gavo_jax.odometry.driver import Odometry, Step
@@ -87,7 +87,7 @@ def _beside_the_pair(odometry: Odometry) -> list[str]:
 
 def _reference_of(sequence: Sequence, step: Step) -> int:
     """The index of the frame that a step's frame was aligned with."""
-    return int(np.searchsorted(sequence.timestamps, step.reference_timestamp))
+    return index_at(sequence.timestamps, step.reference_timestamp)
 
 
 def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landscape | None:

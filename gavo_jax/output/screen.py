@@ -5,13 +5,21 @@ All of it passes through `printable`: names of files and sequences are other peo
 
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -65,17 +73,24 @@ class PairProgress:
 @contextmanager
 def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgress]:
     """Show a bar on standard error while the block runs; nothing where that is no terminal."""
-    console = _Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("pairs"),
-        TimeRemainingColumn(),
-    )
     label = printable(label)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with progress_bar(MofNCompleteColumn(), TextColumn("pairs")) as progress:
         yield PairProgress(progress, progress.add_task(_compiling(label), total=pairs, completed=done), label)
+
+
+@contextmanager
+def frame_progress(label: str, frames: int) -> Iterator[Callable[[], None]]:
+    """Show a bar that counts frames while the block runs, as `pair_progress` does; what is given counts one."""
+    with progress_bar(MofNCompleteColumn(), TextColumn("frames")) as progress:
+        task = progress.add_task(printable(label), total=frames)
+        yield lambda: progress.update(task, advance=1)
+
+
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """A label, a bar, some columns and the time that is left, on standard error while that is a terminal."""
+    console = _Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), *columns, TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _compiling(label: str) -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float64
 from gavo_jax.alignment.search import Population
 from gavo_jax.bodies.records import Body
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Frame, index_at
 from gavo_jax.mapping.mapper import Loops
 from gavo_jax.mapping.pose_graph import COUNTED
 from gavo_jax.odometry.driver import MAX_DOUBTED, Step
@@ -341,7 +341,9 @@ class Truth:
 
     def motion(self, step: Step) -> Float64[np.ndarray, "4 4"] | None:
         """Return the true reference_T_target of a step, None where it is not known."""
-        reference = int(np.searchsorted(self._stamps, step.reference_timestamp))
-        if not (self._is_known(reference) and self._is_known(step.index)):
+        if not self._is_known(step.index):
+            return None
+        reference = index_at(self._stamps, step.reference_timestamp)
+        if not self._is_known(reference):
             return None
         return inverse(self._truth_T_camera[reference]) @ self._truth_T_camera[step.index]
