@@ -124,9 +124,9 @@ def _track(
                 remove_trajectories(folder.path)
                 stopwatch = Stopwatch()
             step = odometry.register(frame, timestamp)
-            viewer.watch(frame if isinstance(frame, Frame) else None, step, odometry.candidates)
-            if scene is not None and isinstance(frame, Frame):
-                scene.watch(frame, step)
+            viewer.watch(odometry.frame, step, odometry.candidates)
+            if scene is not None and odometry.frame is not None:
+                scene.watch(odometry.frame, step)
             if step is not None:
                 folder.add(step, odometry.progress)
             count += 1

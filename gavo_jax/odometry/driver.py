@@ -119,7 +119,6 @@ DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
 """Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
 
-
 Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
 """Says which pixels move in a step's frame: `Step.moving`, or the masks of the run's folder."""
 
@@ -157,6 +156,7 @@ class Odometry:
         camera: Without distortion: that of the frames as they are aligned.
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
         candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
+        frame: The last frame as it was tracked: without what is drawn into the images. None where it could not be read.
 
     Raises:
         GavoError: The camera's images are too small, or the seed is none.
@@ -183,6 +183,7 @@ class Odometry:
         self.aligner = aligner or make_aligner(self.camera, self.settings, jax.random.key(as_seed(seed)), record)
         self.progress = Progress()
         self.candidates: tuple[Population, ...] = ()
+        self.frame: Frame | None = None
 
     @in_32_bits
     def warm_up(self, wholly: bool = False) -> float:
@@ -215,13 +216,13 @@ class Odometry:
         timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
         stopwatch = Stopwatch()
-        drawn = self.progress.drawn
+        drawn, self.frame = self.progress.drawn, None
         if isinstance(frame, Frame):
             drawn = drawn.after(frame.grey)
-            frame = drawn.without(frame)
+            self.frame = frame = drawn.without(frame)
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, drawn=drawn)
-        usable = frame if isinstance(frame, Frame) and finding.use is not Use.NOTHING else None
+        usable = self.frame if finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
         if before.tracker is None:
@@ -253,14 +254,13 @@ class Odometry:
         self.progress, self.candidates = after, outcome.candidates
         if before.last_index == 0:
             return None
-        milliseconds = stopwatch.seconds * 1e3
         return Step(
             index=before.last_index,
             reference_timestamp=reference_timestamp,
             timestamp=timestamp,
             alignment=result,
             world_T_camera=after.world_T_camera.copy(),
-            milliseconds=milliseconds,
+            milliseconds=stopwatch.seconds * 1e3,
             lost=lost,
             policy=self.settings.odometry.on_lost if lost else "",
             segment=after.segment,

@@ -32,7 +32,7 @@ def track(
         settings: As of `Odometry`.
         seed: As of `Odometry`.
         odometry: A driver to use instead of a new one; if it has seen frames already it goes on with the next one.
-        watch: Is shown every frame (None: it could not be read) with its step (None: it is the first).
+        watch: Is shown every `Odometry.frame` with its step (None: it is the first).
 
     Raises:
         GavoError: It is no sequence, or gives what is no frame.
@@ -45,7 +45,7 @@ def track(
     first = odometry.progress.last_index + 1
     for index, frame in enumerate(decoded(sequence, first), start=first):
         step = odometry.register(frame, float(sequence.timestamps[index]))
-        watch(frame if isinstance(frame, Frame) else None, step)
+        watch(odometry.frame, step)
         if step is not None:
             yield step
             if step.lost and odometry.settings.odometry.on_lost == "stop":

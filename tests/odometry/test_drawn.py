@@ -114,3 +114,12 @@ def test_a_run_that_goes_on_knows_what_is_drawn(tmp_path) -> None:
     assert again.progress.drawn.counts.dtype == np.uint8
     rest = [*track(sequence, odometry=again)]
     np.testing.assert_array_equal(rest[-1].world_T_camera, whole[-1].world_T_camera)
+
+
+def test_maps_are_shown_what_was_tracked() -> None:
+    shown: list[Frame | None] = []
+    for _ in track(Altered(ROOM, marked), SEARCH_ALONE, watch=lambda frame, _: shown.append(frame)):
+        pass
+    first, last = shown[0], shown[-1]
+    assert first is not None and np.any(first.depth[104:115, 5:95])
+    assert last is not None and not np.any(last.depth[104:115, 5:95])
