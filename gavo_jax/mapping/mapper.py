@@ -105,9 +105,8 @@ class Mapper:
             self._first = None
         if step.lost:
             return
-        seconds = step.timestamp - step.reference_timestamp
         motion = np.asarray(step.alignment.target_T_reference, np.float64)
-        twist = log(motion) / max(seconds, 1e-3) if seconds > 0 else np.zeros(6)
+        twist = own_velocity(step)
         if self._first is not None and not self.keyframes.all:
             is_reference = stamp_name(self._first.timestamp) == stamp_name(step.reference_timestamp)
             self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist if is_reference else np.zeros(6)))
@@ -294,6 +293,17 @@ class Mapper:
 def _covariance(step: Step) -> Float64[np.ndarray, "6 6"]:
     """Covariance of a step's motion in the reference's camera."""
     return mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
+
+
+def own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
+    """Motion of the points in the camera at a step's moment, m/s and rad/s: the mean since its reference, and what the
+    rolling shutter tells of the camera's own; none where the stamps tell no time.
+    """
+    seconds = step.timestamp - step.reference_timestamp
+    if seconds <= 0:
+        return np.zeros(6)
+    motion, sway = (np.asarray(of, np.float64) for of in (step.alignment.target_T_reference, step.alignment.sway))
+    return (log(motion) + sway) / max(seconds, 1e-3)
 
 
 def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:

@@ -16,16 +16,17 @@ MOTION_COLUMNS = (
     ("index", "timestamp", "reference_timestamp")
     + tuple(f"{name}_{row}{column}" for name in MATRICES for row in range(3) for column in range(4))
     + tuple(f"covariance_{row}{column}" for row, column in zip(*UPPER, strict=True))
+    + tuple(f"sway_{axis}" for axis in range(6))
 )
 """Columns of motions.csv, one row per pair: the frame's index, stamps in seconds, the upper three rows of the pose and
-of the pair's motion, metres, and the upper triangle of its covariance, of (v, w), metres and radians."""
+of the pair's motion, metres, the upper triangle of its covariance, and its sway, of (v, w), metres and radians."""
 
 
 def motion_row(step: Step) -> list[Any]:
     """Values of `MOTION_COLUMNS` of one step, in digits that read back exactly."""
     matrices = (step.world_T_camera, step.alignment.target_T_reference)
     numbers = [*(np.asarray(matrix, np.float64)[:3].ravel() for matrix in matrices)]
-    numbers.append(np.asarray(step.alignment.covariance, np.float64)[UPPER])
+    numbers += [np.asarray(step.alignment.covariance, np.float64)[UPPER], np.asarray(step.alignment.sway, np.float64)]
     stamps = (step.timestamp, step.reference_timestamp)
     return [step.index, *(repr(float(number)) for number in (*stamps, *np.concatenate(numbers)))]
 
@@ -47,14 +48,14 @@ def with_motions(steps: list[Step], path: Path) -> list[Step]:
 def _with_motion(step: Step, index: str, *texts: str) -> Step:
     if int(index) != step.index or len(texts) != len(MOTION_COLUMNS) - 1:
         raise ValueError(index)
-    numbers = np.array(texts, np.float64)
+    *stamps, first, second, upper, sway = np.split(np.array(texts, np.float64), (1, 2, 14, 26, 47))
     covariance = np.zeros((6, 6))
-    covariance[UPPER] = covariance.T[UPPER] = numbers[26:]
-    pose, motion = (np.vstack([rows.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for rows in (numbers[2:14], numbers[14:26]))
+    covariance[UPPER] = covariance.T[UPPER] = upper
+    pose, motion = (np.vstack([rows.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for rows in (first, second))
     return replace(
         step,
-        timestamp=float(numbers[0]),
-        reference_timestamp=float(numbers[1]),
+        timestamp=stamps[0].item(),
+        reference_timestamp=stamps[1].item(),
         world_T_camera=pose,
-        alignment=step.alignment._replace(target_T_reference=motion, covariance=covariance),
+        alignment=step.alignment._replace(target_T_reference=motion, covariance=covariance, sway=sway),
     )

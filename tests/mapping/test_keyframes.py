@@ -89,6 +89,22 @@ def there_and_back(frames: int) -> Trajectory:
 WALK = SyntheticSequence(trajectory=there_and_back(25), noise=NONE, camera=CAMERA)
 
 
+def test_a_keyframe_is_freed_of_its_own_motion():
+    """The mean velocity since the last frame was taken for it: loops of a camera that trembles were off by more."""
+    rolling, sway = replace(CAMERA, readout=0.03), np.array([0.0, 0.01, 0.0, 0.0, 0.02, 0.0])
+    steps = [replace(step, alignment=step.alignment._replace(sway=sway)) for step in drifting(WALK, STEP)]
+    mapper = Mapper(rolling)
+    mapper.watch(WALK[0], None)
+    for step in steps[:8]:
+        mapper.watch(WALK[step.index], step)
+    last, step = mapper.keyframes.all[-1], steps[mapper.keyframes.all[-1].index - 1]
+    own = (log(np.asarray(step.alignment.target_T_reference)) + sway) * RATE
+    grey, depth = WALK[step.index].grey, WALK[step.index].depth
+    assert last.images is not None and step.index > 0
+    np.testing.assert_array_equal(last.images.grey, compensate_motion(grey, depth, rolling, own).grey)
+    assert not np.array_equal(last.images.grey, compensate_motion(grey, depth, rolling, own - sway * RATE).grey)
+
+
 def test_a_frame_without_its_own_motion_is_that_of_a_global_shutter():
     rolling = replace(CAMERA, readout=0.06)
     path = there_and_back(25)
