@@ -4,6 +4,7 @@ import importlib
 import itertools
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -11,15 +12,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import CAMERA, NEWTON, Rendered
+from small import CAMERA, GENETIC, NEWTON, Rendered
 
+from gavo_jax import presets
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
 from gavo_jax.odometry.metrics import DRIFT
 from gavo_jax.se3 import log
-from gavo_jax.settings import AlignmentOptions
+from gavo_jax.settings import AlignmentOptions, Settings
+from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.trajectory import inverse
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -27,6 +30,7 @@ CLIP = "small"
 
 
 WALK = Rendered(8, rate=5.0, speed=0.2)
+QUICK = {"gauss-newton": replace(NEWTON, solver=GaussNewton(iterations=(0, 10, 10, 15, 20))), "ga": GENETIC}
 
 
 @pytest.fixture
@@ -38,13 +42,33 @@ def load(monkeypatch: pytest.MonkeyPatch):
     return importlib.import_module
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the methods' names stand for settings that are soon compiled, where any motion will do."""
+    _have_names_stand_for(lambda method, settings: QUICK.get(method, settings), monkeypatch)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have them stand for the search alone, where nothing else is measured."""
+    without = {"relight": False, "recover": False, "bodies": "off"}
+    _have_names_stand_for(
+        lambda _, settings: replace(settings, odometry=replace(settings.odometry, **without)), monkeypatch
+    )
+
+
+def _have_names_stand_for(change: Callable[[str, Settings], Settings], monkeypatch: pytest.MonkeyPatch) -> None:
+    own = presets._own
+    monkeypatch.setattr(presets, "_own", lambda method, name: change(method, own(method, name)))
+
+
 def read(path: Path) -> dict[str, Any]:
     record = json.loads(path.read_text())
     assert {"benchmark", "date", "processor", "cores", "device", "versions"} <= set(record)
     return record
 
 
-def test_drift_compares_methods_with_peers(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drift_compares_methods_with_peers(load, quick, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drift: ModuleType = load("drift")
     drift.main(clips=CLIP, methods="ga,gauss-newton,opencv-rgb", seeds=2, json=tmp_path / "drift.json", figure=tmp_path)
     record = read(tmp_path / "drift.json")
@@ -77,7 +101,7 @@ def test_drift_refuses_unknown_methods(load) -> None:
         load("drift").main(clips=CLIP, methods="ga:nonsense")
 
 
-def test_ablation_compares_with_the_full_preset(load, tmp_path: Path) -> None:
+def test_ablation_compares_with_the_full_preset(load, quick, tmp_path: Path) -> None:
     load("ablation").main(clips=CLIP, variants="recover", seeds=1, json=tmp_path / "ablation.json")
     record = read(tmp_path / "ablation.json")
     assert [summary["name"] for summary in record["summary"]] == ["full", "recover: no second try"]
@@ -92,7 +116,7 @@ def test_ablation_switches_off_what_it_says(load) -> None:
         assert switch_off(full) != full, name
 
 
-def test_basin_counts_successes_and_flags(load, tmp_path: Path) -> None:
+def test_basin_counts_successes_and_flags(load, quick, tmp_path: Path) -> None:
     basin: ModuleType = load("basin")
     basin.main(
         clip=CLIP, gaps="1,3", methods="gauss-newton,opencv-rgb", step=2, json=tmp_path / "basin.json", figure=tmp_path
@@ -111,7 +135,7 @@ def test_basin_counts_successes_and_flags(load, tmp_path: Path) -> None:
     assert (agreement["precision"], agreement["recall"]) == (0.5, 0.5)
 
 
-def test_optimality_is_judged_from_below(load, tmp_path: Path) -> None:
+def test_optimality_is_judged_from_below(load, quick, tmp_path: Path) -> None:
     load("optimality").main(clips=CLIP, json=tmp_path / "optimality.json")
     record = read(tmp_path / "optimality.json")
     [row] = record["summary"]
@@ -134,7 +158,7 @@ def test_kernel_formulations_agree_and_are_timed(load, tmp_path: Path, monkeypat
     assert record["ratios"]["score / numba"]["80x60"] == pytest.approx(times["score"] / times["numba"])
 
 
-def test_faults_are_counted(load, tmp_path: Path) -> None:
+def test_faults_are_counted(load, quick, tmp_path: Path) -> None:
     faults: ModuleType = load("faults")
     slow = Rendered(20, camera=CAMERA, rate=10.0, speed=0.2)
     faults.common.open_clip = lambda _: slow
@@ -151,7 +175,7 @@ def test_faults_are_counted(load, tmp_path: Path) -> None:
         faults.main(clips=CLIP, faults="nonsense")
 
 
-def test_conditions_are_compared_with_the_clip_as_it_is(load, tmp_path: Path) -> None:
+def test_conditions_are_compared_with_the_clip_as_it_is(load, quick, tmp_path: Path) -> None:
     conditions: ModuleType = load("conditions")
     conditions.main(
         clips=CLIP, method="gauss-newton", conditions="bands of 4 %,every second", json=tmp_path / "conditions.json"
@@ -177,7 +201,7 @@ def test_a_condition_keeps_images_and_camera_alike(load, name: str) -> None:
         assert frame.grey.shape != WALK[index].grey.shape or not np.array_equal(frame.grey, WALK[index].grey)
 
 
-def test_depth_that_is_always_wrong_is_measured(load, tmp_path: Path) -> None:
+def test_depth_that_is_always_wrong_is_measured(load, quick, tmp_path: Path) -> None:
     wrong_depth: ModuleType = load("wrong_depth")
     quick = Rendered(20, camera=CAMERA, rate=15.0, speed=0.5)
     wrong_depth.common.open_clip = lambda _: quick
@@ -202,7 +226,7 @@ def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path
             open_clip(text)
 
 
-def test_throughput_counts_frames_from_files_to_poses(load, tmp_path: Path) -> None:
+def test_throughput_counts_frames_from_files_to_poses(load, quick, tmp_path: Path) -> None:
     throughput: ModuleType = load("throughput")
     throughput.main(
         clip=CLIP,
@@ -225,7 +249,7 @@ def test_throughput_counts_frames_from_files_to_poses(load, tmp_path: Path) -> N
         throughput.main(clip=CLIP, methods="gauss-newton", frames=1)
 
 
-def test_scaling_fits_the_exponent_of_the_large_calls(load, tmp_path: Path) -> None:
+def test_scaling_fits_the_exponent_of_the_large_calls(load, quick, tmp_path: Path) -> None:
     scaling: ModuleType = load("scaling")
     file = tmp_path / "scaling.json"
     scaling.main(levels="3,2", populations="8,64", batches="1,2", methods="gauss-newton", rounds=1, json=file)
@@ -243,7 +267,7 @@ def test_scaling_fits_the_exponent_of_the_large_calls(load, tmp_path: Path) -> N
 
 
 def test_gpu_reports_on_a_cpu_too(
-    load, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    load, alone, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gpu: ModuleType = load("gpu")
     monkeypatch.setattr(gpu, "COPIED", 2**16)
@@ -294,14 +318,14 @@ def test_footprint_times_and_weighs_processes(load, tmp_path: Path) -> None:
     assert 100 < short < 4000 and figures["ratio"] == pytest.approx(long / short)
 
 
-def test_together_counts_programs_and_equal_runs(load, tmp_path: Path) -> None:
+def test_together_counts_programs_and_equal_runs(load, quick, tmp_path: Path) -> None:
     load("together").main(clip=CLIP, methods="gauss-newton", runs=2, repeats=1, json=tmp_path / "together.json")
     figures = read(tmp_path / "together.json")["gauss-newton"]
     assert (figures["more_programs"], figures["equal"]) == (0, 2) and figures["ratio"] > 0
     assert min(figures["core_milliseconds_a_pair"].values()) > 0
 
 
-def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> None:
+def test_calibration_weighs_errors_by_their_covariance(load, quick, tmp_path: Path) -> None:
     calibration: ModuleType = load("calibration")
     calibration.main(frames=3, seeds=1, clips=CLIP, json=tmp_path / "calibration.json")
     *_, synthetic, clip = read(tmp_path / "calibration.json")["rows"]
@@ -311,7 +335,7 @@ def test_calibration_weighs_errors_by_their_covariance(load, tmp_path: Path) -> 
         assert 0 < row["millimetres"] < 5
 
 
-def test_shutter_compares_readouts(load, tmp_path: Path) -> None:
+def test_shutter_compares_readouts(load, alone, tmp_path: Path) -> None:
     shutter: ModuleType = load("shutter")
     walk = Rendered(8, rate=5.0, speed=0.4)
     shutter.common.open_clip = lambda _: walk
@@ -331,7 +355,7 @@ def test_depth_weight_compares_the_channels(load, tmp_path: Path) -> None:
         assert 0.05 < row["disagreement"] < 20 and 0 < row["by_disagreement"] <= row["by_scatter"]
 
 
-def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
+def test_viewer_is_weighed_against_a_run_without(load, quick, tmp_path: Path) -> None:
     viewer: ModuleType = load("viewer")
     viewer.common.open_clip = lambda _: SyntheticSequence(8, camera=CAMERA, rate=5.0, speed=0.2)
     viewer.main(clip=CLIP, methods="gauss-newton", rounds=1, json=tmp_path / "viewer.json")
@@ -341,7 +365,7 @@ def test_viewer_is_weighed_against_a_run_without(load, tmp_path: Path) -> None:
     assert without["megabytes"] == 0 < figures["megabytes"] < 1
 
 
-def test_surfaces_that_tell_little_are_told(load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surfaces_that_tell_little_are_told(load, quick, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     texture: ModuleType = load("texture")
     monkeypatch.setattr(texture, "CAMERA", CAMERA)
     cases = []
@@ -363,7 +387,7 @@ def test_accelerations_are_those_of_the_path(load, tmp_path: Path) -> None:
         assert 0.4 < row["sway, rad/s"] / row["change, rad/s"] < 0.6
 
 
-def test_moving_bodies_are_scored(load, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_moving_bodies_are_scored(load, quick, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moving: ModuleType = load("moving")
     slow = Rendered(20, camera=CAMERA, rate=10.0, speed=0.2)
     moving.common.open_clip = lambda _: slow
@@ -474,7 +498,7 @@ def test_table_1_is_made_of_the_experiment_and_recorded(
     assert "--record: name the file" in capsys.readouterr().err
 
 
-def test_sway_compares_velocities(load, tmp_path: Path) -> None:
+def test_sway_compares_velocities(load, alone, tmp_path: Path) -> None:
     sway: ModuleType = load("sway")
     walk = Rendered(8, rate=5.0, speed=0.4, camera=replace(CAMERA, readout=0.1))
     sway.common.open_clip = lambda _: walk
