@@ -36,8 +36,10 @@ OURS = __name__.partition(".")[0]
 TRACED_WITH = ("jax", "jaxlib", "jaxlie", "numpy", "optax")
 """Packages whose code is traced along with ours; their versions tell whether it has changed."""
 
-OPTIONS = tuple(name for name in sorted(jax.config.values) if hasattr(jax.config, name))
-"""JAX's, by name."""
+OPTIONS = tuple(
+    name for name in sorted(jax.config.values) if hasattr(jax.config, name) and "transfer_guard" not in name
+)
+"""JAX's, by name, but for those of what may be copied: they are asked as a program runs, and are no part of it."""
 _configuration = attrgetter(*OPTIONS)
 """Of `jax.config` their values, as this thread has them."""
 
