@@ -38,15 +38,15 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 TRACED = Path(os.environ["GAVO_CACHE_DIR"]) / "traced"
 
 LONGEST = (
-    "test_benchmarks.py",
     "bodies/test_rival.py",
-    "alignment/test_search.py",
-    "alignment/test_review.py",
     "cli/test_cli.py",
-    "alignment/test_pairs.py",
+    "alignment/test_search.py",
+    "test_benchmarks.py",
     "cli/test_contract.py",
     "output/test_resume.py",
     "experiments/test_together.py",
+    "alignment/test_review.py",
+    "alignment/test_pairs.py",
     "bodies/test_aligner.py",
     "test_examples.py",
     "compilation/test_precision.py",
@@ -63,8 +63,8 @@ LONGEST = (
     "solvers/test_solve.py",
 )
 """Files that take longest, in the order in which they begin: one that began last would keep a process waiting. Those
-that need the same large program begin at different times, as both processes would compile it: the benchmarks and the
-command, the rival and the aligner, single pairs and their review.
+that need the same large program begin at different times, as both processes would compile it: the rival and the aligner,
+single pairs and their review.
 """
 
 MOST_MAPS = 20_000
