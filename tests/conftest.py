@@ -63,8 +63,8 @@ LONGEST = (
     "solvers/test_solve.py",
 )
 """Files that take longest, in the order in which they begin: one that began last would keep a process waiting. Those
-that need the same large program begin at different times, as both processes would compile it: the rival and the aligner,
-single pairs and their review.
+that need the same large program begin at different times, as both processes would compile it: the rival and the
+aligner, single pairs and their review.
 """
 
 MOST_MAPS = 20_000
