@@ -19,9 +19,13 @@ TRUTH = "groundtruth.txt"
 """In TUM's form."""
 
 OTHER_NAMES = re.compile(
-    r"(gt|ground[-_]?truth|(cam(era)?[-_]?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum)", re.IGNORECASE
+    r"(.*[-_])?(gt|ground[-_]?truth|(cam(era)?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum|log)",
+    re.IGNORECASE,
 )
 """Files that look like one, and are not looked for: their form is open."""
+
+OTHER_FOLDERS = re.compile(r"(.*[-_])?(poses?|traj|trajectory|extrinsics?)", re.IGNORECASE)
+"""Folders that look as if they held one."""
 
 NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
 
@@ -136,28 +140,33 @@ def _is_without_gap(numbers: np.ndarray) -> bool:
 
 
 def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") -> list[str]:
-    """A line for a file of poses that is not read, where there is no other: it may be the true trajectory, or is none.
+    """A line for a file or folder of poses that is not read, where there is no other: it may be the true trajectory, or
+    is none.
 
     Args:
         folder: of the frames.
         truth: that which was read.
         estimates: the names, as of `glob`, of what the program has found that wrote the folder.
     """
-    files = [] if truth is not None else sorted(file.name for file in folder.glob("*") if file.is_file())
-    found = set(fnmatch.filter(files, estimates))
-    others = [name for name in files if name not in found and OTHER_NAMES.fullmatch(name)]
+    entries = [] if truth is not None else sorted(folder.iterdir())
+    found = set(fnmatch.filter((entry.name for entry in entries), estimates))
+    others = [
+        entry.name
+        for entry in entries
+        if entry.name not in found and (OTHER_FOLDERS if entry.is_dir() else OTHER_NAMES).fullmatch(entry.name)
+    ]
     return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [
         f"{name}: {_how_to_name(folder / name)}" for name in others
     ]
 
 
-def _how_to_name(file: Path) -> str:
-    """What makes the truth of a file of poses."""
+def _how_to_name(path: Path) -> str:
+    """What makes the truth of a file or a folder of poses."""
     try:
-        rows = data_rows(file)
+        rows = [] if path.is_dir() else data_rows(path)
     except GavoError:
         rows = []
-    if rows and len(rows[0][1]) != 8:
+    if path.is_dir() or (rows and len(rows[0][1]) != 8):
         return f"if it is the true trajectory, write it as rows of timestamp tx ty tz qx qy qz qw into {TRUTH}"
     return f"if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}"
 

@@ -244,12 +244,18 @@ def test_infinity_is_no_pose_however_it_is_written(tmp_path, none):
 
 
 @pytest.mark.parametrize("layout", ["plain", "tum"])
-@pytest.mark.parametrize("name", ["gt.txt", "poses.txt", "groundTruth.csv", "pose_left.txt", "trajectory.tum"])
+@pytest.mark.parametrize(
+    "name",
+    ["gt.txt", "poses.txt", "groundTruth.csv", "pose_left.txt", "trajectory.tum"]
+    + ["room1-traj.txt", "room_trajectory.log", "poses/0.txt", "camera_poses/0.txt"],
+)
 def test_a_truth_by_another_name_is_told(tmp_path, layout, name):
     LAYOUTS[layout][1](tmp_path / "clip")
     truth = tmp_path / "clip" / "groundtruth.txt"
     truth.unlink(missing_ok=True)
+    (tmp_path / "clip" / name).parent.mkdir(exist_ok=True)
     (tmp_path / "clip" / name).write_text("0 0 0 0 0 0 0 1\n")
+    name = name.partition("/")[0]
     sequence = open_source(tmp_path / "clip")
     assert sequence.ground_truth is None
     assert [line for line in left_out(sequence) if line.startswith(f"{name}: if it is the true trajectory")]
