@@ -313,7 +313,7 @@ def build_map(
         farthest: depth beyond is left out, metres.
         trajectory: the poses where they are not the steps' own any more: loops have corrected them.
         moving: where bodies are in the frame of a step.
-        on_frame: called after each frame.
+        on_frame: called for each frame.
 
     Raises:
         GavoError: another shape, an absurd voxel, or Open3D cannot be imported.

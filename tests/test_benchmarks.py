@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import CAMERA, GENETIC, NEWTON, Rendered
+from small import ALONE, CAMERA, GENETIC, NEWTON, Rendered
 
 from gavo_jax import presets
 from gavo_jax.datasets.rendered.sensor_noise import NONE
@@ -51,10 +51,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have them stand for the search alone, where nothing else is measured."""
-    without = {"relight": False, "recover": False, "bodies": "off"}
-    _have_names_stand_for(
-        lambda _, settings: replace(settings, odometry=replace(settings.odometry, **without)), monkeypatch
-    )
+    _have_names_stand_for(lambda _, settings: replace(settings, odometry=ALONE), monkeypatch)
 
 
 def _have_names_stand_for(change: Callable[[str, Settings], Settings], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +98,7 @@ def test_drift_refuses_unknown_methods(load) -> None:
         load("drift").main(clips=CLIP, methods="ga:nonsense")
 
 
-def test_ablation_compares_with_the_full_preset(load, quick, tmp_path: Path) -> None:
+def test_ablation_compares_with_the_full_preset(load, tmp_path: Path) -> None:
     load("ablation").main(clips=CLIP, variants="recover", seeds=1, json=tmp_path / "ablation.json")
     record = read(tmp_path / "ablation.json")
     assert [summary["name"] for summary in record["summary"]] == ["full", "recover: no second try"]
@@ -175,7 +172,7 @@ def test_faults_are_counted(load, quick, tmp_path: Path) -> None:
         faults.main(clips=CLIP, faults="nonsense")
 
 
-def test_conditions_are_compared_with_the_clip_as_it_is(load, quick, tmp_path: Path) -> None:
+def test_conditions_are_compared_with_the_clip_as_it_is(load, tmp_path: Path) -> None:
     conditions: ModuleType = load("conditions")
     conditions.main(
         clips=CLIP, method="gauss-newton", conditions="bands of 4 %,every second", json=tmp_path / "conditions.json"
@@ -203,8 +200,8 @@ def test_a_condition_keeps_images_and_camera_alike(load, name: str) -> None:
 
 def test_depth_that_is_always_wrong_is_measured(load, quick, tmp_path: Path) -> None:
     wrong_depth: ModuleType = load("wrong_depth")
-    quick = Rendered(20, camera=CAMERA, rate=15.0, speed=0.5)
-    wrong_depth.common.open_clip = lambda _: quick
+    walk = Rendered(20, camera=CAMERA, rate=15.0, speed=0.5)
+    wrong_depth.common.open_clip = lambda _: walk
     wrong_depth.main(clips=CLIP, method="gauss-newton", faults="depth upside down", json=tmp_path / "wrong.json")
     clean, damaged = read(tmp_path / "wrong.json")["faults"]
     assert (clean["fault"], damaged["fault"]) == ("clean", "depth upside down") and clean["ratio"] == 1.0

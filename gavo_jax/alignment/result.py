@@ -48,7 +48,6 @@ class Alignment(NamedTuple):
     sway: Any = np.zeros(6, np.float32)
     """Twist of the points in the target camera at its moment, less ξ: metres and radians over the time between the
     frames; 0 where a rolling shutter does not tell it. See `alignment.sway`."""
-
     brightness: Brightness = Brightness(np.float32(1.0), np.float32(0.0))  # pyright: ignore
     """Gain and bias, grey levels, that make of each view's grey the target's: the reference's, and in a sequence the
     keyframe's, too."""

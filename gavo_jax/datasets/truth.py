@@ -163,7 +163,7 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
 def _how_to_name(path: Path) -> str:
     """What makes the truth of a file or a folder of poses."""
     try:
-        rows = [] if path.is_dir() else data_rows(path)
+        rows = data_rows(path)
     except GavoError:
         rows = []
     if path.is_dir() or (rows and len(rows[0][1]) != 8):

@@ -105,8 +105,7 @@ class Mapper:
             self._first = None
         if step.lost:
             return
-        motion = np.asarray(step.alignment.target_T_reference, np.float64)
-        twist = own_velocity(step)
+        twist = _own_velocity(step)
         if self._first is not None and not self.keyframes.all:
             is_reference = stamp_name(self._first.timestamp) == stamp_name(step.reference_timestamp)
             self._add(self.keyframes.make(self._first, 0, 0, np.eye(4), twist if is_reference else np.zeros(6)))
@@ -115,7 +114,7 @@ class Mapper:
         if is_found:
             twist = np.zeros(6)
         else:
-            self._follow(step, motion)
+            self._follow(step)
         if frame is not None and (due or _may_be_keyframe(step)):
             frame = without_moving(frame, moving(step))
         if frame is not None and due:
@@ -219,11 +218,12 @@ class Mapper:
                 before = stamp_name(step.reference_timestamp)
                 step = None if before in stamps else tracked.get(before)
 
-    def _follow(self, step: Step, motion: np.ndarray) -> None:
+    def _follow(self, step: Step) -> None:
         """Keep the covariance of the motion since the last keyframe."""
         before = self._known.get(stamp_name(step.reference_timestamp))
         covariance = _covariance(step)
         if before is not None and np.isfinite(covariance).all():
+            motion = np.asarray(step.alignment.target_T_reference, np.float64)
             covariance = transport_covariance(motion, before.covariance + covariance)
             self._known[stamp_name(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
             if len(self._known) > REMEMBERED:
@@ -295,7 +295,7 @@ def _covariance(step: Step) -> Float64[np.ndarray, "6 6"]:
     return mirrored(np.asarray(step.alignment.covariance, np.float64)) + STEP_FLOOR**2 * np.eye(6)
 
 
-def own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
+def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
     """Motion of the points in the camera at a step's moment, m/s and rad/s: the mean since its reference, and what the
     rolling shutter tells of the camera's own; none where the stamps tell no time.
     """
