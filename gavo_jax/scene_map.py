@@ -19,11 +19,12 @@ from jaxtyping import Float, Int, UInt8
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import rectified, without_distortion
+from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError, GavoWarning, partial_of
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
+from gavo_jax.odometry.drawn import AsTracked
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.se3 import is_rigid
 from gavo_jax.status import AlignmentStatus
@@ -319,7 +320,7 @@ def build_map(
         GavoError: another shape, an absurd voxel, or Open3D cannot be imported.
     """
     check_shape(shape)
-    sequence, steps = without_distortion(sequence), list(steps)
+    frames, steps = AsTracked(sequence), list(steps)
     corrected = _PosesInOrder(trajectory, float(sequence.timestamps[0]))
     places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]
     reasons: Counter[str] = Counter()
@@ -334,15 +335,15 @@ def build_map(
             places.append((step.index, step, world_T_camera, segment))
     segments = [segment for *_, segment in places]
     chosen = max(set(segments), key=lambda segment: (segments.count(segment), -segment), default=0)
-    builder = MapBuilder(sequence.camera, voxel, farthest)
+    builder = MapBuilder(sequence.camera.rectified(), voxel, farthest)
     for index, step, world_T_camera, segment in places:
         on_frame()
         if segment != chosen:
             reasons[ELSEWHERE] += 1
             continue
         try:
-            frame = sequence[index] if step is None else without_moving(sequence[index], moving(step))
-            builder.add(frame, world_T_camera)
+            frame = frames[index]
+            builder.add(frame if step is None else without_moving(frame, moving(step)), world_T_camera)
         except FrameError:
             reasons[UNREADABLE] += 1
     return builder.extract(shape, _left_out(reasons))

@@ -14,6 +14,7 @@ NOTES = {
     "no_depth": "too few depth readings; aligned with a frame before, and no later one with it",
     "partial_depth": "much of the usual depth is missing; aligned with a frame before, and no later one with it",
     "depth_units": "depth may be in other units; used in full",
+    "moving_body": "a part of the image repeats the one before; used in full",
 }
 """What a run makes of frames that it uses and doubts, by status."""
 

@@ -48,9 +48,11 @@ class BackgroundMapper:
         """Return where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
         return self._after_all(self.mapper.find, frame, segment)
 
-    def replay(self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving) -> None:
+    def replay(
+        self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving, is_drawn_on: bool = False
+    ) -> None:
         """Take notice of what a run did before it was cut short; see `Mapper.replay`."""
-        self._after_all(self.mapper.replay, sequence, steps, moving)
+        self._after_all(self.mapper.replay, sequence, steps, moving, is_drawn_on)
 
     def finish(self, steps: Iterable[Step] = ()) -> Loops:
         """The whole map; see `Mapper.finish`."""

@@ -11,12 +11,12 @@ from jaxtyping import Float64
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.mapping.candidates import LoopCandidate, find_candidates
 from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
+from gavo_jax.odometry.drawn import AsTracked
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
 from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.status import GRAVITY, AlignmentStatus
@@ -147,18 +147,22 @@ class Mapper:
             return step.origin == "relocalised"
         return step.depth_is_trusted and self.keyframes.is_due(step.world_T_camera, step.segment)
 
-    def replay(self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving) -> None:
+    def replay(
+        self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving, is_drawn_on: bool = False
+    ) -> None:
         """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded.
 
         Args:
             sequence: The frames that the run is over.
             steps: The steps that it had made.
             moving: Where bodies are in the frame of a step.
+            is_drawn_on: Whether something is drawn into the images: then all of them are decoded, to tell it again.
         """
-        self.watch(_decoded(sequence, 0), None)
+        frames = AsTracked(sequence, is_drawn_on)
+        self.watch(_decoded(frames, 0), None)
         last = max((step.index for step in steps if _may_be_keyframe(step)), default=0)
         for step in steps:
-            frame = _decoded(sequence, step.index) if self.is_due(step) or step.index == last else None
+            frame = _decoded(frames, step.index) if self.is_due(step) or step.index == last else None
             if frame is not None and step.origin == "relocalised":
                 reference = stamp_name(step.reference_timestamp)
                 by = [k for k in self.keyframes.searchable() if stamp_name(k.timestamp) == reference]
@@ -333,8 +337,8 @@ def _may_be_keyframe(step: Step) -> bool:
     return step.origin == "tracked" and not step.lost and step.depth_is_trusted
 
 
-def _decoded(sequence: Sequence, index: int) -> Frame | None:
+def _decoded(frames: AsTracked, index: int) -> Frame | None:
     try:
-        return rectified_at(sequence, index)
+        return frames[index]
     except FrameError:
         return None

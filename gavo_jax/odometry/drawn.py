@@ -4,6 +4,7 @@ would hold the camera where it is.
 No sensor gives a pixel the same level twice for long: it has noise. What is drawn has none.
 """
 
+import contextlib
 from dataclasses import replace
 from typing import NamedTuple, Self
 
@@ -11,7 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Num, UInt8
 
-from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.rectified import rectified_at
 
 STEP = 2
 """Pixels, down and to the right, of which one is looked at."""
@@ -39,6 +41,11 @@ class Drawn(NamedTuple):
     counts: UInt8[np.ndarray, "h w"] = np.zeros((0, 0), np.uint8)
     """In so many images of a camera that moved each pixel kept its level, up to the last one."""
 
+    @property
+    def is_any(self) -> bool:
+        """Whether enough of the image keeps its level for something to be drawn there."""
+        return self.last is not None and np.count_nonzero(self.counts >= FRAMES) >= LEAST * self.counts.size
+
     def after(self, grey: np.ndarray) -> Self:
         """Look at one more image."""
         some = np.ascontiguousarray(np.asarray(grey)[::STEP, ::STEP])
@@ -55,7 +62,7 @@ class Drawn(NamedTuple):
 
     def without(self, frame: Frame) -> Frame:
         """The last frame with the mean of its surroundings, and no depth, where something is drawn."""
-        if self.last is None or np.count_nonzero(self.counts >= FRAMES) < LEAST * self.counts.size:
+        if self.last is None or not self.is_any:
             return frame
         edges = (self.counts >= FRAMES) & _is_steep(self.last)
         if np.count_nonzero(edges) < LEAST * edges.size:
@@ -70,6 +77,33 @@ class Drawn(NamedTuple):
         mask = cv2.resize(drawn.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         filled = np.where(mask, cv2.resize(mean, size), grey).astype(grey.dtype)
         return replace(frame, grey=filled, depth=np.where(mask, depth.dtype.type(0), depth))
+
+
+class AsTracked:
+    """Frames of a run as they were tracked, read once more from the first one on.
+
+    Without `is_drawn_on` nothing is drawn into them, and only those are decoded that are asked for.
+    """
+
+    def __init__(self, sequence: Sequence, is_drawn_on: bool = True) -> None:
+        self._sequence, self._is_drawn_on = sequence, is_drawn_on
+        self._drawn, self._next = Drawn(), 0
+
+    def __getitem__(self, index: int) -> Frame:
+        """A frame behind those that were asked for before: without distortion, and without what is drawn into it.
+
+        Raises:
+            FrameError: It cannot be read.
+        """
+        for number in range(self._next, index) if self._is_drawn_on else ():
+            with contextlib.suppress(FrameError):
+                self._drawn = self._drawn.after(rectified_at(self._sequence, number).grey)
+        self._next = index + 1
+        frame = rectified_at(self._sequence, index)
+        if not self._is_drawn_on:
+            return frame
+        self._drawn = self._drawn.after(frame.grey)
+        return self._drawn.without(frame)
 
 
 def _is_steep(image: np.ndarray) -> np.ndarray:

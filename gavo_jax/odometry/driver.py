@@ -232,7 +232,7 @@ class Odometry:
         else:
             outcome = self._align(before, usable, finding)
         after, result, lost, bodies = outcome.after, outcome.result, outcome.lost, outcome.bodies
-        origin, reference_timestamp = "guessed" if lost or after.unknown else "tracked", before.reference_timestamp
+        origin = "guessed" if lost or after.unknown else "tracked"
         found = self._seek(after, usable if finding.use is Use.ALL else None)
         if found is not None:
             after = after._replace(
@@ -246,7 +246,7 @@ class Odometry:
             new_T_old = found.world_T_camera @ inverse(outcome.after.world_T_camera)
             # what a lost search took for a body did not fit a motion that was wrong
             bodies = () if lost else tuple(body.moved(new_T_old) for body in bodies)
-            result, lost, origin, reference_timestamp = found.alignment, False, "relocalised", found.timestamp
+            result, lost, origin = with_finding(found.alignment, finding.status), False, "relocalised"
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
         if usable is not None and after.tracker is not before.tracker:
@@ -256,7 +256,7 @@ class Odometry:
             return None
         return Step(
             index=before.last_index,
-            reference_timestamp=reference_timestamp,
+            reference_timestamp=before.reference_timestamp if found is None else found.timestamp,
             timestamp=timestamp,
             alignment=result,
             world_T_camera=after.world_T_camera.copy(),

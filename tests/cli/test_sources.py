@@ -147,6 +147,17 @@ def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
     )
 
 
+def test_inspect_tells_of_an_image_that_stands_still_in_part(gavo, clip):
+    """It ended in a traceback."""
+    grey, last = (sorted((clip / "rgb").iterdir())[at] for at in (-2, -1))
+    before, image = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in (grey, last))
+    assert before is not None and image is not None
+    image[60:] = before[60:]
+    assert cv2.imwrite(str(last), image)
+    done = gavo("inspect", clip)
+    assert done.status == 0 and "\nof these, 1 moving_body: a part of the image repeats the one before" in done.out
+
+
 def test_inspect_tells_of_depth_that_is_mirrored(gavo, data_dir, tmp_path):
     source, folder = data_dir / "fr1_desk", tmp_path / "mirrored"
     folder.mkdir()

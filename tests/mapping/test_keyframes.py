@@ -349,6 +349,21 @@ def test_a_frame_that_is_found_shows_no_body_of_a_search_that_failed(found_at: i
     assert len(step.bodies) == (0 if found_at == 8 else 1), "the next one's is seen by a motion that holds"
 
 
+def test_what_is_found_again_after_a_gap_says_so():
+    """The finding of the frame's stamp was gone: the frame was plainly `ok`."""
+    relocaliser = Knows(None)
+    driver, steps = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=relocaliser), []
+    for i in range(12):
+        stamp = i / RATE + (2.0 if i == 11 else 0.0)
+        frame = replace(WALK[i], timestamp=stamp)
+        if 4 <= i < 11:
+            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        relocaliser.segment = 0 if i == 11 else None
+        steps.append(driver.register(frame, stamp))
+    assert steps[-1] is not None and steps[-1].origin == "relocalised"
+    assert steps[-1].alignment.statuses == (AlignmentStatus.GAP,)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_covered_lens_is_followed_by_the_map(known):
     relocaliser = Knows(0 if known else None)

@@ -10,10 +10,11 @@ import small
 from driving import SEARCH_ALONE, Altered
 from small import Rendered
 
-from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE, SensorNoise
-from gavo_jax.odometry.drawn import FRAMES, Drawn
-from gavo_jax.odometry.driver import Odometry
+from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.odometry.drawn import FRAMES, AsTracked, Drawn
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -123,3 +124,38 @@ def test_maps_are_shown_what_was_tracked() -> None:
     first, last = shown[0], shown[-1]
     assert first is not None and np.any(first.depth[104:115, 5:95])
     assert last is not None and not np.any(last.depth[104:115, 5:95])
+
+
+def torn_once(index: int, frame: Frame) -> Frame:
+    """The same, of which one cannot be read."""
+    if index == 4:
+        raise FrameError("torn")
+    return marked(index, frame)
+
+
+def test_frames_are_read_again_as_they_were_tracked() -> None:
+    sequence, shown = Altered(ROOM, torn_once), {}
+
+    def watch(frame: Frame | None, step: Step | None) -> None:
+        shown[0 if step is None else step.index] = frame
+
+    for _ in track(sequence, SEARCH_ALONE, watch=watch):
+        pass
+    again, plain = AsTracked(sequence), AsTracked(sequence, is_drawn_on=False)
+    for index in (0, 3, FRAMES + 2, len(ROOM) - 1):
+        np.testing.assert_array_equal(again[index].grey, shown[index].grey)
+        np.testing.assert_array_equal(again[index].depth, shown[index].depth)
+        np.testing.assert_array_equal(plain[index].grey, sequence[index].grey)
+    with pytest.raises(FrameError, match="torn"):
+        AsTracked(sequence)[4]
+
+
+def test_a_resumed_run_makes_its_map_of_what_was_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keyframes from before the interruption had the clock that later ones were freed of."""
+    sequence, replayed = Altered(ROOM, marked), []
+    steps = [*track(sequence, SEARCH_ALONE)]
+    monkeypatch.setattr(Mapper, "is_due", lambda self, step: step.index % 5 == 0)
+    monkeypatch.setattr(Mapper, "watch", lambda self, frame, *_: replayed.append(frame))
+    Mapper(small.CAMERA).replay(sequence, steps, is_drawn_on=True)
+    kept = [np.any(frame.depth[104:115, 5:95]) for frame in replayed if frame is not None]
+    assert kept[0] and not kept[-1]
