@@ -50,7 +50,7 @@ def fit_objective(
     On the first level nothing is aligned yet, and while several islands compete the leader may be wrong. A regression
     of one image on the other would only tell that they differ, its gain would fall towards 0 and reward motions that
     hide contrast; and residuals of a wrong motion say nothing of how much depth is worth. So brightness is left alone
-    there (`Objective.centred` takes care of exposure), and depth has its largest weight on the first level.
+    there (`Objective.centred` takes care of exposure), and depth keeps the whole of its weight.
     """
     brightness = unchanged_brightness(level)
     objective = level_objective(level, target, options, brightness)

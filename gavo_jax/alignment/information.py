@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from gavo_jax.camera import to_pixels
 from gavo_jax.image.warp import Slopes, Warped
-from gavo_jax.objective.derivatives import Term, pixel_jacobian
+from gavo_jax.objective.derivatives import Term, depth_slopes, pixel_jacobian
 from gavo_jax.objective.error import Residuals
 from gavo_jax.objective.points import Reference
 from gavo_jax.objective.problem import Problem
@@ -95,8 +95,8 @@ def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[S
     grey = Slopes(reference.grey_u, reference.grey_v, flat), Slopes(r.grey_sample.along_u, r.grey_sample.along_v, flat)
     if not use_depth:
         return [grey]
-    before = Slopes(facing * reference.slope_u, facing * reference.slope_v, -facing)
-    after = Slopes(facing * r.depth_sample.along_u, facing * r.depth_sample.along_v, -facing)
+    before = depth_slopes(reference.slope_u, reference.slope_v, facing)
+    after = depth_slopes(r.depth_sample.along_u, r.depth_sample.along_v, facing)
     return [grey, (before, after)]
 
 

@@ -74,8 +74,8 @@ class Winner(NamedTuple):
     motion: Float[Array, "4 4"]
     rival: Float[Array, ""]
     """See `search.SearchState`."""
-    centre: Float[Array, "4 4"]
-    """Motion that the search was held about."""
+    centre: Float[Array, "4 4"] | None
+    """Motion that the search was held about; None where motions from anywhere competed."""
     history: Float[Array, " iterations"]
     judge: Objective | None = None
     """What the evidence is asked of, where motions competed by it."""
@@ -97,7 +97,8 @@ def conclude(
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
     points = finest.points * finest.views  # arrays may be longer
     reach = reach_of(options)
-    problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=winner.centre, reach=reach)
+    centre = winner.motion if winner.centre is None else winner.centre
+    problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=centre, reach=reach)
     added = jnp.zeros((6, 6))
     if options.last_step and not options.symmetric:
         problem, residuals, added = _last_step(problem, residuals, swaying, points)
@@ -105,7 +106,7 @@ def conclude(
     motion = problem.origin
     examination, covariance, chosen_by = _weigh(_examine(problem, residuals, part), objective, winner.judge, added)
     against = find_against(examination, covariance, objective, winner.rival, part.share * points, chosen_by)
-    if options.precondition:
+    if options.precondition and winner.centre is not None:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
         # along a way that the images leave open any motion is as good, that at the edge, too
         is_told = ~against[AlignmentStatus.LOW_TEXTURE]
@@ -135,7 +136,7 @@ def _last_step(
     """
 
     def without_sway() -> Swayed:
-        refined = _refine(problem, residuals)
+        refined = _newton_step(problem, residuals)
         return unswayed(refined, problem.objective.residuals(refined))
 
     if swaying is None or problem.objective.readout is None:
@@ -146,7 +147,7 @@ def _last_step(
     return replace(problem.with_sway(found.twist), origin=found.motion), found.residuals, found.covariance
 
 
-def _refine(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
+def _newton_step(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
     """The motion one Newton step from the problem's origin, of which these are the residuals, if that is no worse."""
     model = problem.linearize_residuals(residuals)
     step = -jnp.linalg.solve(_regular(model.hessian), model.gradient)

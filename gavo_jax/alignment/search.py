@@ -102,16 +102,16 @@ class SearchState(NamedTuple):
     """Half-widths of the search box, metres and radians."""
     brightness: Brightness
     rival: Float[Array, ""]
-    """How far the second-best mode is behind, where several competed: the best one's evidence over its, or its error
-    over the best one's; +inf without one."""
+    """How far the second-best mode is behind: its error over the best one's or, after a contest, the best one's
+    evidence over its; +inf without one."""
 
 
 class Ended(NamedTuple):
     """What the searches of a pair ended with."""
 
     search: SearchState
-    centre: Float[Array, "4 4"]
-    """Motion that it was held about."""
+    centre: Float[Array, "4 4"] | None
+    """Motion that they were held about; None where motions from anywhere competed."""
     histories: Float[Array, "l iterations"]
     populations: Population | None
     judge: Objective | None = None
@@ -215,7 +215,7 @@ def _search_in_contest(
         return found.search.islands[:finalists], (found.histories, found.populations)
 
     def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
-        search = _refine(frames, visits, motion, box, is_last)
+        search = _refine_through_levels(frames, visits, motion, box, is_last)
         return Entry(search.islands[0], evidence(judge, search.islands[0]), search.brightness)
 
     aliases = jnp.full((1, 4, 4), jnp.nan)
@@ -225,10 +225,10 @@ def _search_in_contest(
         aliases = self_motions(itself, exchanged.target)
     winner, lead, (histories, populations) = hold_contest(known, search_islands, aliases, refine, record)
     search = SearchState(winner.motion[None], box, winner.brightness, lead)
-    return Ended(search, winner.motion, histories, populations, judge)
+    return Ended(search, None, histories, populations, judge)
 
 
-def _refine(
+def _refine_through_levels(
     frames: Frames,
     visits: Level,
     motion: Float[Array, "4 4"],
@@ -309,16 +309,18 @@ def _search_level(
     found, errors, history, trail = results
     population = None
     if trail is not None:
-        about = centre if options.precondition else search.islands[0]
+        about, box = search.islands[0], search.box
+        if options.precondition:
+            about, box = centre, jnp.repeat(reach_of(options), 3)
         motions, error = (jnp.concatenate(jnp.unstack(leaf), axis=1) for leaf in trail)
-        population = Population(level.number, log(motions), error, log(about), search.box)
+        population = Population(level.number, log(motions), error, log(about), box)
     if options.refine and places > 1:
         judge = comparable_objective(level, target, options, exchanged)
         total = jax.vmap(lambda motion: evidence(judge, motion).total)(found)
         errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
     order = best_distinct(found, errors, places)
     rival = search.rival
-    if places > 1:
+    if places > 1 and not options.refine:  # then the contest says it
         ratio = rival_error(found, errors, order[0]) / jnp.maximum(errors[order[0]], LEAST_ERROR)
         rival = jnp.where(level.islands > 1, ratio, rival)
     search = SearchState(found[order], search.box * options.bounds_factor, brightness, rival)

@@ -62,7 +62,7 @@ class Level(NamedTuple):
     views: Integer[Array, ""]
     """Views that count; the points of the others have lost their readings."""
     islands: Integer[Array, ""]
-    """Number of independent populations."""
+    """Number of independent populations; 0 leaves the level out, where a search skips some."""
     depth_weight: Float[Array, ""]
     """Weight of the depth cost."""
     exchanged: Reference | None = None

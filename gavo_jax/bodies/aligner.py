@@ -121,6 +121,11 @@ class BodyAware:
 
         return side_by_side(self.first.warm_up, look)
 
+    def warm_up_second(self) -> None:
+        """Compile what is asked where what moves is shared out among motions."""
+        state = self.blank_state()
+        self.segmenter.look_back(state.scene, state.tracker, np.eye(4))
+
     def blank_state(self) -> AwareState:
         """The state before the first frame, in the shapes and types of every state."""
         tracker = self.search.blank_state()

@@ -92,6 +92,11 @@ class WithRival:
         """That of the first one; votes are compiled, or loaded, when they are needed: few runs do."""
         return self.first.warm_up()
 
+    def warm_up_second(self) -> None:
+        """Compile the votes."""
+        nobody, nowhere = self._nobody, np.stack([np.eye(4, dtype=np.float32)] * 2)
+        vote(nobody.anchor, nobody.anchor, nowhere, nobody.near, self.first.segmenter.camera)
+
     def blank_state(self) -> RivalledState:
         """The state before the first frame, in the shapes and types of every state."""
         return self._alone(self.first.blank_state(), OVER)

@@ -11,9 +11,10 @@ from gavo_jax import presets
 from gavo_jax.errors import GavoError, printable
 from gavo_jax.experiments.distinction import tell_apart
 from gavo_jax.experiments.record import Record, read_record
-from gavo_jax.experiments.summary import DRIFT, ROTATION_DRIFT, Comparison, Summary, compare, summarise
+from gavo_jax.experiments.summary import Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
 from gavo_jax.locks import hold
+from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import save_figure
 from gavo_jax.output.files import environment, prepare_folder

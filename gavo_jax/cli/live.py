@@ -1,5 +1,6 @@
 """`gavo run` over a camera's frames as they come, until Ctrl-C, the camera's end or `--frames`."""
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
-from gavo_jax.scene_map import LiveMap, MapBuilder
+from gavo_jax.scene_map import LiveMap, MapBuilder, Shape
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
@@ -42,15 +43,20 @@ def run_live(options: Run) -> int:
     """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
     as_seed(options.seed, "--seed")
     _refuse_what_cannot_be(options)
-    trajectory_formats = formats(options.trajectory_format)
+    formats(options.trajectory_format)
     shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
     if settings.odometry.loops:
         raise GavoError(f"--loops: {NOT_LIVE.format(options.sequence)}")
-    device = open_device(options.sequence)
+    with contextlib.closing(open_device(options.sequence)) as device:
+        return _follow(options, device, settings, shape)
+
+
+def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) -> int:
+    """Track the device's frames and write the files of the run; return the exit status."""
     camera = _camera(options, device)
-    name = f"{device.name}-{method}-{preset}"
+    name = f"{device.name}-{options.method}-{options.preset}"
     path = options.output or Path("runs") / name
     be_ready()
     with Newest(device) as newest, RunFolder(path) as folder, make_viewer(options.viewer, path / RECORDING) as viewer:
@@ -68,7 +74,7 @@ def run_live(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
-            **run_identity(device.name, method, unchanged_preset(settings, options), options.seed),
+            **run_identity(device.name, options.method, unchanged_preset(settings, options), options.seed),
             "complete": end.fault is None,
             **finish_run(first, steps, None, None, end.seconds, compile_seconds + end.waited).figures,
             "frames_received": newest.received,
@@ -78,7 +84,7 @@ def run_live(options: Run) -> int:
         print_run(name, metrics, folder.path, trajectory, truth=None)
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
-        write_trajectories(trajectory, folder.path, trajectory_formats)
+        write_trajectories(trajectory, folder.path, formats(options.trajectory_format))
     dropped = f"{newest.dropped} of {newest.received} frames came while another was tracked"
     say(f"{dropped}, or programs were compiled, and made room for newer ones")
     if end.fault is not None:
@@ -105,7 +111,7 @@ class _End(NamedTuple):
 def _track(
     options: Run,
     newest: Newest,
-    camera: Any,
+    camera: Camera,
     odometry: Odometry,
     folder: RunFolder,
     viewer: Viewer,

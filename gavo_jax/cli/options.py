@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
@@ -291,3 +291,5 @@ Command = (
     | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Calibrate, subcommand("calibrate")]
 )
+COMMANDS = tuple(get_args(command)[0].__name__.lower() for command in get_args(Command))
+"""Their names."""

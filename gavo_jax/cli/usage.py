@@ -11,8 +11,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import TextIO
 
-COMMANDS = ("run", "compare", "view", "align", "evaluate", "experiment", "download", "tune", "doctor", "inspect")
-COMMANDS += ("calibrate",)
+from gavo_jax.cli.options import COMMANDS
+
 NUMBER = r"(?:could not convert string to float|invalid literal for int\(\) with base 10): (?P<value>.*)"
 UNION = r"no type matching .*(?P<kind>INT|FLOAT) could be instantiated from \[(?P<values>.*)\]\."
 CHOICE = r"invalid choice (?P<value>.*) for argument '(?P<name>[^']*)'\. Expected one of \((?P<choices>.*)\)\."

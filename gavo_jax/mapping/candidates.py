@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.alignment.corners import NEAREST
 from gavo_jax.camera import Camera, to_pixels
-from gavo_jax.mapping.keyframes import NEAREST, Keyframe
+from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 

@@ -28,14 +28,14 @@ class Doubts(NamedTuple):
 def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) -> Trajectory:
     """A trajectory of the odometry corrected as its keyframes were.
 
+    Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
+    poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
+    become one.
+
     Args:
         odometry: The trajectory, as the odometry has it.
         loops: The map, with its keyframes as they were corrected.
         doubts: Which poses are guesses; those that are lost are put between those around, if these belong together.
-
-    Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
-    poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
-    become one.
     """
     placed = _placed(loops.keyframes, odometry)
     if not placed:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from gavo_jax.alignment.corners import NEAREST
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
@@ -26,8 +27,6 @@ FEWEST_PIXELS = 60
 """Of that image; it is of a finer level where frames are smaller than about 150 x 110."""
 BLUR = 1.0
 """Standard deviation of that image's blur, in its pixels."""
-NEAREST = 0.05
-"""Metres in front of a camera from which on a point counts as seen."""
 FEWEST = 30
 """Fewest points that have to be seen for two thumbnails to be compared."""
 USUAL_DISTANCE = 2.0

@@ -34,6 +34,11 @@ def pixel_jacobian(slopes: Slopes, warped: Warped, camera: Camera | ImagePlane) 
     return jnp.stack([q * pull_x, q * pull_y, q * pull_z, *turns]).reshape(6, -1)
 
 
+def depth_slopes(along_u: Float[Array, "*n"], along_v: Float[Array, "*n"], facing: Float[Array, "*n"]) -> Slopes:
+    """Slopes of depth residuals, from those of an image of inverse depth and how far its surface faces the camera."""
+    return Slopes(facing * along_u, facing * along_v, -facing)
+
+
 Term = tuple[Float[Array, "6 n"], Float[Array, " n"], Float[Array, " n"]]
 """A channel's Jacobian, residuals and weights."""
 
@@ -71,9 +76,8 @@ def weighted_terms(objective: Objective, reference: Reference, r: Residuals) -> 
     along = Slopes(grey.along_u, grey.along_v, jnp.zeros_like(r.grey))
     channels = [(r.grey, scales.grey, r.inside, one, along)]
     if objective.use_depth:
-        factor = scales.depth_weight * (scales.grey / scales.depth) ** 2
-        along = Slopes(facing * depth.along_u, facing * depth.along_v, -facing)
-        channels.append((r.depth, scales.depth, r.depth_valid, factor, along))
+        along = depth_slopes(depth.along_u, depth.along_v, facing)
+        channels.append((r.depth, scales.depth, r.depth_valid, scales.depth_factor, along))
     terms = []
     for residual, scale, mask, factor, slopes in channels:
         if shutter is not None:

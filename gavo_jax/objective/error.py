@@ -35,6 +35,11 @@ class Scales(NamedTuple):
     depth_weight: Float[Array, ""]
     """Weight of the depth cost against the grey one (both normalised by their scales)."""
 
+    @property
+    def depth_factor(self) -> Float[Array, ""]:
+        """What the square of a depth residual counts against that of a grey one."""
+        return self.depth_weight * (self.grey / self.depth) ** 2
+
     @classmethod
     def unit(cls) -> "Scales":
         """Scales that leave residuals as they are, without depth: the paper's error."""

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import to_pixels
 from gavo_jax.image.warp import Slopes, Warped
-from gavo_jax.objective.derivatives import pixel_jacobian
+from gavo_jax.objective.derivatives import depth_slopes, pixel_jacobian
 from gavo_jax.objective.error import Objective
 
 
@@ -27,8 +27,8 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
 
     total = curvature(Slopes(reference.grey_u, reference.grey_v, jnp.zeros_like(valid)))
     if objective.use_depth:
-        depth = curvature(Slopes(facing * reference.slope_u, facing * reference.slope_v, -facing))
-        total += scales.depth_weight * (scales.grey / scales.depth) ** 2 * depth
+        depth = curvature(depth_slopes(reference.slope_u, reference.slope_v, facing))
+        total += scales.depth_factor * depth
     return total
 
 

@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
     @property
     def is_any(self) -> bool:
         """Whether enough of the image keeps its level for something to be drawn there."""
-        return self.last is not None and np.count_nonzero(self.counts >= FRAMES) >= LEAST * self.counts.size
+        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= LEAST)
 
     def after(self, grey: np.ndarray) -> Self:
         """Look at one more image."""

@@ -9,7 +9,7 @@ from gavo_jax.image.pyramid import Pyramid
 from gavo_jax.objective.estimates import MIDDLE_GREY, Brightness
 from gavo_jax.objective.points import Reference
 
-LARGEST_GAIN = 1.6
+GAIN_CHANGED = 1.6
 """Ratio of two images' contrasts beyond which the camera must have changed its gain; below, views may differ by that
 much, and the search estimates the gain itself."""
 
@@ -56,5 +56,5 @@ def _changed(reference: Reference, brightness: Brightness, applies: Bool[Array, 
 def in_exposure(reference: Reference, before: Exposure, after: Exposure) -> Reference:
     """Points as they would be with another exposure, if it differs so much that a search would not find it."""
     gain = after.spread / jnp.maximum(before.spread, 0.1)
-    differs = (before.spread > 0) & ((gain > LARGEST_GAIN) | (gain < 1.0 / LARGEST_GAIN))
+    differs = (before.spread > 0) & ((gain > GAIN_CHANGED) | (gain < 1.0 / GAIN_CHANGED))
     return _changed(reference, Brightness(gain, after.mean - gain * before.mean), differs)

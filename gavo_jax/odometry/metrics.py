@@ -115,14 +115,14 @@ def compute_metrics(
         "statuses": dict(Counter(str(step.alignment.status) for step in steps)),
         "segments": len(np.unique(trajectory.segments)),
         "unknown_motions": int(np.count_nonzero(np.diff(trajectory.segments))),
-        "rpe_translation_rmse_m_per_s": figure(lambda truth: per_second(truth).translation.rmse),
-        "rpe_rotation_rmse_deg_per_s": figure(lambda truth: per_second(truth).rotation.rmse),
-        "rpe_translation_rmse_m_per_frame": figure(lambda truth: per_frame(truth).translation.rmse),
-        "ate_translation_rmse_m": figure(lambda truth: absolute_trajectory_error(trajectory, truth).rmse),
-        "distance_error_final_m": figure(lambda truth: distance_error(_unbroken(trajectory), truth).final),
-        "compile_seconds": compile_seconds,
-        "milliseconds_per_pair_median": float(np.median([step.milliseconds for step in steps])) if steps else None,
-        "frames_per_second": (len(steps) + 1) / seconds if seconds > 0 else None,
+        DRIFT: figure(lambda truth: per_second(truth).translation.rmse),
+        ROTATION_DRIFT: figure(lambda truth: per_second(truth).rotation.rmse),
+        DRIFT_PER_FRAME: figure(lambda truth: per_frame(truth).translation.rmse),
+        ABSOLUTE_ERROR: figure(lambda truth: absolute_trajectory_error(trajectory, truth).rmse),
+        FINAL_DISTANCE: figure(lambda truth: distance_error(_unbroken(trajectory), truth).final),
+        COMPILE_SECONDS: compile_seconds,
+        MILLISECONDS: float(np.median([step.milliseconds for step in steps])) if steps else None,
+        FRAMES_PER_SECOND: (len(steps) + 1) / seconds if seconds > 0 else None,
     }
 
 

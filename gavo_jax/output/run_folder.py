@@ -215,7 +215,7 @@ class RunFolder:
         remove_files(self.path, METRICS, LOOPS, RECORDING, VIEW, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
-        self._last_pose = float(Trajectory.read_tum(self.path / self._poses).timestamps[-1])
+        self._last_pose = _last_stamp(self.path / self._poses)
         remove_masks(self.path, after=self._last_pose)
         return progress
 
@@ -359,3 +359,12 @@ def _identity(config: dict[str, Any]) -> dict[str, Any]:
 
     whole = {key: config.get(key) for key in IDENTITY_KEYS}
     return {**whole, **part("options", IDENTITY_OPTIONS), **part("versions", IDENTITY_VERSIONS)}
+
+
+def _last_stamp(path: Path) -> float:
+    """Return the stamp of a trajectory's last row, which is not the latest one where a clock was set back."""
+    rows = [line for line in read_text(path).splitlines() if line and not line.startswith("#")]
+    try:
+        return float(rows[-1].split()[0])
+    except (IndexError, ValueError):
+        raise GavoError(f"{path}: its last row is no pose") from None

@@ -105,7 +105,7 @@ def warp_target(
         camera: of both, without distortion.
     """
     height, width = reference.grey.shape
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    matrix = camera.matrix
     u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     known = reference.depth > 0
     inverse_depth = np.divide(1, reference.depth, out=np.zeros_like(reference.depth), where=known)

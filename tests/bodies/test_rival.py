@@ -21,6 +21,7 @@ from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
 from gavo_jax.evaluation import relative_pose_error
 from gavo_jax.odometry.aligners import Attempt, Search
+from gavo_jax.odometry.composition import warm_up_wholly
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
@@ -370,3 +371,16 @@ def test_what_goes_on_beside_what_is_known_leaves_that_alone_while_the_camera_tu
     result = aware._helped_by_prediction(state, clock, attempt, covered=0.1).result
     off = log(inverse(exp(truth)) @ result.target_T_reference)
     assert np.all(np.abs(off) < 1e-4 + np.sqrt(np.diag(result.covariance)))
+
+
+def test_before_a_camera_what_is_asked_in_doubt_is_compiled_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The votes and the look back were compiled while the camera waited."""
+    asked: list[str] = []
+    monkeypatch.setattr("gavo_jax.bodies.rival.vote", lambda *_: asked.append("vote"))
+    monkeypatch.setattr("gavo_jax.bodies.scene._look_back", lambda *_, **__: asked.append("look back"))
+    monkeypatch.setattr(Search, "warm_up", lambda _: 0.0)
+    monkeypatch.setattr("gavo_jax.bodies.scene._look", lambda *_, **__: ())
+    search = Search(CAMERA, SETTINGS, jax.random.key(0))
+    aligner = WithRival(BodyAware(search, search))
+    warm_up_wholly(aligner)
+    assert sorted(asked) == ["look back", "vote"]

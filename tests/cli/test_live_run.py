@@ -67,6 +67,20 @@ def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     assert "0 of 5 frames came while another was tracked" in done.out
 
 
+def test_a_camera_that_is_not_used_after_all_is_let_go(tmp_path, capsys):
+    """It stayed open where its camera file was refused."""
+    closed: list[bool] = []
+
+    class Closed(Player):
+        def close(self):
+            closed.append(True)
+
+    register_device("closed", Closed)
+    done = runner(capsys)("run", "closed", "--method", "small-newton", "--camera", tmp_path / "none.toml")
+    assert done.status == 2 and "none.toml" in done.err
+    assert closed
+
+
 class Stumbling(Player):
     """Its third image has another size; at the end it is unplugged, if it has a reason."""
 
