@@ -70,7 +70,7 @@ class History(NamedTuple):
 MIN_DEPTH_SHARE = 0.05
 """Share of an image, or of a reference's points, with a reading, below which there is no depth to align by."""
 FLAT = 1e-4
-"""Share of the farthest reading by which readings differ at least that are not all of one depth."""
+"""Share of the largest reading by which readings differ at most that are one number."""
 REMEMBERED = 15
 """Frames whose median says what is usual."""
 MAX_DOUBTS = 3
@@ -266,6 +266,11 @@ def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray)
     return bool(count >= MIN_SEEN and min(still, moved) > MIN_FROZEN_PART * count)
 
 
+def is_one_number(readings: np.ndarray) -> bool:
+    """Whether some readings of depth, or of its inverse, are all the same."""
+    return bool(np.ptp(readings) <= FLAT * readings.max())
+
+
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
     """Whether depth is the last frame's once more, though it claims to be of another moment. None at all is not; nor is
     a wall that is seen from straight before it by an exact sensor, and has been since the first frame.
@@ -274,7 +279,7 @@ def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
     checksum = zlib.crc32(some.tobytes())
     repeated = checksum == history.depth_checksum and (stamp is None or stamp != history.depth_timestamp)
     readings = _readings(some)
-    has_relief = history.has_relief or (readings.size > 0 and bool(np.ptp(readings) > FLAT * readings.max()))
+    has_relief = history.has_relief or (readings.size > 0 and not is_one_number(readings))
     history = history._replace(depth_checksum=checksum, depth_timestamp=stamp, has_relief=has_relief)
     return repeated and has_relief and readings.size > 0, history
 

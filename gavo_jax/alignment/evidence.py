@@ -30,6 +30,10 @@ MISMATCH = 0.2
 against a motion than its logarithm."""
 HIDDEN = 3.0
 """Depth scales by which the target must be nearer than a point for the point to be hidden."""
+MAY_BE_HIDDEN = 0.3
+"""What a point counts in the exposure whose target has no depth, which would tell whether it is hidden."""
+LEAST_SEEN = 0.02
+"""Share of the readings that count as seen at least: what a few points say is little."""
 
 
 STEP = (0.05, 0.05)
@@ -62,7 +66,7 @@ def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], poin
     if objective.backward is not None:
         sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference), points)
     total, seen, readings = sums
-    return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, 0.02 * readings + 1.0))
+    return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, LEAST_SEEN * readings + 1.0))
 
 
 def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], directions: Float[Array, "6 6"]) -> Held:
@@ -98,7 +102,7 @@ def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Flo
     grey_spread, depth_spread = map(jnp.maximum, of_two, (LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD))
     depth = jnp.where(few.use_depth, r.depth_valid, 0.0)
     hidden = depth * (r.depth > HIDDEN * DEPTH_SCALE)
-    fits = r.inside * jnp.where(depth > 0, jnp.abs(r.depth) < HIDDEN * DEPTH_SCALE, 0.3)
+    fits = r.inside * jnp.where(depth > 0, jnp.abs(r.depth) < HIDDEN * DEPTH_SCALE, MAY_BE_HIDDEN)
     exposure = jnp.sum(fits * r.grey) / jnp.maximum(jnp.sum(fits), 1.0)
     ratio = _log_ratio(r.grey - exposure, GREY_SCALE, grey_spread) + depth * _log_ratio(
         r.depth, DEPTH_SCALE, depth_spread

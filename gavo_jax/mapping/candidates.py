@@ -21,6 +21,8 @@ MIN_SECONDS = 0.2
 """Least time between the two keyframes: within that, the odometry's own keyframe saw both, and nothing is learnt."""
 MIN_OVERLAP = 0.5
 """Smallest predicted share of either keyframe's points that the other one sees."""
+NEARLY = 0.8
+"""Part of that, by few points, from which on a keyframe is looked at more closely."""
 MIN_LIKENESS = 0.88
 """Smallest correlation of the grey of what both keyframes see."""
 APART = 2
@@ -79,7 +81,7 @@ def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> 
     ahead = z > NEAREST
     u, v = to_pixels(camera, x, y, 1.0 / np.where(ahead, z, 1.0))
     seen = np.mean(ahead & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1), axis=1)
-    return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= 0.8 * MIN_OVERLAP]
+    return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= NEARLY * MIN_OVERLAP]
 
 
 def _was_tried(new: Keyframe, other: Keyframe) -> bool:

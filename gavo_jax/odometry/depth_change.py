@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from gavo_jax.camera import Camera, inverse_depth, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
+from gavo_jax.frame_checks import is_one_number
 from gavo_jax.rigid_motions import exp, log
 from gavo_jax.trajectory import inverse
 
@@ -31,8 +32,6 @@ REMEMBERED, MIN_REMEMBERED = 15, 8
 MOST_LEFT = 0.7
 """Largest part of the change of depth that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and
 0.42 with a body over 40 % of the image."""
-FLAT = 1e-4
-"""Share of the nearest reading, in 1/m, by which readings differ at most that are one number."""
 LEAST_EXPLAINED = 0.95
 """Share of the grey residuals that are not large where depth of one number is a wall, straight ahead: there the slide
 along it explains all. Rooms whose depth was made one number have 0.93 and less."""
@@ -144,7 +143,7 @@ def left_unexplained(
 def _is_one_number(inverse: Float64[np.ndarray, "rows columns"]) -> bool:
     """Whether all readings on the grid are."""
     readings = inverse[inverse > 0]
-    return readings.size >= LEAST_POINTS and bool(np.ptp(readings) <= FLAT * readings.max())
+    return readings.size >= LEAST_POINTS and is_one_number(readings)
 
 
 def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

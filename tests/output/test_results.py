@@ -193,3 +193,20 @@ def test_what_loops_corrected_before_a_run_goes_on_is_not_left(tmp_path):
     with RunFolder(tmp_path, trajectory="odometry.txt") as folder:
         assert folder.resume(config, {}) is not None
         assert not (tmp_path / "trajectory.txt").exists() and not (tmp_path / "loops.csv").exists()
+
+
+def test_a_resumed_run_goes_on_from_the_last_pose_though_a_clock_was_set_back(tmp_path: Path) -> None:
+    """The latest stamp was taken for the last one, and the next break was told from there."""
+
+    def pair(index: int, stamp: float, segment: int) -> Step:
+        return Step(index, stamp - 1.0, stamp, no_alignment(AlignmentStatus.OK), np.eye(4), 1.0, False, segment=segment)
+
+    with RunFolder(tmp_path / "run") as folder:
+        folder.start({}, 100.0)
+        folder.add(pair(1, 101.0, 0))
+        folder.add(pair(2, 51.0, 1), Progress(last_index=2, segment=1))
+        folder.save_checkpoint()
+    with RunFolder(tmp_path / "run") as folder:
+        assert folder.resume({}, {}) is not None
+        folder.add(pair(3, 52.0, 2))
+    assert "the motion from 51.0" in (tmp_path / "run" / "trajectory.txt").read_text().splitlines()[-2]
