@@ -43,7 +43,6 @@ def run_live(options: Run) -> int:
     """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
     as_seed(options.seed, "--seed")
     _refuse_what_cannot_be(options)
-    formats(options.trajectory_format)
     shape = check_map_options(options.map, options.map_shape, options.voxel)
     method, preset, settings = choose_settings(options)
     options, settings = replace(options, method=method, preset=preset), with_shortcuts(settings, options)
@@ -177,7 +176,8 @@ def _camera(options: Run, device: LiveDevice) -> Camera:
 
 
 def _refuse_what_cannot_be(options: Run) -> None:
-    """Raise GavoError for options that a live camera has no use for."""
+    """Raise GavoError for options that a live camera has no use for, and for formats that nobody knows."""
+    formats(options.trajectory_format)
     for option, is_given in (
         ("--resume", options.resume),
         ("--start", options.start != 0),
