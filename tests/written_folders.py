@@ -369,6 +369,23 @@ def tartan_air_2(folder: Path) -> None:
     (folder / "camera.yaml").write_text("fx: 131\nfy: 131\ncx: 79.5\ncy: 59.5\nwidth: 160\nheight: 120\n")
 
 
+def kitti_rows(folder: Path, name: str, rows: list[str]) -> None:
+    """A file of Virtual KITTI 2: a row for each frame and camera below the names of the columns."""
+    columns = "K[0,0] K[1,1] K[0,2] K[1,2]" if name == "intrinsic.txt" else "r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1"
+    lines = [f"{i} {camera} {row}" for i, row in enumerate(rows) for camera in (0, 1)]
+    (folder / name).write_text("\n".join([f"frame cameraID {columns}", *lines]) + "\n")
+
+
+def virtual_kitti(folder: Path) -> None:
+    """A variation of a scene of Virtual KITTI 2, in centimetres; the poses are those of the world in the camera."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"frames/rgb/Camera_0/rgb_{i:05}.jpg", grey)
+        image(folder / f"frames/depth/Camera_0/depth_{i:05}.png", raw(metres, 100, 65535))
+        image(folder / f"frames/rgb/Camera_1/rgb_{i:05}.jpg", grey[:, ::-1])
+    kitti_rows(folder, "intrinsic.txt", ["131 131 79.5 59.5"] * 4)
+    kitti_rows(folder, "extrinsic.txt", [" ".join(map(str, np.linalg.inv(pose).ravel())) for pose in POSES])
+
+
 RTABMAP_STAMPS = [f"{1786504901.920936 + i / 30:.6f}" for i in range(4)]
 OPTICAL = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0.9]])
 """A camera's axes in those of a robot's body, and where it lies on it."""
@@ -435,6 +452,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "open_loris": ("OpenLORIS-Scene sequence", open_loris),
     "tartan_air": ("TartanAir trajectory", tartan_air),
     "tartan_air_2": ("TartanAir trajectory", tartan_air_2),
+    "virtual_kitti": ("drive of Virtual KITTI 2", virtual_kitti),
     "rtabmap": ("export of RTAB-Map", rtabmap),
     "rtabmap_export": ("export of RTAB-Map", rtabmap_export),
     "nerf": ("folder of colour and depth images", nerf),

@@ -20,6 +20,7 @@ from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
 from gavo_jax.datasets.layouts.rtabmap import RtabMap
 from gavo_jax.datasets.layouts.tartanair import TartanAir
 from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.layouts.virtual_kitti import VirtualKitti
 from gavo_jax.datasets.recordings.bags import BagSequence
 from gavo_jax.errors import GavoError, blamed
 
@@ -58,6 +59,7 @@ BUILT_IN: tuple[Dataset, ...] = (
         ScanNet,
         Replica,
         TartanAir,
+        VirtualKitti,
         BagSequence,
         StrayScan,
         ArkitScenes,

@@ -320,6 +320,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["clip: images of 160x120", "rendered at 640x480 or 640x640", "--camera"],
     ),
     "tartanair: poses of prose": ("tartan_air", write("pose_left.txt", "up\n"), ["pose_left.txt:1: expected 7"]),
+    "virtual kitti: depth that was not unpacked": (
+        "virtual_kitti",
+        remove("frames/depth"),
+        ["depth/Camera_0: no such folder beside that of rgb: unpack depth, too"],
+    ),
+    "virtual kitti: poses of prose": (
+        "virtual_kitti",
+        write("extrinsic.txt", "up\n"),
+        ["extrinsic.txt:1: expected the"],
+    ),
     "rtabmap: a camera of prose": (
         "rtabmap",
         write(f"calib/{RTABMAP_STAMPS[1]}.yaml", "wide"),

@@ -56,6 +56,7 @@ WITH_TIMES = (
     "arkit_scenes",
     "open_loris",
     "tartan_air_2",
+    "virtual_kitti",
     "rtabmap",
     "scannet_plus_plus",
     "scanner_app",

@@ -103,9 +103,8 @@ def test_every_layout_gives_the_same_frames(folder, name):
     }
     from_one = ("bop", "nerf", "nerfstudio", "open3d", "open3d_image", "rtabmap_export")
     first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
-    expected = np.arange(4) / {"stray": 60, "scannet_plus_plus": 60, "scanner_app": 15, "tartan_air_2": 10}.get(
-        name, 30
-    )
+    rates = {"stray": 60, "scannet_plus_plus": 60, "scanner_app": 15, "tartan_air_2": 10, "virtual_kitti": 10}
+    expected = np.arange(4) / rates.get(name, 30)
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
     is_lossy = bool([*folder.rglob("*.jpg")])

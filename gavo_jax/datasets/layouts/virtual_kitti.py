@@ -1,0 +1,110 @@
+"""Drives of Virtual KITTI 2 (Cabon et al. 2020), rendered."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.camera_files.calibration import Calibration, load_calibration
+from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, found_among, of_matrices
+from gavo_jax.datasets.names import Found
+from gavo_jax.datasets.truth import numbers_in, pose_of
+from gavo_jax.errors import GavoError, data_rows
+from gavo_jax.trajectory import inverse
+
+CENTIMETRES = 100.0
+"""Units of depth a metre; the sky, 655.35 m away, is no reading."""
+
+RATE = 10.0
+"""Frames per second, those of the drives of KITTI that it is a copy of."""
+
+CAMERA = "Camera_0"
+"""The left one of two."""
+
+TEXTS = "it is in the dataset's vkitti_2.0.3_textgt.tar.gz"
+
+
+class VirtualKitti(NumberedFolder):
+    """A variation of a scene (`Scene01/clone`): `frames/rgb/Camera_0/`, `frames/depth/Camera_0/`, and texts.
+
+    `intrinsic.txt` and `extrinsic.txt` have a row for each frame and camera: the camera, and the world in it.
+    """
+
+    kind: ClassVar[str] = "drive of Virtual KITTI 2"
+    DEPTH_SCALE: ClassVar[float] = CENTIMETRES
+    INTRINSICS: ClassVar[str] = "intrinsic.txt"
+    POSES: ClassVar[str] = "extrinsic.txt"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Recognise a folder by those of the images, which are downloaded one by one."""
+        return any(folder.is_dir() for folder in _folders(path))
+
+    @classmethod
+    def find(cls, path: Path) -> Found:
+        """Each kind has a folder."""
+        color, depth = folders = _folders(path)
+        for folder, other in (folders, folders[::-1]):
+            if not folder.is_dir():
+                kind = folder.parent.name
+                raise GavoError(f"{folder}: no such folder beside that of {other.parent.name}: unpack {kind}, too")
+        return found_among(color.glob("rgb_*"), depth.glob("depth_*"))
+
+    @classmethod
+    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
+        """A camera file in the folder, else what the rows of the frames have in common."""
+        size = size_of_most(entries)
+        if (own := own_camera_file(path)) is not None:
+            return load_calibration(own, size, CENTIMETRES)
+        file = path / cls.INTRINSICS
+        if not file.is_file():
+            raise GavoError(f"{file}: no such file: {TEXTS}; or say --camera")
+        rows = [numbers_in(place, row, 4) for place, row in _rows(file).values()]
+        found = [[[row[0], 0.0, row[2]], [0.0, row[1], row[3]], [0.0, 0.0, 1.0]] for row in rows if row]
+        return of_matrices(file, found, size, CENTIMETRES)
+
+    @classmethod
+    def stamps(cls, path: Path) -> dict[int, float]:
+        """Count by the rate."""
+        return {number: number / RATE for number in cls.find(path).color}
+
+    @classmethod
+    def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """Those of the rows, turned round."""
+        file = path / cls.POSES
+        rows = _rows(file) if file.is_file() else {}
+        found = {frame: pose_of(place, row) for frame, (place, row) in rows.items()}
+        return {frame: inverse(pose) for frame, pose in found.items() if pose is not None}
+
+    @classmethod
+    def open(cls, path: Path, reading: Reading) -> Self:
+        """Find the files and read camera and poses; the unit of depth is known."""
+        return super().open(path, replace(reading, depth_scale=reading.depth_scale or CENTIMETRES))
+
+
+def _folders(path: Path) -> tuple[Path, Path]:
+    """Those of colour and of depth."""
+    return path / "frames/rgb" / CAMERA, path / "frames/depth" / CAMERA
+
+
+def _rows(file: Path) -> dict[int, tuple[str, list[str]]]:
+    """What follows frame and camera in each row of the camera that is read, with its place, by the frames' numbers."""
+    rows: dict[int, tuple[str, list[str]]] = {}
+    for place, (frame, *fields) in data_rows(file):
+        if frame == "frame":
+            continue
+        if not (frame.isdecimal() and fields and fields[0].isdecimal()):
+            found = " ".join([frame, *fields])[:60]
+            raise GavoError(f"{place}: expected the numbers of a frame and of its camera first, found {found!r}")
+        if fields[0] != CAMERA[-1]:
+            continue
+        if int(frame) in rows:
+            raise GavoError(f"{place}: frame {int(frame)} is there twice")
+        rows[int(frame)] = place, fields[1:]
+    if not rows:
+        raise GavoError(f"{file}: has no row of any frame of {CAMERA}: get the file anew")
+    return rows
