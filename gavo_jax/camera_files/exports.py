@@ -144,9 +144,8 @@ NERF_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
 
 def read_nerfstudio(path: Path, values: Table) -> Table:
     """Looks like NeRF's transforms."""
-    if "fl_x" not in values and values["frames"]:
-        own = [{key: frame[key] for key in NERF_KEYS if key in frame} for frame in values["frames"]]
-        values = {**common_camera(str(path), own), **values}
+    if cameras := _nerf_cameras(values):
+        values = {**values, **common_camera(str(path), cameras)}
     size = {ours: _whole(values[theirs]) for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
     table |= next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
@@ -157,6 +156,18 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
         raise GavoError(f"{path}: camera_model {shown(model)}, or its k4: OPENCV, OPENCV_FISHEYE and PINHOLE are read")
     lens = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return {**table, **size, **({"distortion": lens} if any(lens) else {})}
+
+
+def _nerf_cameras(values: Table) -> list[Table]:
+    """The cameras of frames that say their own; what one does not say of it stands above all frames, as instant-ngp and
+    NeRFCapture have it.
+    """
+    frames = values.get("frames")
+    told = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+    above = {key: values[key] for key in NERF_KEYS if key in values}
+    if "fl_x" in above and not any("fl_x" in frame for frame in told):
+        return []
+    return [{**above, **{key: frame[key] for key in NERF_KEYS if key in frame}} for frame in told]
 
 
 OPENLORIS_COLOR = "d400_color_optical_frame"

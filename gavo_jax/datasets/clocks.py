@@ -1,9 +1,13 @@
 """What numbers of frames count: seconds since 1970 or since a device was switched on, or the frames themselves."""
 
+import math
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+
+from gavo_jax.errors import GavoError, shown
 
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Seconds of what whole numbers may count."""
@@ -94,6 +98,29 @@ def _are_milliseconds(steps: np.ndarray) -> bool:
     if len(usual) < MOST_STEPS * len(steps) or not is_rate:
         return False
     return np.gcd.reduce(usual.astype(np.int64)) == 1
+
+
+def told_unit(stamps: Sequence[float]) -> float | None:
+    """Seconds of what the stamps of a file count; None where they are whole and seem to be the numbers of frames."""
+    if all(float(stamp).is_integer() for stamp in stamps):
+        return unit_of(stamps)
+    return decimal_unit(stamps) or UNITS[0]
+
+
+LATEST = 1e20
+"""No clock counts further."""
+
+
+def told_stamp(place: str, stamp: Any) -> float:
+    """A stamp that a file of JSON says.
+
+    Raises:
+        GavoError: it is no number of a clock.
+    """
+    is_number = isinstance(stamp, int | float) and not isinstance(stamp, bool)
+    if not is_number or not math.isfinite(stamp if abs(stamp) < LATEST else math.inf):
+        raise GavoError(f"{place}: timestamp: expected seconds, found {shown(stamp)}: say --rate to do without them")
+    return stamp
 
 
 def decimal_unit(numbers: Sequence[float]) -> float | None:

@@ -70,8 +70,8 @@ BUILT_IN: tuple[Dataset, ...] = (
         SemanticReplica,
         NeuralRgbd,
         RtabMap,
-        Open3DFolder,
         Nerfstudio,
+        Open3DFolder,
         PlainFolder,
     ),
 )

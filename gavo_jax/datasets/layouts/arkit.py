@@ -12,6 +12,7 @@ from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camer
 from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
+from gavo_jax.datasets.clocks import told_stamp
 from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
@@ -51,7 +52,7 @@ class ScanNetPlusPlus(NumberedFolder):
         """Those of the frames, which are seconds."""
         file = path / cls.STAMPS
         found = {number: frame["timestamp"] for number, frame in _frames(file).items() if "timestamp" in frame}
-        return {number: _seconds(file, stamp) for number, stamp in found.items()}
+        return {number: told_stamp(str(file), stamp) for number, stamp in found.items()}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -90,7 +91,7 @@ class ScannerApp(NumberedFolder):
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
         """Those of the frames, which are seconds since the phone was switched on."""
-        return {number: _seconds(file, stamp) for number, (file, stamp) in cls._said(path, "time").items()}
+        return {number: told_stamp(str(file), stamp) for number, (file, stamp) in cls._said(path, "time").items()}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -163,12 +164,6 @@ class Polycam(PlainFolder):
 def _read_files(written: tuple[tuple[Path, int], ...]) -> dict[Path, dict[str, Any]]:
     """What each of some files says that were written then; read once for stamps, cameras and poses."""
     return {file: read_json_object(file) for file, _ in written}
-
-
-def _seconds(file: Path, stamp: Any) -> float:
-    if isinstance(stamp, bool) or not isinstance(stamp, int | float) or not np.isfinite(stamp):
-        raise GavoError(f"{file}: timestamp: expected seconds: say --rate to do without them")
-    return stamp
 
 
 def _frames(file: Path) -> dict[int, dict[str, Any]]:

@@ -1,15 +1,17 @@
 """Folders whose `transforms.json` names a depth image for each frame, as nerfstudio and instant-ngp read them."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES
+from gavo_jax.datasets.clocks import in_seconds, told_stamp, told_unit
 from gavo_jax.datasets.files import Reading, resolve_folder
 from gavo_jax.datasets.images import COLOR_SUFFIXES
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS
 from gavo_jax.datasets.layouts.numbered import PlainFolder
-from gavo_jax.datasets.layouts.pairing import Paired, paired_as_told
+from gavo_jax.datasets.layouts.pairing import Paired, paired_as_told, paired_at
 from gavo_jax.datasets.layouts.tum import path_below
 from gavo_jax.datasets.names import images_among
 from gavo_jax.datasets.truth import Seconds
@@ -19,13 +21,17 @@ COLOR_KEY = "file_path"
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 """As nerfstudio and as instant-ngp call it."""
 
+STAMP_KEY = "timestamp"
+"""As NeRFCapture calls it."""
+
 NAMES_DEPTH = re.compile(r'"(depth_file_path|depth_path)"\s*:\s*"')
 
 
 class Nerfstudio(PlainFolder):
     """A folder whose `transforms.json` says which colour and which depth image are a frame.
 
-    Spectacular AI and NeRFCapture write such. The names of the colour images say when, as in any folder.
+    Spectacular AI and NeRFCapture write such. The stamps of the frames say when, where they have any; else the names of
+    the colour images do, as in any folder.
     """
 
     kind: ClassVar[str] = "nerfstudio folder"
@@ -41,12 +47,7 @@ class Nerfstudio(PlainFolder):
     def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
         """What the file names, by the names of colour; and a line for what lies beside, and is not named with depth."""
         file, partners = path / TRANSFORMS, dict[Path, Path]()
-        for place, frame in _frames(file):
-            key = next((key for key in DEPTH_KEYS if frame.get(key) is not None), None)
-            if key is None:
-                continue
-            color, depth = (_named(path, place, name, frame.get(name)) for name in (COLOR_KEY, key))
-            color = _with_ending(color)
+        for place, color, depth, _ in _pairs(path):
             if partners.setdefault(color, depth) != depth:
                 raise GavoError(f"{place}: {color.name} is there twice, with {partners[color].name} for its depth, too")
         if not partners:
@@ -60,8 +61,43 @@ class Nerfstudio(PlainFolder):
 
     @classmethod
     def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
-        """The frames as the file has them."""
-        return paired_as_told(path, color, depth, reading, seconds)
+        """The frames as the file has them, at their stamps, if it says those."""
+        stamps = {} if reading.rate else _stamps(path)
+        if stamps and (unit := told_unit([*stamps.values()])) is not None:
+            times = dict(zip(stamps, in_seconds([*stamps.values()], unit), strict=True))
+            return paired_at(color, depth, [times[image] for image in color])
+        paired = paired_as_told(path, color, depth, reading, seconds)
+        unused = [f"timestamps in {TRANSFORMS}: whole numbers that are no times of a camera"] if stamps else []
+        return paired._replace(left_out=paired.left_out + unused)
+
+
+def _pairs(path: Path) -> Iterator[tuple[str, Path, Path, dict[str, Any]]]:
+    """Place, colour and depth of each frame of which depth is named, and what is said of it."""
+    for place, frame in _frames(path / TRANSFORMS):
+        key = next((key for key in DEPTH_KEYS if frame.get(key) is not None), None)
+        if key is not None:
+            color, depth = (_named(path, place, name, frame.get(name)) for name in (COLOR_KEY, key))
+            yield place, _with_ending(color), depth, frame
+
+
+def _stamps(path: Path) -> dict[Path, float]:
+    """Stamps of the images, as the file has them; none where it has none.
+
+    Raises:
+        GavoError: one is no stamp, is missing among others, or is that of two images; or an image has two.
+    """
+    told = [(place, color, frame.get(STAMP_KEY)) for place, color, _, frame in _pairs(path)]
+    if all(stamp is None for _, _, stamp in told):
+        return {}
+    stamps: dict[Path, float] = {}
+    images: dict[float, Path] = {}
+    for place, color, value in told:
+        stamp = told_stamp(place, value)
+        if (other := images.setdefault(stamp, color)) != color:
+            raise GavoError(f"{place}: timestamp: {stamp} is that of {other.name}, too: say --rate to do without them")
+        if stamps.setdefault(color, stamp) != stamp:
+            raise GavoError(f"{place}: timestamp: {color.name} is there twice, with {stamps[color]}, too")
+    return stamps
 
 
 def _frames(file: Path) -> list[tuple[str, dict[str, Any]]]:

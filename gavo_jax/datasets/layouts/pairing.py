@@ -149,6 +149,12 @@ def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Re
     return found._replace(entries=entries, left_out=left_out)
 
 
+def paired_at(color: list[Path], depth: list[Path], stamps: list[float]) -> Paired:
+    """Frames of a colour and a depth image at the same place of the lists, at stamps that a file says, seconds."""
+    entries = sorted(Entry(*frame) for frame in zip(stamps, color, depth, strict=True))
+    return Paired(entries, [], {at: entry.stamp for at, entry in enumerate(entries, 1)}, None)
+
+
 def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
     """Frames by the numbers in the names, whose times a clock says."""
     found = by_number(color, depth)

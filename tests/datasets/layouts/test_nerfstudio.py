@@ -90,6 +90,84 @@ def test_a_rate_that_is_said_counts(folder):
     assert not sequence.times_guessed and opened(folder).times_guessed == "names are numbers"
 
 
+def stamped(folder: Path, stamp: Callable[[int], object]) -> Path:
+    """The frames with stamps as NeRFCapture has them, by their places from 0."""
+    change(folder, each(lambda frame: frame.update(timestamp=stamp(int(frame["file_path"][-9:-4]) - 1))))
+    return folder
+
+
+def test_stamps_of_frames_say_when(folder):
+    """NeRFCapture has seconds since the phone was switched on; the run took 30 frames per second for granted."""
+    stamps = [5021.25, 5021.75, 5023.0, 5023.5]
+    sequence = check_frames(stamped(folder, stamps.__getitem__))
+    np.testing.assert_allclose(sequence.timestamps, stamps)
+    assert sequence.ground_truth is not None and not sequence.times_guessed
+    np.testing.assert_allclose(sequence.ground_truth.timestamps, stamps)
+    np.testing.assert_allclose(opened(folder, rate=10).timestamps, np.arange(1, 5) / 10)
+
+
+def test_frames_go_by_their_stamps_and_not_by_their_names(folder):
+    sequence = opened(stamped(folder, lambda at: 10.5 - at))
+    assert [entry.color.name[-5] for entry in sequence.entries] == ["4", "3", "2", "1"]
+    np.testing.assert_allclose(sequence[3].depth / sequence.camera.depth_scale, METRES[0], atol=1e-3)
+
+
+@pytest.mark.parametrize(("start", "unit"), [(1716900000123456789, 1e-9), (1716900000123, 1e-3)])
+def test_stamps_may_be_whole_numbers_of_a_clock(folder, start, unit):
+    sequence = opened(stamped(folder, lambda at: start + round(at / 30 / unit)))
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / 30, atol=1e-3)
+    assert 1716900000 <= sequence.timestamps[0] < 1716900001
+
+
+def test_stamps_that_count_frames_are_told(folder):
+    sequence = opened(stamped(folder, lambda at: at))
+    np.testing.assert_allclose(sequence.timestamps, np.arange(1, 5) / 30)
+    assert sequence.times_guessed == "names are numbers"
+    assert left_out(sequence) == ["timestamps in transforms.json: whole numbers that are no times of a camera"]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "fault"),
+    [
+        (lambda at: None if at else 1.5, r"frames\[0\]: timestamp: expected seconds, found None: say --rate"),
+        (lambda at: "soon", "timestamp: expected seconds, found 'soon'"),
+        (lambda at: True, "timestamp: expected seconds, found True"),
+        (lambda at: float("nan"), "timestamp: expected seconds, found nan"),
+        (lambda at: 10**400, "timestamp: expected seconds, found"),
+        (lambda at: [7.5], r"timestamp: expected seconds, found \[7.5\]"),
+        (lambda at: 7.5, r"timestamp: 7.5 is that of frame_0000\d.png, too: say --rate"),
+    ],
+)
+def test_stamps_that_are_none_are_refused(folder, stamp, fault):
+    stamped(folder, stamp)
+    with pytest.raises(GavoError, match=rf"transforms\.json: .*{fault}"):
+        open_source(folder)
+    assert len(opened(folder, rate=10)) == 4
+
+
+def test_an_image_with_two_stamps_is_refused(folder):
+    stamped(folder, lambda at: at + 0.5)
+    change(folder, lambda values: values["frames"].append({**values["frames"][0], "timestamp": 9.5}))
+    with pytest.raises(GavoError, match=r"frames\[4\]: timestamp: frame_00004.png is there twice, with 3.5, too"):
+        open_source(folder)
+
+
+def test_frames_redefine_the_camera_above_them(folder):
+    """As instant-ngp and NeRFCapture have it: above is the first frame's, and focus moves."""
+    change(folder, each(lambda frame: frame.update(fl_x=132.0, fl_y=132.0)))
+    assert opened(folder).camera.fx == 132 and opened(folder).camera.cx == 79.5
+    change(folder, lambda values: values["frames"][0].update(fl_x=140.0))
+    with pytest.raises(GavoError, match=r"transforms\.json: each frame has a camera of its own.*fl_x differs by 8"):
+        open_source(folder)
+
+
+def test_depth_that_is_named_goes_before_a_folder_of_depth_beside_intrinsics(folder):
+    """The file of Open3D's reconstruction took `depth/`, which is another's, for it."""
+    intrinsics = {"width": 160, "height": 120, "intrinsic_matrix": [150.0, 0, 0, 0, 150.0, 0, 79.5, 59.5, 1]}
+    (folder / "camera_intrinsic.json").write_text(json.dumps(intrinsics))
+    assert check_frames(folder).camera.fx == 150
+
+
 def test_images_that_are_not_named_with_depth_are_told(folder):
     change(folder, lambda values: values["frames"].pop())
     change(folder, lambda values: values["frames"][0].pop("depth_file_path"))
