@@ -59,6 +59,9 @@ STEP_TOLERANCE = 0.15
 LEAST_STEP = 3.5
 """Raw units: rounding hides the law of smaller steps."""
 
+HALVES = (0x2E66, 0x7C00)
+"""Whole numbers whose bits are those of floats of 16 bits from 0.1 to infinity, as Mid-Air keeps depth in PNG."""
+
 LEAST_STEPS, SPREAD = 40, 0.35
 """Steps that have to be seen, and how far the middle half of them may differ, to be taken for a law."""
 
@@ -73,6 +76,8 @@ class DepthSample(NamedTuple):
     """99th percentile of the raw depth."""
     kinect_scale: float | None
     """Units per metre by the steps, if the sensor were such a camera; None where the steps follow no law."""
+    is_whole: bool = False
+    """Whether it is whole numbers of 16 bits."""
 
 
 def sample_depth(images: Sequence[np.ndarray]) -> DepthSample | None:
@@ -82,7 +87,8 @@ def sample_depth(images: Sequence[np.ndarray]) -> DepthSample | None:
     if readings.size == 0:
         return None
     near, median, far = np.percentile(readings, [1, 50, 99])
-    return DepthSample(float(near), float(median), float(far), _kinect_scale(readings))
+    is_whole = all(image.dtype == np.uint16 for image in images)
+    return DepthSample(float(near), float(median), float(far), _kinect_scale(readings), is_whole)
 
 
 def _kinect_scale(readings: np.ndarray) -> float | None:
@@ -156,10 +162,22 @@ def doubt_of_scale(sequence: FrameSequence) -> str | None:
         return None
     others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
     other = _most_usual(sample, others)
-    if other is None:
+    as_halves = _as_halves(sample)
+    if other is None and not as_halves:
         return None
-    as_it_is, in_other = (f"{sample.median / unit:.3g} m" for unit in (scale, other))
-    return f"a median of {as_it_is} is unusual; in {name_of_unit(other)} (--depth-scale {other:g}) it is {in_other}"
+    in_other = ""
+    if other is not None:
+        named = f"{name_of_unit(other)} (--depth-scale {other:g})"
+        in_other = f"; in {named} it is {sample.median / other:.3g} m"
+    return f"a median of {sample.median / scale:.3g} m is unusual{in_other}{as_halves}"
+
+
+def _as_halves(sample: DepthSample) -> str:
+    """What depth is if whole numbers are the bits of floats; empty where they cannot be."""
+    if not (sample.is_whole and HALVES[0] <= sample.near and sample.far <= HALVES[1]):
+        return ""
+    metres = float(np.uint16(sample.median).view(np.float16))
+    return f"; as bits of floats, which Mid-Air keeps in PNG, it is {metres:.3g}: write those as TIFF or .npy of floats"
 
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:

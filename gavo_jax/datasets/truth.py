@@ -19,10 +19,11 @@ TRUTH = "groundtruth.txt"
 """In TUM's form."""
 
 OTHER_NAMES = re.compile(
-    r"(.*[-_])?(gt|ground[-_]?truth|(cam(era)?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum|log)",
+    r"(.*[-_])?(gt|ground[-_]?truth|(cam(era)?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum|log)"
+    r"|\d+\.pose",
     re.IGNORECASE,
 )
-"""Files that look like one, and are not looked for: their form is open."""
+"""Files that look like one, and are not looked for: their form is open. The last one is of UW's RGB-D Scenes."""
 
 OTHER_FOLDERS = re.compile(r"(.*[-_])?(poses?|traj|trajectory|extrinsics?)", re.IGNORECASE)
 """Folders that look as if they held one."""

@@ -130,6 +130,24 @@ def _spectacular(place: Place) -> str | None:
     )
 
 
+def _scannet_plus_plus(place: Place) -> str | None:
+    if not all((place.path / name).is_file() for name in ("depth.bin", "pose_intrinsic_imu.json")):
+        return None
+    return (
+        "the iPhone's part of a scan of ScanNet++, its images still packed: write rgb/ and depth/ with "
+        "iphone/prepare_iphone_data.py of its toolbox (extract_rgb, extract_depth)"
+    )
+
+
+def _mid_air(place: Place) -> str | None:
+    if not any((place.path / "color_left").glob("trajectory_*")):
+        return None
+    return (
+        "recordings of Mid-Air, whose PNG hold floats of 16 bits: of a trajectory write depth = 512 / disparity of "
+        "stereo_disparity/ as TIFF or .npy of floats into depth/, beside rgb/ with the images of color_left/"
+    )
+
+
 def _recording(place: Place) -> str | None:
     film = next((child for child in place.inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None)
     return None if film is None else f"{film.name}: {_in_file(film)}"
@@ -158,6 +176,8 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _stereo,
     _nyu,
     _spectacular,
+    _scannet_plus_plus,
+    _mid_air,
     _recording,
     _part_of_source,
     _folder,

@@ -113,6 +113,19 @@ def test_a_depth_that_is_unusually_near_is_set_beside_another_unit(tmp_path, sca
     assert doubt is None if words is None else doubt and re.search(words, doubt)
 
 
+@pytest.mark.parametrize("is_packed", [True, False])
+def test_floats_of_16_bits_in_png_are_told(tmp_path, is_packed):
+    """Mid-Air keeps depth so; as millimetres it is a plausible street."""
+    for i, metres in enumerate(METRES):
+        image(tmp_path / f"rgb/{i}.png", np.full((120, 160), 99, np.uint8))
+        depth = np.maximum(metres, 0.5) + 3
+        image(tmp_path / f"depth/{i}.png", depth.astype(np.float16).view(np.uint16) if is_packed else raw(depth, 7000))
+    doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA, depth_scale=1000.0)))
+    middle = f"{np.median(np.concatenate(METRES[:3])) + 3:.1f}"
+    assert doubt and ("as bits of floats, which Mid-Air keeps in PNG" in doubt) == is_packed
+    assert not is_packed or f"it is {middle}" in doubt
+
+
 def test_a_wrong_scale_is_refused_in_one_line_unless_forced(tmp_path):
     (tmp_path / "clip").mkdir()
     LAYOUTS["plain"][1](tmp_path / "clip")

@@ -247,7 +247,7 @@ def test_infinity_is_no_pose_however_it_is_written(tmp_path, none):
 @pytest.mark.parametrize(
     "name",
     ["gt.txt", "poses.txt", "groundTruth.csv", "pose_left.txt", "trajectory.tum"]
-    + ["room1-traj.txt", "room_trajectory.log", "poses/0.txt", "camera_poses/0.txt"],
+    + ["room1-traj.txt", "room_trajectory.log", "01.pose", "poses/0.txt", "camera_poses/0.txt"],
 )
 def test_a_truth_by_another_name_is_told(tmp_path, layout, name):
     LAYOUTS[layout][1](tmp_path / "clip")

@@ -31,6 +31,15 @@ def made(folder: Path, *names: str) -> Path:
             "depth0: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays",
         ),
         (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI: .* sai-cli process, and"),
+        (
+            ("depth.bin", "pose_intrinsic_imu.json", "rgb.mkv", "rgb_mask.mkv", "exif.json"),
+            r"ScanNet\+\+, its images still packed: write rgb/ and depth/ with iphone/prepare_iphone_data.py",
+        ),
+        (("depth.bin", "pose_intrinsic_imu.json", "rgb/frame_000000.jpg"), "still packed: write rgb/ and depth/"),
+        (
+            tuple(f"{kind}/trajectory_0000/000000.x" for kind in ("color_left", "depth", "stereo_disparity")),
+            r"Mid-Air, whose PNG hold floats of 16 bits: .* 512 / disparity",
+        ),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
