@@ -201,6 +201,11 @@ def to_pixels(camera: Any, x: Any, y: Any, per_depth: Any = 1.0) -> tuple[Any, A
     return camera.fx * x * per_depth + camera.cx, camera.fy * y * per_depth + camera.cy
 
 
+def in_image(camera: Any, u: Any, v: Any) -> Any:
+    """Whether pixels lie between the centres of an image's first and last ones."""
+    return (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
+
+
 def to_ray(camera: Any, u: Any, v: Any) -> tuple[Any, Any]:
     """x/z and y/z of what is seen at columns and rows, the inverse of `to_pixels`."""
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.levels import ImagePlane
-from gavo_jax.image.warp import Points, Slopes, Warped
+from gavo_jax.image.warp import Points, Slopes, Warped, has_neighbours
 
 
 class Shutter(NamedTuple):
@@ -44,7 +44,7 @@ def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | Ima
         late = shutter.readout * row_time(warped.v, camera)
         flow = twist_flow(shutter.sway, warped, camera)
         u, v, inverse_depth = (start + late * step for start, step in zip((u, v, inverse_depth), flow, strict=True))
-    inside = (warped.inside > 0) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    inside = (warped.inside > 0) & has_neighbours(u, v, camera)
     return Warped(u, v, inverse_depth, inside.astype(jnp.float32))
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.image.levels import ImagePlane
@@ -41,6 +41,11 @@ class Slopes(NamedTuple):
     along_inverse_depth: Float[Array, "*n"]
 
 
+def has_neighbours(u: Float[Array, "*n"], v: Float[Array, "*n"], camera: Camera | ImagePlane) -> Bool[Array, "*n"]:
+    """Whether the four pixels around a place lie in the image."""
+    return (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+
+
 def moved(points: Points, camera_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Points seen from another camera, their coordinates times their old inverse depth: R (x, y, 1) + t q."""
     r, t = camera_T_reference[:3, :3], camera_T_reference[:3, 3]
@@ -55,5 +60,5 @@ def warp(points: Points, target_T_reference: Float[Array, "4 4"], camera: Camera
     before = depth > 1e-3
     per_depth = 1.0 / jnp.where(before, depth, 1.0)
     u, v = to_pixels(camera, x, y, per_depth)
-    inside = before & (points.q > 0) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    inside = before & (points.q > 0) & has_neighbours(u, v, camera)
     return Warped(u, v, points.q * per_depth, inside.astype(jnp.float32))

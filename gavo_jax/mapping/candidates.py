@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gavo_jax.alignment.corners import NEAREST
-from gavo_jax.camera import Camera, to_pixels
+from gavo_jax.camera import Camera, in_image, to_pixels
 from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
@@ -80,7 +80,7 @@ def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> 
     x, y, z = np.moveaxis(old_T_new[:, :3, :3] @ points + old_T_new[:, :3, 3:], 1, 0)
     ahead = z > NEAREST
     u, v = to_pixels(camera, x, y, 1.0 / np.where(ahead, z, 1.0))
-    seen = np.mean(ahead & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1), axis=1)
+    seen = np.mean(ahead & in_image(camera, u, v), axis=1)
     return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= NEARLY * MIN_OVERLAP]
 
 

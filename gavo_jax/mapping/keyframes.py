@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gavo_jax.alignment.corners import NEAREST
-from gavo_jax.camera import Camera, to_pixels, to_ray
+from gavo_jax.camera import Camera, in_image, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.features import Features
 from gavo_jax.image.motion_compensation import CompensatedImages, compensate_motion
@@ -76,7 +76,7 @@ class Thumbnail(NamedTuple):
         seen = other_T_self[:3, :3] @ self.points + other_T_self[:3, 3:]
         tiny, z = camera.level(level_of_thumbnail(camera)), np.where(seen[2] > NEAREST, seen[2], 1.0)
         u, v = to_pixels(tiny, seen[0], seen[1], 1.0 / z)
-        inside = (seen[2] > NEAREST) & (u >= 0) & (u <= tiny.width - 1) & (v >= 0) & (v <= tiny.height - 1)
+        inside = (seen[2] > NEAREST) & in_image(tiny, u, v)
         if inside.sum() < FEWEST:
             return 0.0, 0.0
         column, row = (axis[inside].astype(np.float32)[None] for axis in (u, v))

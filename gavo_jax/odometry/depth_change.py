@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gavo_jax.camera import Camera, inverse_depth, to_pixels, to_ray
+from gavo_jax.camera import Camera, in_image, inverse_depth, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.frame_checks import is_one_number
 from gavo_jax.rigid_motions import exp, log
@@ -125,7 +125,7 @@ def left_unexplained(
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = rotation @ there + q * translation[:, None]
         u, v = to_pixels(camera, moved[0], moved[1], 1 / moved[2])
-        inside = (q > 0) & (moved[2] > 0) & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
+        inside = (q > 0) & (moved[2] > 0) & in_image(camera, u, v)
     seen = _sampled(depth, np.where(inside, u, 0), np.where(inside, v, 0), camera)
     unmoved = inverse_depth(depth[row, column].ravel(), camera)
     inside &= (seen > 0) & (unmoved > 0)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, in_image
 from gavo_jax.datasets.base import Frame
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.viewer.colors import RESIDUAL_COLORS, color_of_body
@@ -115,6 +115,6 @@ def warp_target(
     seen = known & (z > 1e-3)
     x /= z
     y /= z
-    seen &= (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    seen &= in_image(camera, x, y)
     sampled = cv2.remap(target.grey, x, y, cv2.INTER_LINEAR)
     return cv2.bitwise_and(sampled, sampled, mask=seen.view(np.uint8)), seen
