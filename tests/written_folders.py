@@ -386,6 +386,30 @@ def virtual_kitti(folder: Path) -> None:
     kitti_rows(folder, "extrinsic.txt", [" ".join(map(str, np.linalg.inv(pose).ravel())) for pose in POSES])
 
 
+AIRSIM_STAMPS = [1643000.5 + i / 20 for i in range(4)]
+AIRSIM_COLUMNS = "VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile"
+
+
+def pfm_from_top(path: Path, metres: np.ndarray) -> None:
+    """As AirSim writes PFM: from the top, where the format runs from the bottom."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(f"Pf\n{metres.shape[1]} {metres.shape[0]}\n-1\n".encode() + metres.astype("<f4").tobytes())
+
+
+def airsim(folder: Path) -> None:
+    """Labels lie there, too; the poses are those of the vehicle."""
+    rows = [AIRSIM_COLUMNS]
+    for i, (stamp, grey, metres) in enumerate(zip(AIRSIM_STAMPS, GREYS, METRES, strict=True)):
+        names = [f"img_SimpleFlight_0_{kind}_{1643000123456789000 + 50000000 * i + kind}" for kind in (0, 1, 5)]
+        image(folder / f"images/{names[0]}.png", grey)
+        pfm_from_top(folder / f"images/{names[1]}.pfm", metres)
+        image(folder / f"images/{names[2]}.png", np.full((120, 160, 3), i, np.uint8))
+        files = f"{names[0]}.png;{names[1]}.pfm;{names[2]}.png"
+        rows.append(f"SimpleFlight\t{round(1000 * stamp)}\t{i}\t0\t-1.5\t1\t0\t0\t0\t{files}")
+    (folder / "airsim_rec.txt").write_text("\n".join(rows) + "\n")
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+
+
 RTABMAP_STAMPS = [f"{1786504901.920936 + i / 30:.6f}" for i in range(4)]
 OPTICAL = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0.9]])
 """A camera's axes in those of a robot's body, and where it lies on it."""
@@ -453,6 +477,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tartan_air": ("TartanAir trajectory", tartan_air),
     "tartan_air_2": ("TartanAir trajectory", tartan_air_2),
     "virtual_kitti": ("drive of Virtual KITTI 2", virtual_kitti),
+    "airsim": ("recording of AirSim", airsim),
     "rtabmap": ("export of RTAB-Map", rtabmap),
     "rtabmap_export": ("export of RTAB-Map", rtabmap_export),
     "nerf": ("folder of colour and depth images", nerf),

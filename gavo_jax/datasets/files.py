@@ -22,6 +22,7 @@ from gavo_jax.datasets.films import file_of, film_of, read_frame
 from gavo_jax.datasets.images import read_bytes, read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError, read_json_object, read_text
+from gavo_jax.image.numbers import Depth
 from gavo_jax.trajectory import Trajectory
 
 SAMPLED = 3
@@ -203,7 +204,7 @@ class FileSequence:
         assert entry.depth is not None
         return self._images.assembler.frame(
             _color(entry.color),
-            DepthImage(read_depth(entry.depth), str(entry.depth)),
+            DepthImage(self.depth_in(entry.depth), str(entry.depth)),
             str(entry.color),
             entry.stamp,
             entry.depth_stamp,
@@ -214,7 +215,12 @@ class FileSequence:
         entry = self.entries[index]
         if entry.depth is None:
             raise TimestampError(entry.doubt)
-        return read_depth(entry.depth)
+        return self.depth_in(entry.depth)
+
+    @classmethod
+    def depth_in(cls, file: Path) -> Depth:
+        """`read_depth`, as this kind of source has its files."""
+        return read_depth(file)
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode frame after frame; raises `FrameError` at one that cannot be read."""

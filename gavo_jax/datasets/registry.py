@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from gavo_jax.datasets import unrecognised
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.layouts.airsim import AirSim
 from gavo_jax.datasets.layouts.arkit import Polycam, ScannerApp, ScanNetPlusPlus
 from gavo_jax.datasets.layouts.bonn import Bonn
 from gavo_jax.datasets.layouts.bop import BopScene
@@ -60,6 +61,7 @@ BUILT_IN: tuple[Dataset, ...] = (
         Replica,
         TartanAir,
         VirtualKitti,
+        AirSim,
         BagSequence,
         StrayScan,
         ArkitScenes,

@@ -330,6 +330,13 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("extrinsic.txt", "up\n"),
         ["extrinsic.txt:1: expected the"],
     ),
+    "airsim: a torn row": ("airsim", cut("airsim_rec.txt", 0.81), ["airsim_rec.txt:5: expected 10 values"]),
+    "airsim: a file of prose": (
+        "airsim",
+        write("airsim_rec.txt", "up\n"),
+        ["airsim_rec.txt: expected names of columns"],
+    ),
+    "airsim: no camera": ("airsim", remove("camera.toml"), ["clip: no camera file in it", "--camera"]),
     "rtabmap: a camera of prose": (
         "rtabmap",
         write(f"calib/{RTABMAP_STAMPS[1]}.yaml", "wide"),

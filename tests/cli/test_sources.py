@@ -57,6 +57,7 @@ WITH_TIMES = (
     "open_loris",
     "tartan_air_2",
     "virtual_kitti",
+    "airsim",
     "rtabmap",
     "scannet_plus_plus",
     "scanner_app",

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from written_folders import (
+    AIRSIM_STAMPS,
     ARKIT_STAMPS,
     CAMERA,
     CAMERA_TOML,
@@ -100,10 +101,12 @@ def test_every_layout_gives_the_same_frames(folder, name):
         "scanner_app": SCANNER_STAMPS,
         "open_loris": LORIS_STAMPS,
         "rtabmap": RTABMAP_STAMPS,
+        "airsim": AIRSIM_STAMPS,
     }
     from_one = ("bop", "nerf", "nerfstudio", "open3d", "open3d_image", "rtabmap_export")
     first = 1 / 30 if name in from_one else float(stamps.get(name, [0.0])[0])
     rates = {"stray": 60, "scannet_plus_plus": 60, "scanner_app": 15, "tartan_air_2": 10, "virtual_kitti": 10}
+    rates |= {"airsim": 20}
     expected = np.arange(4) / rates.get(name, 30)
     tolerance = 1e-3 if name == "arkit_scenes" else 1e-6
     np.testing.assert_allclose(sequence.timestamps - first, expected, atol=tolerance)
