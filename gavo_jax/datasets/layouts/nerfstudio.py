@@ -1,5 +1,6 @@
 """Folders whose `transforms.json` names a depth image for each frame, as nerfstudio and instant-ngp read them."""
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,5 +121,5 @@ def _named(folder: Path, place: str, key: str, value: Any) -> Path:
 
 def _with_ending(image: Path) -> Path:
     """An image with the ending of its file, which NeRFCapture leaves out and instant-ngp tries."""
-    files = (image.with_name(image.name + ending) for ending in COLOR_SUFFIXES if not image.exists())
-    return next((file for file in files if file.is_file()), image)
+    files = (image.with_name(image.name + ending) for ending in COLOR_SUFFIXES if not os.path.exists(image))
+    return next((file for file in files if os.path.isfile(file)), image)

@@ -1,5 +1,6 @@
 """Drives of Virtual KITTI 2 (Cabon et al. 2020), rendered."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,9 @@ RATE = 10.0
 
 CAMERA = "Camera_0"
 """The left one of two."""
+
+NUMBER = re.compile(r"\d{1,9}", re.ASCII)
+"""Of a frame or a camera."""
 
 TEXTS = "it is in the dataset's vkitti_2.0.3_textgt.tar.gz"
 
@@ -97,10 +101,10 @@ def _rows(file: Path) -> dict[int, tuple[str, list[str]]]:
     for place, (frame, *fields) in data_rows(file):
         if frame == "frame":
             continue
-        if not (frame.isdecimal() and fields and fields[0].isdecimal()):
+        if not (NUMBER.fullmatch(frame) and fields and NUMBER.fullmatch(fields[0])):
             found = " ".join([frame, *fields])[:60]
             raise GavoError(f"{place}: expected the numbers of a frame and of its camera first, found {found!r}")
-        if fields[0] != CAMERA[-1]:
+        if int(fields[0]) != int(CAMERA[-1]):
             continue
         if int(frame) in rows:
             raise GavoError(f"{place}: frame {int(frame)} is there twice")

@@ -182,6 +182,16 @@ def test_names_without_a_number_are_told(folder):
     assert left_out(opened(folder)) == ["1 frames: names of another form than most, as last.png"]
 
 
+def test_a_name_that_no_disk_holds_is_an_image_that_is_missing(folder):
+    """The system's own error for it came through."""
+    change(folder, lambda values: values["frames"][0].update(depth_file_path=f"lidar/{300 * '9'}.png"))
+    with pytest.raises(GavoError, match=r"999\.png: image is missing"):
+        opened(folder)
+    change(folder, lambda values: values["frames"][0].update(file_path=f"images/{300 * 'a'}4"))
+    with pytest.raises(GavoError, match="aaa4: image is missing"):
+        opened(folder)
+
+
 def test_a_file_that_names_no_depth_leaves_it_to_the_names_of_folders(folder):
     change(folder, each(lambda frame: frame.update(depth_file_path=None)))
     assert recognise(folder).kind == "folder of colour and depth images"

@@ -90,6 +90,7 @@ def test_poses_that_are_not_there_are_no_truth(clip):
         ("intrinsic.txt", "0 0 nan nan nan nan\n", "has no camera of any frame: say --camera"),
         ("intrinsic.txt", "0 0 131 131 79.5 59.5\n1 0 231 231 79.5 59.5\n", "each frame has a camera of its own"),
         ("intrinsic.txt", "0\n", r":1: expected the numbers of a frame and of its camera first, found '0'"),
+        ("extrinsic.txt", 5000 * "1" + " 0 1 0 0 0\n", r":1: expected the numbers of a frame and of its camera first"),
         ("extrinsic.txt", "a b 1 0 0 0\n", r":1: expected the numbers of a frame and of its camera first"),
         (
             "extrinsic.txt",
