@@ -1,5 +1,6 @@
 """What lies at a path where no source is, in words that help: each guess says something, or leaves it to the next."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -39,6 +40,9 @@ RECORDINGS = {
 }
 """What holds a source in a form of its maker's alone."""
 
+WHAT_OF = re.compile(r"^(?:drive|export|recording|scan|scene) of ")
+"""What the names of kinds begin with, and lists of all of them leave out."""
+
 SHOWN = 5
 """Names that a message lists."""
 
@@ -63,7 +67,7 @@ def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]
         kinds: The kinds of sources that are known.
         is_source: Whether one of them is at another path.
     """
-    known = f"{', '.join(kinds)} (SUN3D's, too)"
+    known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (SUN3D's, too)"
     if not path.is_dir():
         if path.is_file() and (source := source_around(path, is_source)):
             return f"a file of a source: name its folder, {source}"
