@@ -238,7 +238,7 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     if len(estimate) < 2 or len(truth) < 2:
         raise GavoError("relative pose error: estimate and ground truth need at least two poses each")
     end = _closest_index(estimate.timestamps, estimate.timestamps + delta)
-    start = np.flatnonzero((end != len(estimate) - 1) & (end != np.arange(len(estimate))))  # a pose is no pair
+    start = np.flatnonzero((end != len(estimate) - 1) & (estimate.timestamps[end] > estimate.timestamps))
     end = end[start]
     apart = float(np.median(np.diff(estimate.timestamps)))
     if len(start) == 0 and apart > delta:

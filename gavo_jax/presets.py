@@ -137,8 +137,10 @@ def register(method: str, settings: Settings | Solver) -> None:
     Raises:
         GavoError: The name is another's, or none.
     """
-    if method in METHODS or not re.fullmatch("[a-z][a-z0-9-]*", method):
+    if not isinstance(method, str) or method in METHODS or not re.fullmatch("[a-z][a-z0-9-]*", method):
         raise GavoError(f"{method!r} cannot be the name of a method of one's own")
+    if settings is None:
+        raise GavoError(f"{method}: settings or a solver are needed, not None")
     _registered[method] = as_settings(settings)
 
 

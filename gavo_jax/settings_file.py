@@ -88,7 +88,10 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     known = {type(presets.preset(name).solver): name for name in presets.usable_methods()}
     if type(settings.solver) not in known:
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
-    table: dict[str, Any] = {"method": method or known[type(settings.solver)], "preset": preset}
+    method = method or known[type(settings.solver)]
+    if type(presets.preset(method, preset).solver) is not type(settings.solver):
+        raise GavoError(f"{path}: method {method} is not that of a {type(settings.solver).__name__}")
+    table: dict[str, Any] = {"method": method, "preset": preset}
     for room in ROOMS:
         part = getattr(settings, room)
         values = {field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.repr}

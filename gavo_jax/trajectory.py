@@ -104,6 +104,8 @@ class Trajectory:
         segments = np.zeros(len(timestamps), int) if self.segments is None else np.asarray(self.segments, int)
         if segments.shape != timestamps.shape:
             raise ValueError(f"one segment a pose expected, got {segments.shape} for {timestamps.shape}")
+        if np.any(segments < 0):
+            raise ValueError(f"segments are numbered from 0 on, and one is {segments.min()}")
         object.__setattr__(self, "segments", segments)
 
     def require_rigid(self) -> None:
@@ -168,8 +170,9 @@ class Trajectory:
         """Write rows of `timestamp tx ty tz qx qy qz qw` that read back to the last digit.
 
         Raises:
-            GavoError: the file cannot be written; nothing is left under its name then.
+            GavoError: a pose is no rigid transform, or the file cannot be written; nothing is left under its name then.
         """
+        self.require_rigid()
         lines = [TRAJECTORY_HEADER]
         before, stamp = 0, None
         for i, row in enumerate(map(format_tum_row, self.timestamps, self.world_T_camera)):

@@ -377,3 +377,11 @@ def test_inverse_poses_of_a_turn_about_one_axis_are_not_taken_for_the_other_orde
         for sign in (1, -1)
     )
     assert not is_w_first(turn, turn) and not is_w_first(back, turn)
+
+
+def test_poses_of_one_moment_have_no_drift_over_a_second():
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    still = Trajectory(np.ones(40), poses)
+    with pytest.raises(GavoError, match="no poses 1 s apart"):
+        relative_pose_error(still, still)

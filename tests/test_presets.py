@@ -110,3 +110,10 @@ def test_every_preset_has_a_solver_for_all_levels():
     for bad in (("simplex", "default"), ("ga", "best")):
         with pytest.raises(GavoError, match="unknown"):
             presets.preset(*bad)
+
+
+@pytest.mark.parametrize(("name", "settings"), [("mine", None), (3, GaussNewton())])
+def test_nothing_is_no_method(name, settings):
+    with pytest.raises(GavoError, match="settings or a solver|cannot be the name"):
+        presets.register(name, settings)
+    assert name not in presets.methods()

@@ -230,3 +230,10 @@ def test_numbers_of_arrays_are_written_as_numbers(tmp_path):
     save_settings(tmp_path / "s.toml", Settings(solver))
     again = load_settings(tmp_path / "s.toml").settings.solver
     assert again == GeneticAlgorithm(mutants=0.25, patience=5, spread=(0.5,) * 5)
+
+
+@pytest.mark.parametrize(("method", "preset"), [("pso", "default"), (None, "nosuch")])
+def test_what_could_not_be_read_again_is_not_written(tmp_path, method, preset):
+    with pytest.raises(GavoError, match=r"pso is not that of a GeneticAlgorithm|nosuch"):
+        save_settings(tmp_path / "s.toml", presets.preset("ga", "fast"), method, preset)
+    assert not (tmp_path / "s.toml").exists()

@@ -311,3 +311,9 @@ def test_columns_in_another_order_are_refused(tmp_path, heading):
     (tmp_path / "t.txt").write_text(f"{heading}\n1.0 1 2 3 0 0 0 1\n")
     with pytest.raises(GavoError, match=r"t\.txt: columns .*: expected timestamp tx ty tz qx qy qz qw"):
         Trajectory.read_tum(tmp_path / "t.txt")
+
+
+def test_segments_below_zero_are_refused():
+    """They were lost in a file."""
+    with pytest.raises(ValueError, match="from 0 on"):
+        Trajectory(np.arange(2.0), np.stack([np.eye(4)] * 2), np.array([0, -1]))

@@ -17,7 +17,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 from gavo_jax.features import FeatureKind, feature_motion
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.se3 import is_rigid, rigid
@@ -112,6 +112,13 @@ def starts_of(
     return jnp.concatenate([jnp.asarray(guesses, jnp.float32)[:, None], found], axis=1)
 
 
+def _as_numbers(guesses: Any) -> Float64[np.ndarray, "*b 4 4"]:
+    try:
+        return np.asarray(guesses, np.float64)
+    except (TypeError, ValueError):
+        raise GavoError(f"target_T_reference is needed as a guess, a matrix of numbers, not {shown(guesses)}") from None
+
+
 def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray, "b 4 4"]:
     """The rigid motions that guesses stand for: a search starts from each, and its result would be none otherwise.
 
@@ -186,7 +193,7 @@ def align(
     settings = as_settings(settings, solver, alignment=options)
     sides = stacked_sides([reference], [target], camera)
     keys = (jax.random.key(0) if key is None else typed_keys(key, ()))[None]
-    expected = None if guess is None else np.asarray(guess, np.float32)[None]
+    expected = None if guess is None else _as_numbers(guess).astype(np.float32)[None]
     found = align_rows(sides, camera, settings, keys, starts_of(expected, sides, camera, settings))
     result = review(found, ([reference], [target]), sides, camera, settings, expected)
     row = jax.tree.map(lambda leaf: leaf[0], result)
@@ -226,6 +233,7 @@ def align_batch(
     """
     require_untraced(references, targets, camera, settings, solver, keys, guesses)
     settings = as_settings(settings, solver, alignment=options)
+    guesses = None if guesses is None else _as_numbers(guesses)
     sides, keys = stacked_pairs(references, targets, camera, keys)
     found = align_rows(sides, camera, settings, keys, starts_of(guesses, sides, camera, settings))
     return review(found, (references, targets), sides, camera, settings, guesses)

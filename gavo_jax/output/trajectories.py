@@ -49,10 +49,13 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
         form: one of `FILES`.
 
     Raises:
-        GavoError: an unknown format, stamps that the format cannot hold, a bag without the extra `[bag]`, or the file
-            cannot be written.
+        GavoError: an unknown format, a pose that is no rigid transform, a stamp that is no number or that the format
+            cannot hold, a bag without the extra `[bag]`, or the file cannot be written.
     """
     check_format(form)
+    trajectory.require_rigid()
+    if not np.isfinite(trajectory.timestamps).all():
+        raise GavoError(f"{path}: pose {np.argmin(np.isfinite(trajectory.timestamps))} has a stamp that is no number")
     WRITERS[form](trajectory, Path(path))
 
 

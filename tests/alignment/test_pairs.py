@@ -192,11 +192,15 @@ def test_what_does_not_belong_to_the_frames_is_refused_by_name(small_frames: dic
     frame = small_frames[0]
     bright = frame.grey / np.float32(255.0)
     two, key = [frame, frame], jax.random.key(0)
+    words: Any = "x"
+    ragged: Any = [np.eye(4), np.eye(3)]
     calls: list[tuple[str, Callable[[], Any]]] = [
         ("Camera is needed, not str", lambda: align(frame, frame, "fr1", NEWTON)),  # pyright: ignore
         ("multiply by 255", lambda: align((bright, frame.depth), frame, CAMERA, NEWTON)),
         ("multiply by 255", lambda: align_batch((bright[None], frame.depth[None]), [frame], CAMERA, NEWTON)),
         ("key is needed", lambda: align(frame, frame, CAMERA, NEWTON, key=5)),  # pyright: ignore
+        ("a matrix of numbers, not 'x'", lambda: align(frame, frame, CAMERA, NEWTON, guess=words)),
+        ("a matrix of numbers", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=ragged)),
         ("guesses are of shape", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.zeros(6))),
         ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.eye(4))),
         ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.tile(np.eye(4), (3, 1, 1)))),

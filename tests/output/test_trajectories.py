@@ -92,3 +92,12 @@ def test_an_earlier_runs_files_are_removed(tmp_path):
         write_trajectory(TRAJECTORY, tmp_path / name, form)
     remove_trajectories(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [FILES["tum"]]
+
+
+@pytest.mark.parametrize("form", [form for form in FILES if form != "bag"])
+@pytest.mark.parametrize(("stamp", "scale", "words"), [(1.0, 2.0, "no rigid transform"), (np.nan, 1.0, "no number")])
+def test_what_is_no_trajectory_is_not_written(tmp_path, form, stamp, scale, words):
+    trajectory = Trajectory(np.array([0.0, stamp]), scale * np.stack([np.eye(4)] * 2))
+    with pytest.raises(GavoError, match=words):
+        write_trajectory(trajectory, tmp_path / "poses", form)
+    assert not (tmp_path / "poses").exists()
