@@ -1,7 +1,6 @@
 """Drives of Virtual KITTI 2 (Cabon et al. 2020), rendered."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Self
@@ -9,8 +8,8 @@ from typing import ClassVar, Self
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera_files.calibration import Calibration, load_calibration
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.camera_files.calibration import Calibration
+from gavo_jax.datasets.files import Reading, Size
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, found_among, of_matrices
 from gavo_jax.datasets.names import Found
 from gavo_jax.datasets.truth import numbers_in, pose_of
@@ -59,11 +58,8 @@ class VirtualKitti(NumberedFolder):
         return found_among(color.glob("rgb_*"), depth.glob("depth_*"))
 
     @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the rows of the frames have in common."""
-        size = size_of_most(entries)
-        if (own := own_camera_file(path)) is not None:
-            return load_calibration(own, size, CENTIMETRES)
+    def own_camera(cls, path: Path, size: Size) -> Calibration:
+        """What the rows of the frames have in common."""
         file = path / cls.INTRINSICS
         if not file.is_file():
             raise GavoError(f"{file}: no such file: {TEXTS}; or say --camera")
