@@ -85,16 +85,14 @@ def _standing_surfaces(inverse_depth: Float[np.ndarray, "h w"]) -> Integer[np.nd
     labels, count = _surfaces(inverse_depth)
     before, behind = np.zeros(count), np.zeros(count)
     for q, surface in ((inverse_depth, labels), (inverse_depth.T, labels.T)):
-        for apart in range(1, min(WIDEST_SHADOW, q.shape[1] - 1) + 1):
-            a, b = q[:, :-apart], q[:, apart:]
-            step = np.abs(a - b) > STEP * np.maximum(a, b) + STEP_NOISE
-            meet = step & (a > 0) & (b > 0) & (surface[:, :-apart] != surface[:, apart:])
-            for between in range(1, apart):
-                meet &= q[:, between : between - apart] == 0
-            first, second = surface[:, :-apart][meet], surface[:, apart:][meet]
-            is_nearer = a[meet] > b[meet]
-            before += np.bincount(np.where(is_nearer, first, second), minlength=count)
-            behind += np.bincount(np.where(is_nearer, second, first), minlength=count)
+        row, column = np.nonzero(q > 0)
+        q, surface = q[row, column], surface[row, column]
+        a, b = q[:-1], q[1:]
+        meet = (np.diff(row) == 0) & (np.diff(column) <= WIDEST_SHADOW) & (np.diff(surface) != 0)
+        meet &= np.abs(a - b) > STEP * np.maximum(a, b) + STEP_NOISE
+        first, second, is_nearer = surface[:-1][meet], surface[1:][meet], (a > b)[meet]
+        before += np.bincount(np.where(is_nearer, first, second), minlength=count)
+        behind += np.bincount(np.where(is_nearer, second, first), minlength=count)
     area = np.bincount(labels.ravel(), minlength=count) / labels.size
     chosen = (area > LEAST_AREA) & (before > BEFORE * (before + behind)) & (before >= LEAST_BORDER)
     largest_first = np.argsort(-np.where(chosen, area, 0.0))
