@@ -32,6 +32,9 @@ REMEMBERED, MIN_REMEMBERED = 15, 8
 MOST_LEFT = 0.7
 """Largest part of the change of depth that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and
 0.42 with a body over 40 % of the image."""
+RIGHT_BEFORE = 5
+"""So many more pairs whose change of depth was explained than others, from the first remembered one on, say that depth
+was right until then."""
 LEAST_EXPLAINED = 0.95
 """Share of the grey residuals that are not large where depth of one number is a wall, straight ahead: there the slide
 along it explains all. Rooms whose depth was made one number have 0.93 and less."""
@@ -60,8 +63,13 @@ class DepthChange(NamedTuple):
         return self.usually_left > MOST_LEFT
 
     def pairs_covered(self, pairs: int) -> int:
-        """Return how many of the last pairs its figures speak of, of so many so far: all, until one was forgotten."""
-        return len(self.left) if len(self.left) == REMEMBERED else pairs
+        """Return how many of the last pairs its figures speak against, of so many so far: all, until one was forgotten,
+        but for those before depth became wrong.
+        """
+        covered = len(self.left) if len(self.left) == REMEMBERED else pairs
+        more_explained = np.cumsum(np.where(np.array(self.left) > MOST_LEFT, -1, 1))
+        was_right = more_explained.size > 0 and more_explained.max() >= RIGHT_BEFORE
+        return covered - (int(np.argmax(more_explained)) + 1 if was_right else 0)
 
     def after(
         self, frame: Frame, elapsed: float, target_T_reference: Any, explained: float, camera: Camera

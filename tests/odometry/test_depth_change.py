@@ -130,6 +130,27 @@ def test_depth_of_another_moment_is_right_where_its_stamp_says_so() -> None:
     assert figures[1] < 0.5 * figures[0]
 
 
+RIGHT, WRONG = 0.1, 1.9
+
+
+@pytest.mark.parametrize(
+    ("left", "pairs", "covered"),
+    [
+        ((WRONG,) * 9, 12, 12),
+        ((RIGHT, RIGHT, *(WRONG,) * 7), 9, 9),  # by chance
+        ((*(RIGHT,) * 5, *(WRONG,) * 6), 11, 6),
+        ((*(RIGHT,) * 4, WRONG, RIGHT, RIGHT, *(WRONG,) * 8), 40, 8),
+        ((WRONG, RIGHT) * 7 + (WRONG,), 40, 15),
+    ],
+)
+def test_pairs_before_depth_became_wrong_are_not_spoken_against(
+    left: tuple[float, ...], pairs: int, covered: int
+) -> None:
+    """Depth that became coarse after nine pairs flagged these, too."""
+    change = DepthChange(np.zeros((1, 1)), 0.0, left=left)
+    assert change.is_unexplained and change.pairs_covered(pairs) == covered
+
+
 def test_of_half_of_the_pairs_a_body_may_be_why_that_was_not_known_yet() -> None:
     """In a room with a box that moved, the first eight pairs were told to have wrong depth."""
     change = DepthChange(np.zeros((1, 1)), 0.0, left=(1.9,) * 4 + (0.1,) * 4)
