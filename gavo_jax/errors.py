@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import operator
 import os
 import re
 import reprlib
@@ -12,6 +13,8 @@ import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 MAX_TEXT_BYTES = 128 * 2**20
 MAX_SHOWN = 100
@@ -82,6 +85,29 @@ def number(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"not a number: {text[:MAX_SHOWN]!r}")
     return math.nan if OF_WINDOWS.fullmatch(text) else float(text)
+
+
+def as_number(name: str, value: Any, needed: str = "a number is needed") -> float:
+    """A value as a number of Python's own.
+
+    Raises:
+        GavoError: It is no single real number, but text, a list.
+    """
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
+        raise GavoError(f"{name}: {needed}, not {shown(value)}")
+    return float(value)
+
+
+def as_whole(name: str, value: Any) -> int:
+    """A value as a whole number of Python's own.
+
+    Raises:
+        GavoError: It is none; 2.0 is none either.
+    """
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise GavoError(f"{name}: a whole number is needed, not {shown(value)}") from None
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:

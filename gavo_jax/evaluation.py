@@ -6,13 +6,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_number
 from gavo_jax.trajectory import (
     MAX_GAP,
     Trajectory,
     associate,
     inverse,
     quaternion_from_rotation,
+    require_trajectory,
     rotation_from_quaternion,
 )
 
@@ -122,9 +123,10 @@ def relative_pose_error(
 
     Raises:
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
-            (for frames: not a whole number).
+            (for frames: not a whole number), or no number.
     """
     estimate, truth = _known(estimate), _known(truth)
+    delta = as_number("relative pose error: delta", delta)
     if not np.isfinite(delta) or delta <= 0:
         raise GavoError(f"relative pose error: delta must be positive and finite, not {delta}")
     if unit == "s":
@@ -146,8 +148,9 @@ def absolute_trajectory_error(
     single pose says nothing and is left out. So are poses that are not finite.
 
     Raises:
-        GavoError: fewer than two poses associate, or no two of one segment.
+        GavoError: fewer than two poses associate, or no two of one segment; an argument is of another kind.
     """
+    max_difference = as_number("absolute trajectory error: max_difference", max_difference)
     estimated, true = _associated(_known(estimate), _known(truth), max_difference, "absolute trajectory error")
     segments, counts = np.unique(estimated.segments, return_counts=True)
     told = np.isin(estimated.segments, segments[counts > 1])
@@ -176,8 +179,9 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     left out.
 
     Raises:
-        GavoError: the truth covers no pose of the estimate.
+        GavoError: the truth covers no pose of the estimate; an argument is of another kind.
     """
+    max_gap = as_number("distance error: max_gap", max_gap)
     estimate, truth = _known(estimate), _known(truth)
     estimate = estimate[np.argsort(estimate.timestamps, kind="stable")]
     true, valid = truth.interpolate(estimate.timestamps, max_gap)
@@ -195,7 +199,12 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
 
 
 def _known(trajectory: Trajectory) -> Trajectory:
-    """The poses that are finite, and so are their stamps; raise GavoError where one is no rigid transform."""
+    """The poses that are finite, and so are their stamps.
+
+    Raises:
+        GavoError: it is no trajectory, or a pose is no rigid transform.
+    """
+    require_trajectory(trajectory)
     trajectory.require_rigid()
     known = np.isfinite(trajectory.world_T_camera).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
     return trajectory if known.all() else trajectory[known]

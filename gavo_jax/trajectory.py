@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gavo_jax.errors import GavoError, GavoWarning, number, read_text, rows_of, without_heading, write_bytes
+from gavo_jax.errors import (
+    GavoError,
+    GavoWarning,
+    as_number,
+    blamed,
+    number,
+    read_text,
+    rows_of,
+    shown,
+    without_heading,
+    write_bytes,
+)
 from gavo_jax.se3 import is_rigid
 
 MAX_GAP = 0.1
@@ -94,14 +105,16 @@ class Trajectory:
     segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Hold all as arrays; raise ValueError where their shapes do not belong together."""
-        timestamps = np.asarray(self.timestamps, np.float64)
-        world_T_camera = np.asarray(self.world_T_camera, np.float64)
+        """Hold all as arrays; raise ValueError where they hold no numbers, or their shapes do not belong together."""
+        with blamed("Trajectory: numbers are needed"):
+            timestamps = np.asarray(self.timestamps, np.float64)
+            world_T_camera = np.asarray(self.world_T_camera, np.float64)
+            given = None if self.segments is None else np.asarray(self.segments, int)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
             raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_camera", world_T_camera)
-        segments = np.zeros(len(timestamps), int) if self.segments is None else np.asarray(self.segments, int)
+        segments = np.zeros(len(timestamps), int) if given is None else given
         if segments.shape != timestamps.shape:
             raise ValueError(f"one segment a pose expected, got {segments.shape} for {timestamps.shape}")
         if np.any(segments < 0):
@@ -125,6 +138,9 @@ class Trajectory:
 
     def __getitem__(self, which: Any) -> "Trajectory":
         """Return some of the poses: a slice, a mask or a list of places."""
+        if np.ndim(which) == 0 and not isinstance(which, slice):
+            needed = "a slice, a mask or a list of places is needed"
+            raise TypeError(f"Trajectory: {needed}, not {shown(which)}; a single pose is world_T_camera[i]")
         return Trajectory(self.timestamps[which], self.world_T_camera[which], self.segments[which])
 
     @staticmethod
@@ -192,19 +208,28 @@ class Trajectory:
         write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
 
     def interpolate(
-        self, timestamps: Float[np.ndarray, " m"], max_gap: float = MAX_GAP
-    ) -> tuple[Float[np.ndarray, "m 4 4"], Bool[np.ndarray, " m"]]:
+        self, timestamps: float | Float[np.ndarray, "*m"], max_gap: float = MAX_GAP
+    ) -> tuple[Float[np.ndarray, "*m 4 4"], Bool[np.ndarray, "*m"]]:
         """Return `world_T_camera` at other stamps, between the samples around: translation linear, rotation by slerp.
 
         Args:
-            timestamps: seconds, in any order.
+            timestamps: seconds, in any order; one number for one pose.
             max_gap: seconds; a stamp between two samples further apart than this is not valid.
 
         Returns:
             Transforms, NaN where not valid, and the mask of the valid ones: those on a sample or between two near
             ones of one segment.
+
+        Raises:
+            GavoError: an argument is no number.
         """
-        timestamps = np.asarray(timestamps, np.float64)
+        max_gap, asked = as_number("interpolate: max_gap", max_gap), _as_stamps(timestamps)
+        poses, valid = self._interpolate(asked.ravel(), max_gap)
+        return poses.reshape(*asked.shape, 4, 4), valid.reshape(asked.shape)
+
+    def _interpolate(
+        self, timestamps: Float[np.ndarray, " m"], max_gap: float
+    ) -> tuple[Float[np.ndarray, "m 4 4"], Bool[np.ndarray, " m"]]:
         order = np.argsort(self.timestamps, kind="stable")
         times, samples, segments = self.timestamps[order], self.world_T_camera[order], self.segments[order]
         result = np.full((len(timestamps), 4, 4), np.nan)
@@ -228,6 +253,27 @@ class Trajectory:
         between[:, 3, 3] = 1.0
         result[valid] = between
         return result, valid
+
+
+def require_trajectory(trajectory: Any) -> None:
+    """Refuse what is no trajectory.
+
+    Raises:
+        GavoError: It is a path, an array of poses.
+    """
+    if not isinstance(trajectory, Trajectory):
+        hint = "gavo.Trajectory.read_tum(path) or gavo.Trajectory(timestamps, world_T_camera)"
+        raise GavoError(f"a Trajectory is needed, not {type(trajectory).__name__}: {hint}")
+
+
+def _as_stamps(stamps: Any) -> Float[np.ndarray, "*m"]:
+    try:
+        numbers = np.asarray(stamps)
+    except ValueError:  # lists of unequal lengths
+        numbers = np.asarray(None)
+    if numbers.dtype.kind not in "iuf":
+        raise GavoError(f"interpolate: timestamps: numbers of seconds are needed, not {shown(stamps)}")
+    return numbers.astype(np.float64)
 
 
 def stamp_name(timestamp: float) -> str:

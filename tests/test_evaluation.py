@@ -344,6 +344,27 @@ def test_bad_deltas_and_units_are_refused(arguments):
         relative_pose_error(truth, truth, *arguments)
 
 
+@pytest.mark.parametrize("value", ["1", None, [1], np.ones(1), 1j, True])
+def test_spans_that_are_no_numbers_are_refused_by_name(value):
+    truth = smooth_truth()
+    for unit in ("s", "frames"):
+        with pytest.raises(GavoError, match="relative pose error: delta: a number is needed, not"):
+            relative_pose_error(truth, truth, value, unit)
+    with pytest.raises(GavoError, match="absolute trajectory error: max_difference: a number is needed, not"):
+        absolute_trajectory_error(truth, truth, value)
+    with pytest.raises(GavoError, match="distance error: max_gap: a number is needed, not"):
+        distance_error(truth, truth, value)
+
+
+@pytest.mark.parametrize("other", [None, "truth.txt", np.eye(4), [1.0]])
+def test_what_is_no_trajectory_is_refused(other):
+    truth = smooth_truth()
+    for error in (relative_pose_error, absolute_trajectory_error, distance_error):
+        for pair in ((other, truth), (truth, other)):
+            with pytest.raises(GavoError, match=f"a Trajectory is needed, not {type(other).__name__}: .*read_tum"):
+                error(*pair)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, 3.0, np.pi])
 def test_rotation_angles_are_exact_at_both_ends(angle):
     rotation = Rotation.from_rotvec(np.array([0.6, 0.0, 0.8]) * angle).as_matrix()

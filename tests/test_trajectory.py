@@ -230,6 +230,50 @@ def test_interpolation_returns_the_samples_and_knows_its_limits():
     assert not Trajectory(np.zeros(0), np.zeros((0, 4, 4))).interpolate(stamps)[1].any()
 
 
+def test_interpolation_at_one_stamp_is_one_pose():
+    trajectory = random_trajectory(4, 2)
+    stamps = trajectory.timestamps[:1] + 0.001
+    poses, valid = trajectory.interpolate(stamps)
+    pose, is_valid = trajectory.interpolate(float(stamps[0]))
+    assert pose.shape == (4, 4) and is_valid and valid.all()
+    np.testing.assert_array_equal(pose, poses[0])
+    assert trajectory.interpolate(stamps.reshape(1, 1))[0].shape == (1, 1, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("1.0",), "timestamps: numbers of seconds are needed, not '1.0'"),
+        ((None,), "timestamps: numbers of seconds are needed, not None"),
+        (([[1.0], [1.0, 2.0]],), "timestamps: numbers of seconds are needed"),
+        (([0.0], "1"), "max_gap: a number is needed, not '1'"),
+        (([0.0], None), "max_gap: a number is needed, not None"),
+    ],
+)
+def test_interpolation_at_what_is_no_stamp_is_refused(arguments: tuple, words: str):
+    with pytest.raises(GavoError, match=f"^interpolate: {words}"):
+        random_trajectory(4, 2).interpolate(*arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(["a"], [np.eye(4)]), ([0.0], [["a"]]), ([0.0, 1.0], [[1.0], [1.0, 2.0]]), ([0.0], [np.eye(4)], ["first"])],
+)
+def test_what_is_no_number_makes_no_trajectory(arguments: tuple):
+    with pytest.raises(GavoError, match="^Trajectory: numbers are needed: "):
+        Trajectory(*arguments)
+
+
+def test_one_place_of_a_trajectory_is_no_trajectory():
+    trajectory = random_trajectory(4, 2)
+    assert len(trajectory[[1]]) == len(trajectory[1:2]) == 1
+    for which in (1, np.int64(1), "1", None):
+        with pytest.raises(TypeError, match=r"a slice, a mask or a list of places is needed, .*world_T_camera\[i\]"):
+            trajectory[which]
+    with pytest.raises(TypeError, match="a slice, a mask"):
+        list(trajectory)  # pyright: ignore[reportArgumentType]
+
+
 def test_interpolation_between_equal_and_opposite_rotations_stays_finite():
     world_T_camera = np.tile(np.eye(4), (3, 1, 1))
     world_T_camera[2, :3, :3] = np.diag([-1.0, -1.0, 1.0])

@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Float, UInt8
 
 from gavo_jax.camera import Camera, require_camera
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_number
 from gavo_jax.image.numbers import Depth, is_real
 from gavo_jax.trajectory import Trajectory
 
@@ -68,9 +68,7 @@ def as_seconds(name: str, stamp: Any) -> float:
     Raises:
         GavoError: It is no single number, but text, a date.
     """
-    if np.ndim(stamp) or np.asarray(stamp).dtype.kind not in "iuf":
-        raise GavoError(f"{name}: seconds are needed, a number, not {type(stamp).__name__}")
-    return float(stamp)
+    return as_number(name, stamp, "seconds are needed, a number")
 
 
 def index_at(timestamps: Float[np.ndarray, " n"], stamp: float) -> int:

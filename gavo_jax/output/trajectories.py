@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from gavo_jax.errors import GavoError, partial_of
 from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
-from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, write_lines
+from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, require_trajectory, write_lines
 
 FILES = {
     "tum": TRAJECTORY,
@@ -49,10 +49,11 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
         form: one of `FILES`.
 
     Raises:
-        GavoError: an unknown format, a pose that is no rigid transform, a stamp that is no number or that the format
-            cannot hold, a bag without the extra `[bag]`, or the file cannot be written.
+        GavoError: an unknown format, what is no trajectory, a pose that is no rigid transform, a stamp that is no
+            number or that the format cannot hold, a bag without the extra `[bag]`, or the file cannot be written.
     """
     check_format(form)
+    require_trajectory(trajectory)
     trajectory.require_rigid()
     if not np.isfinite(trajectory.timestamps).all():
         raise GavoError(f"{path}: pose {np.argmin(np.isfinite(trajectory.timestamps))} has a stamp that is no number")

@@ -76,6 +76,8 @@ def test_bag_holds_the_poses_and_is_replaced(tmp_path):
 
 
 def test_what_cannot_be_written_is_one_line(tmp_path):
+    with pytest.raises(GavoError, match="a Trajectory is needed, not ndarray"):
+        write_trajectory(TRAJECTORY.world_T_camera, tmp_path / "t.txt", "tum")  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="not one of tum, kitti, euroc, json, bag"):
         formats("tum,klm")
     (tmp_path / "bag").mkdir()
