@@ -13,7 +13,6 @@ from gavo_jax.errors import GavoError
 SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES = 40
 """Unless it is said how many: the drift over one second needs a little more than a second of them."""
-MAX_SYNTHETIC_FRAMES = 1_000_000
 
 
 def open_part(
@@ -63,7 +62,5 @@ def open_part(
 
 def _synthetic(camera: str, stop: int | None, moving: int, color: bool) -> SyntheticSequence:
     frames = SYNTHETIC_FRAMES if stop is None else stop
-    if frames > MAX_SYNTHETIC_FRAMES:
-        raise GavoError(f"{SYNTHETIC}: has no more than {MAX_SYNTHETIC_FRAMES} frames, not {frames}")
     named = None if camera == "auto" else load_camera(camera)
     return SyntheticSequence(frames, camera=named, bodies=moving, color=color)

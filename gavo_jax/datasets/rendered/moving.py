@@ -168,9 +168,12 @@ def truths(bodies: Sequence[MovingBody], timestamps: Float[np.ndarray, " frames"
     """The truth of every body at the frames' stamps.
 
     Raises:
-        GavoError: a body without parts, a part without boxes, a box that cannot be, more parts than there are labels,
-            or a path that gives something else than rigid transforms.
+        GavoError: what is no body, a body without parts, a part without boxes, a box that cannot be, more parts than
+            there are labels, or a path that gives something else than rigid transforms.
     """
+    for body in bodies:
+        if not isinstance(body, MovingBody):
+            raise GavoError(f"synthetic: bodies: a MovingBody is needed, not {type(body).__name__}")
     if any(not body.parts or not all(part.boxes for part in body.parts) for body in bodies):
         raise GavoError("synthetic: bodies: every body needs a part, and every part a box")
     for box in (box for body in bodies for part in body.parts for box in part.boxes):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_number
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SensorNoise:
     def __post_init__(self) -> None:
         """Refuse values that are negative or not finite."""
         for field in fields(self):
-            value = getattr(self, field.name)
+            value = as_number(f"sensor noise: {field.name}", getattr(self, field.name))
             if not (math.isfinite(value) and value >= 0):
                 raise GavoError(f"sensor noise: {field.name}: must be a number from 0, not {value!r}")
         if self.drift_period == 0:

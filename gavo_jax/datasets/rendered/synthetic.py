@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.actors import builtin_bodies, turn
 from gavo_jax.datasets.rendered.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
@@ -27,7 +27,7 @@ from gavo_jax.datasets.rendered.room import (
     free_space,
 )
 from gavo_jax.datasets.rendered.sensor_noise import KINECT, SensorNoise
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_number, as_whole, shown
 from gavo_jax.image.shutter import row_time
 from gavo_jax.trajectory import Trajectory
 
@@ -38,6 +38,9 @@ DEFAULT_CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
 DEFAULT_FRAMES, DEFAULT_RATE = 30, 30.0
 BANDS = 60
 """Bands of rows that a rolling shutter exposes one after the other."""
+
+MOST_FRAMES = 1_000_000
+"""Their poses are known from the first on: more would fill the memory."""
 
 LARGEST_EXTENT = 50.0
 """Trajectories that reach further than this (m) along an axis are refused: a room has to hold them."""
@@ -87,15 +90,17 @@ class SyntheticSequence:
         color: bool = False,
         bodies: int | Iterable[MovingBody] = (),
     ) -> None:
-        if frames is not None and frames < 1:
-            raise GavoError(f"synthetic: frames: must be at least 1, not {frames}")
-        if seed < 0:
-            raise GavoError(f"synthetic: seed: must be at least 0, not {seed}")
-        for key, value in (("rate", rate), ("speed", speed)):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise GavoError(f"synthetic: {key}: must be a number above 0, not {value!r}")
+        frames = None if frames is None else _whole("frames", frames, 1)
+        if frames is not None and frames > MOST_FRAMES:
+            raise GavoError(f"synthetic: has no more than {MOST_FRAMES} frames, not {frames}")
+        seed = _whole("seed", seed, 0)
+        rate, speed = None if rate is None else _positive("rate", rate), _positive("speed", speed)
+        if not isinstance(noise, SensorNoise):
+            raise GavoError(f"synthetic: noise: a SensorNoise is needed, not {shown(noise)}")
+        camera = DEFAULT_CAMERA if camera is None else camera
+        require_camera(camera)
         self._noise, self._color, self._seed = noise, color, seed
-        self._camera = (camera or DEFAULT_CAMERA).rectified()
+        self._camera = camera.rectified()
         low, high = DEPTH_SCALES
         if not low <= self._camera.depth_scale <= high:
             fault = f"camera.depth_scale: from {low:g} to {high:g}, as 16 bits hold a room's depth, not"
@@ -104,12 +109,13 @@ class SyntheticSequence:
             self._truth = builtin_path(frames or DEFAULT_FRAMES, rate or DEFAULT_RATE, speed, seed)
             self._half_extent, self._height = _HALF_EXTENT, _HEIGHT
         else:
-            source = trajectory if isinstance(trajectory, Trajectory) else Trajectory.read_tum(trajectory)
+            source = _as_trajectory(trajectory)
             self._truth, self._half_extent, self._height = _fit_room(_play(source, frames, rate, speed))
             source.require_rigid()
         self._selection = np.arange(len(self._truth))
         self._phases = np.random.default_rng([seed, _EXPOSURE_STREAM]).uniform(0, 2 * np.pi, 2)
-        if isinstance(bodies, int):
+        if not isinstance(bodies, Iterable):
+            bodies = as_whole("synthetic: bodies", bodies)
             bodies = builtin_bodies(bodies, seed, self._truth.world_T_camera[0], self._half_extent)
         self._bodies = tuple(bodies)
         self._bodies_truth = truths(self._bodies, self._truth.timestamps)
@@ -268,6 +274,27 @@ def builtin_path(frames: int, rate: float = DEFAULT_RATE, speed: float = 1.0, se
     world_T_camera[:, 1, 3] = wave(4, (0.22, 6.3), (0.015, 1.3))
     world_T_camera[:, 2, 3] = _EYE_LEVEL + wave(5, (0.09, 3.9), (0.015, 1.2))
     return Trajectory(timestamps, world_T_camera)
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    if (whole := as_whole(f"synthetic: {name}", value)) < least:
+        raise GavoError(f"synthetic: {name}: must be at least {least}, not {whole}")
+    return whole
+
+
+def _positive(name: str, value: Any) -> float:
+    number = as_number(f"synthetic: {name}", value)
+    if not (math.isfinite(number) and number > 0):
+        raise GavoError(f"synthetic: {name}: must be a number above 0, not {number!r}")
+    return number
+
+
+def _as_trajectory(source: Any) -> Trajectory:
+    if isinstance(source, Trajectory):
+        return source
+    if not isinstance(source, str | Path):
+        raise GavoError(f"synthetic: trajectory: a Trajectory or a TUM file is needed, not {shown(source)}")
+    return Trajectory.read_tum(source)
 
 
 def _play(source: Trajectory, frames: int | None, rate: float | None, speed: float) -> Trajectory:

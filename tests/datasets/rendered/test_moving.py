@@ -155,6 +155,9 @@ def test_a_written_folder_tells_the_truth(moving: SyntheticSequence, tmp_path) -
     ("bodies", "word"),
     [
         (-1, "bodies"),
+        (1.5, "bodies: a whole number is needed, not 1.5"),
+        ("2", "bodies: a MovingBody is needed, not str"),
+        ([1], "bodies: a MovingBody is needed, not int"),
         (MOST_BODIES + 1, f"to {MOST_BODIES}"),
         ([MovingBody("nothing", ())], "needs a part"),
         ([MovingBody("hollow", (MovingPart((), Sway(np.eye(4))),))], "a box"),

@@ -225,7 +225,10 @@ def test_the_sequence_as_a_whole_is_noisy_by_default():
     assert same(SyntheticSequence(frames=1)[0], noisy)
 
 
-@pytest.mark.parametrize("bad", [{"depth_sigma": -1.0}, {"grey_sigma": float("nan")}, {"drift_period": 0.0}])
+@pytest.mark.parametrize(
+    "bad",
+    [{"depth_sigma": -1.0}, {"grey_sigma": float("nan")}, {"drift_period": 0.0}, {"baseline": "1"}, {"gain_drift": []}],
+)
 def test_impossible_noise_is_refused(bad: dict):
     with pytest.raises(GavoError, match=next(iter(bad))):
         SensorNoise(**bad)
@@ -321,9 +324,19 @@ def test_any_camera():
     ("arguments", "word"),
     [
         ({"frames": 0}, "frames"),
+        ({"frames": 2.5}, "frames: a whole number is needed, not 2.5"),
+        ({"frames": "3"}, "frames: a whole number is needed, not '3'"),
+        ({"frames": 10**9}, "no more than 1000000 frames"),
         ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed: a whole number is needed"),
+        ({"seed": None}, "seed: a whole number is needed"),
         ({"rate": 0.0}, "rate"),
+        ({"rate": "30"}, "rate: a number is needed, not '30'"),
         ({"speed": float("inf")}, "speed"),
+        ({"speed": None}, "speed: a number is needed"),
+        ({"noise": None}, "noise: a SensorNoise is needed, not None"),
+        ({"camera": "fr1"}, "a Camera is needed, not str"),
+        ({"trajectory": 1}, "trajectory: a Trajectory or a TUM file is needed, not 1"),
         ({"trajectory": "nowhere/groundtruth.txt"}, "nowhere"),
         ({"trajectory": Trajectory(np.zeros(0), np.zeros((0, 4, 4)))}, "empty"),
         ({"trajectory": Trajectory(np.zeros(1), np.full((1, 4, 4), np.nan))}, "finite"),
@@ -406,5 +419,5 @@ def test_rendering_keeps_up():
 @pytest.mark.parametrize("scale", [1.0, 1e5, float("nan")])
 def test_a_unit_in_which_16_bits_hold_no_room_is_refused(scale: float) -> None:
     """Depth came in whole metres, or not at all."""
-    with pytest.raises(GavoError, match="depth_scale: from 100 to 20000"):
+    with pytest.raises(GavoError, match="depth_scale: (from 100 to 20000|a positive number is needed)"):
         SyntheticSequence(2, camera=replace(DEFAULT_CAMERA, depth_scale=scale))
