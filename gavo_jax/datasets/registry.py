@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gavo_jax.datasets import unrecognised
-from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.base import RUN, Sequence
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.layouts.airsim import AirSim
 from gavo_jax.datasets.layouts.arkit import Polycam, ScannerApp, ScanNetPlusPlus
@@ -163,7 +163,17 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
     dataset = recognise(path)
     if dataset in BUILT_IN and (useless := set(reading.given()) & USELESS.get(dataset, TOPICS)):
         raise GavoError(f"{path}: {min(useless)} says nothing of a {dataset.kind}")
-    return dataset.open(path, reading)
+    return dataset.open(path, reading) if dataset in BUILT_IN else _open_others(dataset, path, reading)
+
+
+def _open_others(dataset: Dataset, path: Path, reading: Reading) -> Sequence:
+    """What a dataset of somebody's own opens: what it raises, or gives in place of a sequence, is its fault."""
+    whose = f"dataset {dataset.kind!r}: {path}"
+    with blamed(whose):
+        sequence = dataset.open(path, reading)
+        if lacking := [name for name in RUN if not hasattr(sequence, name)]:
+            raise GavoError(f"{whose}: open gives {type(sequence).__name__}, no Sequence: no {', '.join(lacking)}")
+    return sequence
 
 
 def recognise(path: Path) -> Dataset:

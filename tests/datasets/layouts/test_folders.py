@@ -995,6 +995,21 @@ def test_a_faulty_dataset_of_others_is_named(tmp_path, no_plugins, fault):
     assert len(open_source(tmp_path / "room")) == len(GREYS)
 
 
+@pytest.mark.parametrize(
+    ("opened", "words"),
+    [
+        (lambda *_: None, "open gives NoneType, no Sequence: no camera, "),
+        (lambda path, reading: [path], "open gives list, no Sequence: no camera, timestamps, name, "),
+        (lambda *_: 1 / 0, "division by zero"),
+    ],
+)
+def test_a_dataset_of_others_that_opens_no_sequence_is_named(tmp_path, no_plugins, opened, words):
+    (tmp_path / "x.lines").write_text("")
+    register_dataset(type("Broken", (Lines,), {"open": staticmethod(opened)}))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match=rf"^dataset 'a file of lines': .*x\.lines: {words}"):
+        open_source(tmp_path / "x.lines")
+
+
 class Unbound:
     """Its methods want an object of the class."""
 
