@@ -84,6 +84,8 @@ def test_values_of_every_kind():
         ("solver.population", 3, ["population", "at least 4"]),
         ("solver.iterations", 16, ["iterations", "list of 5 whole numbers"]),
         ("solver.iterations", [0, 0, 0, 0, 0], ["iterations"]),
+        ("solver.iterations.4", "many", ["iterations", "list of 5 whole numbers"]),
+        ("solver.iterations", [[1]], ["iterations", "list of 5 whole numbers"]),
         ("alignment.points", [900, 900], ["points", "list of 5"]),
         ("alignment.points", 0.5, ["points", "whole"]),
         ("alignment.points", 0, ["points", "at least 1"]),

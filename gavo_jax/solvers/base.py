@@ -1,5 +1,6 @@
 """The solver protocol and the one loop that runs every solver on a pyramid level."""
 
+import contextlib
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -146,9 +147,10 @@ class PerLevel:
     def levels(self) -> tuple[int, ...]:
         """Levels with at least one iteration, coarsest first."""
         iterations: tuple[int, ...] = self.iterations  # pyright: ignore[reportAttributeAccessIssue]
-        if not isinstance(iterations, tuple):  # for `require_settings` to refuse
-            return ()
-        return tuple(k for k in reversed(range(len(iterations))) if iterations[k] > 0)
+        if isinstance(iterations, tuple):
+            with contextlib.suppress(TypeError):  # an entry that is no count
+                return tuple(k for k in reversed(range(len(iterations))) if iterations[k] > 0)
+        return ()  # for `require_settings` to refuse
 
 
 def largest(schedule: Schedule) -> int:
