@@ -76,10 +76,12 @@ def asking_for_help(arguments: Sequence[str]) -> list[str]:
 
 
 def empty_argument(arguments: Sequence[str]) -> str | None:
-    """What is wrong where an argument, or an option's value, is empty: as a path it would be the current folder."""
+    """What is wrong where an argument, or an option's value, is empty or blank: as a path it would be the current
+    folder, or one whose name no message shows.
+    """
     for before, argument in itertools.pairwise(("", *arguments)):
-        if argument == "" or re.fullmatch(r"--[\w-]+=", argument):
-            place = argument.removesuffix("=") or before
+        if re.fullmatch(r"(--[\w-]+=)?\s*", argument):
+            place = argument.strip().removesuffix("=") or before
             return f"{place}: an empty argument: is a variable not set?".removeprefix(": ")
     return None
 

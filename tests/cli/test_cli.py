@@ -386,6 +386,8 @@ def test_usage_error_says_what_would_help(gavo, arguments):
         (("run", "synthetic", "--output", ""), "--output"),
         (("run", "synthetic", "--output="), "--output"),
         (("view", ""), "view"),
+        (("view", " "), "view"),
+        (("run", "synthetic", "--output=\t"), "--output"),
     ],
 )
 def test_an_empty_argument_is_not_the_current_folder(gavo, arguments, where):
