@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from gavo_jax.bodies.records import without_moving
-from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.camera import Camera, require_camera
+from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError, GavoWarning, partial_of
 from gavo_jax.image.numbers import grey_bytes
@@ -139,9 +139,10 @@ class MapBuilder:
             farthest: depth beyond is left out, metres.
 
         Raises:
-            GavoError: an absurd voxel, or Open3D cannot be imported.
+            GavoError: what is no camera, an absurd voxel, or Open3D cannot be imported.
         """
         check_voxel(voxel)
+        require_camera(camera)
         self._recorded = camera
         self.camera, self.voxel, self.farthest = camera.rectified(), voxel, farthest
         self._open3d = import_open3d("map")
@@ -317,9 +318,10 @@ def build_map(
         on_frame: called for each frame.
 
     Raises:
-        GavoError: another shape, an absurd voxel, or Open3D cannot be imported.
+        GavoError: what is no sequence, another shape, an absurd voxel, or Open3D cannot be imported.
     """
     check_shape(shape)
+    require_sequence(sequence)
     frames, steps = AsTracked(sequence), list(steps)
     corrected = _PosesInOrder(trajectory, float(sequence.timestamps[0]))
     places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]

@@ -85,6 +85,8 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     Raises:
         GavoError: It cannot be written, or holds somebody else's code.
     """
+    if not isinstance(settings, Settings):
+        raise GavoError(f"{path}: Settings are needed, not {type(settings).__name__}")
     known = {type(presets.preset(name).solver): name for name in presets.usable_methods()}
     if type(settings.solver) not in known:
         raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")

@@ -63,6 +63,13 @@ def test_absurd_voxels_are_refused(voxel: Any) -> None:
         check_voxel(voxel)
 
 
+def test_a_map_of_something_else_is_refused() -> None:
+    with pytest.raises(GavoError, match="a Camera is needed, not str"):
+        MapBuilder("fr1")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="a Sequence is needed, not NoneType"):
+        build_map(None, ())  # pyright: ignore[reportArgumentType]
+
+
 def test_without_open3d_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(GavoError, match=r"install 'gavo-jax\[map\]'"):

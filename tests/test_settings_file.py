@@ -141,6 +141,13 @@ def test_every_preset_comes_back_from_its_file(method, name, tmp_path):
     assert load_settings(tmp_path / "config.json") == (method, name, settings)
 
 
+@pytest.mark.parametrize("other", [None, "fast", presets.preset("ga").solver])
+def test_what_are_no_settings_is_not_written(tmp_path, other):
+    with pytest.raises(GavoError, match=rf"s\.toml: Settings are needed, not {type(other).__name__}"):
+        save_settings(tmp_path / "s.toml", other)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [

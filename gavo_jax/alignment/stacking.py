@@ -103,6 +103,8 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         GavoError: They are none, too small, or not of the camera's size.
     """
     require_camera(camera)
+    if not hasattr(side, "__len__"):
+        raise GavoError(f"lists of frames are needed, or pairs of arrays, not {type(side).__name__}")
     is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
     if not len(side[0] if is_stacked else side):
         raise GavoError("a batch of no frames: at least one pair is needed")

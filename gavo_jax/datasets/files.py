@@ -21,7 +21,7 @@ from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.films import file_of, film_of, read_frame
 from gavo_jax.datasets.images import read_bytes, read_color, read_depth
 from gavo_jax.datasets.truth import icl_truth
-from gavo_jax.errors import GavoError, read_json_object, read_text
+from gavo_jax.errors import GavoError, as_number, read_json_object, read_text
 from gavo_jax.image.numbers import Depth
 from gavo_jax.trajectory import Trajectory
 
@@ -52,6 +52,15 @@ class Reading:
     max_difference: float = 0.02
     color_topic: str | None = None
     depth_topic: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are none, or not above 0."""
+        for name in ("depth_scale", "rate", "max_difference"):
+            value = getattr(self, name)
+            if value is None and name != "max_difference":
+                continue
+            if not as_number(f"Reading: {name}", value) > 0:
+                raise GavoError(f"Reading: {name}: must be above 0, not {value}")
 
     @property
     def is_auto(self) -> bool:

@@ -153,7 +153,9 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
     Raises:
         GavoError: there is nothing, nothing that is known, or the source is faulty.
     """
-    path, reading = Path(path), reading or Reading()
+    path, reading = Path(path), Reading() if reading is None else reading
+    if not isinstance(reading, Reading):
+        raise GavoError(f"a Reading is needed, not {type(reading).__name__}: gavo.Reading(camera=…)")
     try:
         exists = path.exists()
     except (OSError, ValueError) as error:

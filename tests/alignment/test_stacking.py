@@ -35,6 +35,8 @@ def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> 
     frame = small_frames[0]
     with pytest.raises(GavoError, match="pair \\(grey, depth\\), not ndarray"):
         align(frame.grey, frame.depth, CAMERA, NEWTON)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(GavoError, match="lists of frames are needed, or pairs of arrays, not NoneType"):
+        align_batch(None, None, CAMERA, NEWTON)
     with pytest.raises(GavoError, match="frame_of"):
         align((np.repeat(frame.grey[..., None], 3, axis=2), frame.depth), frame, CAMERA, NEWTON)
     with pytest.raises(GavoError, match="alignment.loss: must be a function, not 'huber'"):

@@ -51,6 +51,20 @@ def _method():
     presets.register("small-newton", NEWTON)
 
 
+@pytest.mark.parametrize(
+    ("name", "opened", "words"),
+    [
+        ("", Player, "name: a word is needed, not ''"),
+        (None, Player, "name: a word is needed, not None"),
+        ([], Player, "name: a word is needed"),
+        ("player", None, "'player': what opens it is needed, a function, not None"),
+    ],
+)
+def test_what_is_no_device_is_refused_at_once(name, opened, words):
+    with pytest.raises(GavoError, match=f"^live device: {words}|^live device {words}"):
+        register_device(name, opened)
+
+
 def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
     register_device("player", Player)

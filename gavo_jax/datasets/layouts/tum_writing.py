@@ -9,9 +9,12 @@ import cv2
 import numpy as np
 
 from gavo_jax.camera import Camera
-from gavo_jax.datasets.base import Frame, Sequence
+from gavo_jax.datasets.base import Frame, Sequence, require_sequence
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mask, write_truth
 from gavo_jax.errors import GavoError
+
+WRITTEN = ("camera", "__iter__", "name", "ground_truth")
+"""What is needed of a `Sequence`."""
 
 
 def write_tum(sequence: Sequence, folder: str | Path) -> None:
@@ -22,9 +25,11 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     folder left half written is not taken for a sequence.
 
     Raises:
-        GavoError: the folder holds a sequence already, something cannot be written, or images are not of 8 and 16 bits.
+        GavoError: it is no sequence, the folder holds one already, something cannot be written, or images are not of 8
+            and 16 bits.
         FrameError: a frame of the sequence cannot be read.
     """
+    require_sequence(sequence, WRITTEN)
     folder = Path(folder)
     if (folder / "rgb.txt").exists():
         raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from gavo_jax.datasets.live import realsense
 from gavo_jax.datasets.live.frames import LiveDevice
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 
 _devices: dict[str, Callable[[], LiveDevice]] = {realsense.NAME: realsense.RealSense}
 
@@ -15,7 +15,14 @@ def register_device(name: str, opened: Callable[[], LiveDevice]) -> None:
     Args:
         name: the word; one that is registered again gets the new device.
         opened: returns the device, ready to be read.
+
+    Raises:
+        GavoError: the name is no word, or nothing can be called.
     """
+    if not (isinstance(name, str) and name):
+        raise GavoError(f"live device: name: a word is needed, not {shown(name)}")
+    if not callable(opened):
+        raise GavoError(f"live device {name!r}: what opens it is needed, a function, not {shown(opened)}")
     _devices[name] = opened
 
 

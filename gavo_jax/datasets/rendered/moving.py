@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from gavo_jax.datasets.rendered.room import Box, Faces, Room, box_faces, build_room, shine
 from gavo_jax.datasets.rendered.textures import TEXTURES, Atlas, paint
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, blamed
 from gavo_jax.se3 import is_rigid
 from gavo_jax.trajectory import Trajectory
 
@@ -164,12 +164,13 @@ def _join(first: Atlas, second: Atlas) -> Atlas:
     return Atlas(np.concatenate(images), corner, np.concatenate([first.texel, second.texel]))
 
 
+@blamed("synthetic: bodies")
 def truths(bodies: Sequence[MovingBody], timestamps: Float[np.ndarray, " frames"]) -> tuple[BodyTruth, ...]:
     """The truth of every body at the frames' stamps.
 
     Raises:
         GavoError: what is no body, a body without parts, a part without boxes, a box that cannot be, more parts than
-            there are labels, or a path that gives something else than rigid transforms.
+            there are labels, or a path that raises, or gives something else than rigid transforms.
     """
     for body in bodies:
         if not isinstance(body, MovingBody):

@@ -935,6 +935,18 @@ def test_a_pipe_is_no_recording(tmp_path):
         open_source(tmp_path / "x.bag")
 
 
+@pytest.mark.parametrize("name", ["depth_scale", "rate", "max_difference"])
+@pytest.mark.parametrize("value", ["30", [], float("nan"), 0, -1.0, True])
+def test_a_reading_of_no_positive_number_is_refused_by_name(name, value):
+    with pytest.raises(GavoError, match=f"Reading: {name}: "):
+        Reading(**{name: value})
+
+
+def test_a_camera_in_place_of_a_reading_is_told(tmp_path):
+    with pytest.raises(GavoError, match=r"a Reading is needed, not str: gavo\.Reading\(camera=…\)"):
+        open_source(tmp_path, "fr1")  # pyright: ignore[reportArgumentType]
+
+
 class Lines:
     """A dataset of somebody else's: files that name a room's frames."""
 

@@ -389,6 +389,13 @@ def test_stamps_of_depth_and_the_lens_come_back(tmp_path):
         write_tum(Kinect(np.float32), tmp_path / "f")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize("other", [None, "fr1_xyz", [], SyntheticSequence])
+def test_what_is_no_sequence_is_not_written(tmp_path, other):
+    with pytest.raises(GavoError, match="a Sequence is needed, not"):
+        write_tum(other, tmp_path / "k")
+    assert not list(tmp_path.iterdir())
+
+
 def test_stamps_of_a_frame_a_second_are_seconds(tmp_path):
     """Their decimals are zeros: they were taken for numbers of frames."""
     write_tum(SyntheticSequence(frames=3, rate=1.0, camera=SMALL), tmp_path / "slow")
