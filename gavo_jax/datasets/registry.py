@@ -212,5 +212,8 @@ def source_around(path: Path) -> Path | None:
 
 
 def _is_source(path: Path) -> bool:
-    """Whether a source of a known kind is at a path."""
-    return _asked(path)[0] is not None
+    """Whether a source of a known kind is at a path; none is where nobody can look: behind a link in a circle, say."""
+    try:
+        return _asked(path)[0] is not None
+    except GavoError:
+        return False

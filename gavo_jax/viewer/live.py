@@ -76,7 +76,7 @@ def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
         recording: the file to save to.
 
     Raises:
-        GavoError: Rerun is not installed, or there is no screen for a window.
+        GavoError: Rerun is not installed, there is no screen for a window, or a folder in place of the file.
     """
     if mode == "none":
         return NO_VIEWER
@@ -84,6 +84,8 @@ def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
         raise GavoError(f"--viewer {mode}: rerun is not installed: pip install 'gavo-jax[viewer]'")
     if mode == "spawn" and not _has_screen():
         raise GavoError("--viewer spawn: no screen here: use --viewer web or --viewer save")
+    if mode == "save" and recording.is_dir():
+        raise GavoError(f"{recording}: cannot be written: a folder lies there")
     return RerunViewer(mode, recording)
 
 

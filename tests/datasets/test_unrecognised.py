@@ -75,6 +75,13 @@ def test_sources_nearby_are_named(tmp_path: Path) -> None:
         open_source(made(scene / "seq-01", "more/notes.md") / "more")
 
 
+def test_a_link_in_a_circle_is_passed_over(tmp_path: Path) -> None:
+    folder = made(tmp_path / "there", "notes.md", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
+    (folder / "circle").symlink_to("circle")
+    with pytest.raises(GavoError, match="no source itself, but a folder of one: name seq-01"):
+        open_source(folder)
+
+
 def test_the_last_guess_always_has_words(tmp_path: Path) -> None:
     place = unrecognised.Place(tmp_path, [], "", lambda _: False)
     assert unrecognised.GUESSES[-1](place)

@@ -342,6 +342,12 @@ def test_missing_package_and_missing_screen_are_said(tmp_path, monkeypatch):
         live.make_viewer("save", tmp_path / "run.rrd")
 
 
+def test_a_folder_where_the_recording_belongs_is_told_before_the_run(tmp_path):
+    (tmp_path / "run.rrd").mkdir()
+    with pytest.raises(GavoError, match=r"run\.rrd: cannot be written: a folder lies there"):
+        live.make_viewer("save", tmp_path / "run.rrd")
+
+
 def test_a_window_that_does_not_open_is_said_in_one_line(tmp_path, forty_frames, run):
     del run  # has compiled what the command starts
     save_settings(tmp_path / "settings.toml", GENETIC)
