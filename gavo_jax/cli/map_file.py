@@ -1,5 +1,6 @@
 """`gavo run --map`: the map as a file; what cannot be is refused before the run starts."""
 
+import os
 from pathlib import Path
 
 from gavo_jax.cli.options import Run
@@ -17,8 +18,8 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
     """Refuse a map that cannot be made or written; return what it is to be.
 
     Raises:
-        GavoError: an unknown ending, no folder for it, one in its place, an absurd voxel, options of a map without
-            one, or Open3D cannot be imported.
+        GavoError: an unknown ending, no folder for it or one that is closed, a folder in its place, an absurd voxel,
+            options of a map without one, or Open3D cannot be imported.
     """
     check_voxel(voxel)
     if path is None:
@@ -29,6 +30,8 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
     shape = check_map(path, shape)
     if not path.absolute().parent.is_dir():
         raise GavoError(f"{path}: no such folder: {path.parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise GavoError(f"{path}: cannot be written: the folder is closed to you")
     if path.is_dir():
         raise GavoError(f"{path}: a folder: name a file for the map")
     import_open3d("map")

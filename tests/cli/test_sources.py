@@ -121,6 +121,13 @@ def test_a_folder_in_the_place_of_a_file_is_refused_before_the_run(gavo, clip):
     assert is_refused(gavo("calibrate", clip), "camera.toml: a folder") and not Path("out").exists()
 
 
+def test_a_folder_that_is_closed_to_the_map_is_told_before_the_run(gavo, clip, monkeypatch):
+    Path("closed").mkdir()
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != "closed")  # all folders are open to root
+    refused = gavo("run", clip, *FAST, "--map", "closed/map.ply", "--output", "out")
+    assert is_refused(refused, "closed/map.ply: cannot be written") and not Path("out").exists()
+
+
 def test_calibrate_replaces_no_camera_file_that_nobody_named(gavo, clip, monkeypatch):
     """In the folder of a sequence that file may be the dataset's own."""
     monkeypatch.chdir(clip)
