@@ -12,7 +12,7 @@ import pytest
 from small import NEWTON
 
 from gavo_jax.alignment.visits import prepare_target
-from gavo_jax.bodies.consensus import ask_area
+from gavo_jax.bodies.consensus import Blocks, _whitened, ask_area, gain_of_its_own, weighted_median
 from gavo_jax.bodies.evidence import View, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.layouts.tum import TumSequence
@@ -71,6 +71,28 @@ def test_the_area_asks_for_the_scene_and_names_what_dissents(room: SyntheticSequ
     body = room.body_labels(0)[::factor, ::factor] > 0
     dissenting = np.asarray(right.dissenting)
     assert dissenting[body].mean() > 3 * dissenting[~body].mean()
+
+
+def test_the_median_by_weight_is_that_of_sorted_values() -> None:
+    generator = np.random.default_rng(0)
+    for values in (generator.exponential(size=301), generator.integers(0, 4, 300), 1e30 * generator.uniform(size=7)):
+        weights = np.where(generator.uniform(size=len(values)) < 0.2, 0.0, generator.uniform(size=len(values)))
+        order = np.argsort(values)
+        half = np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())
+        found = weighted_median(jnp.asarray(values, jnp.float32), jnp.asarray(weights, jnp.float32))
+        assert float(found) == np.float32(values[order][half])
+
+
+def test_what_a_block_would_gain_is_its_pull_in_units_of_its_hessian() -> None:
+    generator = np.random.default_rng(0)
+    roots, gradient = generator.normal(size=(9, 6, 6)), generator.normal(size=(9, 6))
+    hessian, delta = roots @ roots.transpose(0, 2, 1) + np.eye(6), generator.normal(size=6)
+    pull = hessian @ delta + gradient
+    right = jnp.asarray(np.concatenate([hessian, gradient[..., None]], axis=-1), jnp.float32)
+    whitened = _whitened(jnp.asarray(hessian, jnp.float32), right)
+    blocks = Blocks(hessian=right[..., :6], gradient=right[..., 6], whitened=whitened, credit=jnp.ones(9))
+    gains = gain_of_its_own(blocks, jnp.asarray(delta, jnp.float32))
+    np.testing.assert_allclose(gains, np.einsum("bi,bij,bj->b", pull, np.linalg.inv(hessian), pull), rtol=1e-4)
 
 
 def test_the_camera_is_not_taken_along(room: SyntheticSequence) -> None:
