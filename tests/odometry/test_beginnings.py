@@ -13,7 +13,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA
 from gavo_jax.odometry.aligners import Attempt
-from gavo_jax.odometry.beginnings import PROVEN_AFTER, Beginning, begun, followed, revised_by
+from gavo_jax.odometry.beginnings import PROVEN_AFTER, SURVIVED, Beginning, begun, followed, revised_by
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.tracking import Clock
@@ -23,10 +23,10 @@ RATE = 30.0
 CAMERA = DEFAULT_CAMERA.level(2)
 
 
-def track(before: Beginning | None, frames: int, stamp: float = 0.0) -> Beginning | None:
-    """So many frames of a video in which nothing is seen to move."""
+def track(before: Beginning | None, frames: int, stamp: float = 0.0, share: float = 0.0) -> Beginning | None:
+    """So many frames of a video in which bodies have some share of the image."""
     stamps = [stamp + (k + 1) / RATE for k in range(frames)]
-    return reduce(lambda track, stamp: followed(track, stamp, 0.0, is_reference=True), stamps, before)
+    return reduce(lambda track, stamp: followed(track, stamp, share, is_reference=True), stamps, before)
 
 
 def test_what_moves_behind_a_break_was_followed_before_it() -> None:
@@ -45,8 +45,19 @@ def test_a_long_track_of_a_still_world_is_the_scene() -> None:
 
 
 def test_where_bodies_are_known_the_camera_is_told_from_them() -> None:
-    known = followed(track(begun(None, 0.0), 3), 0.2, 0.05, is_reference=True)
-    assert known is None and followed(None, 0.3, 0.0, is_reference=True) is None
+    still = track(begun(None, 0.0), 3)
+    assert track(still, int(SURVIVED * RATE) + 2, 0.1, share=0.05) is None
+    assert followed(None, 0.3, 0.0, is_reference=True) is None
+
+
+def test_what_comes_to_move_just_before_a_break_was_not_followed_before() -> None:
+    """A card that filled the image left it: a tenth moved for two frames, then the track broke; nine pairs were ok."""
+    leaving = track(track(begun(None, 0.0), 9), 2, 0.3, share=0.1)
+    assert revised_by(leaving, 0.2) == 0
+    broken = begun(begun(leaving, 0.5), 0.6)
+    assert revised_by(broken, 0.2) == 13
+    again = begun(track(broken, 4, 0.6), 0.9)
+    assert revised_by(again, 0.2) == 0 and revised_by(again, 0.5) == 5  # what was told is told no more
 
 
 class Covered(StandIn):
