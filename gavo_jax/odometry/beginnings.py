@@ -1,9 +1,9 @@
 """Whose motion a run has followed since its beginning, or since it was broken.
 
 A body that fills the image is taken for the scene: nothing moves against it. It shows only when it leaves. Then the
-track breaks. Nothing had been seen to move before; now a large part of the first pair behind the break moves on its own,
-or something came to move just before the break: the scene, seen from the body. So the body was what the pairs before the
-break had followed.
+track breaks. Nothing had been seen to move before; now a large part of the first pair behind the break moves on its
+own, or something came to move just before the break: the scene, seen from the body. So the body was what the pairs
+before the break had followed.
 """
 
 from typing import NamedTuple
