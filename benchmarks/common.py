@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -196,17 +197,19 @@ def preset_contender(name: str, settings: Settings) -> Contender:
 
 
 def preset_of(name: str) -> Settings:
-    """The settings of METHOD or METHOD:PRESET.
+    """The settings of METHOD, METHOD:PRESET or METHOD:PRESET:BODIES, where BODIES is what `--bodies` takes.
 
     Raises:
-        GavoError: unknown method or preset.
+        GavoError: unknown method or preset, or no such way with bodies.
     """
-    method, _, preset = name.partition(":")
-    return presets.preset(method, preset or "default")
+    method, _, rest = name.partition(":")
+    preset, _, bodies = rest.partition(":")
+    settings = presets.preset(method, preset or "default")
+    return replace(settings, odometry=replace(settings.odometry, bodies=bodies)) if bodies else settings
 
 
 def parse_methods(text: str) -> list[Contender]:
-    """The contenders of a list like `ga,ga:fast,opencv-rgb`: METHOD, METHOD:PRESET or the name of a peer.
+    """The contenders of a list like `ga,ga:fast,opencv-rgb`: what `preset_of` takes, or the name of a peer.
 
     Raises:
         GavoError: unknown method, preset or peer.

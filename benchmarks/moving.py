@@ -112,15 +112,11 @@ def with_bodies(settings: Settings, mode: str | None) -> Settings:
     """Settings that treat bodies by a mode, those that are told by none; None leaves them as they are.
 
     Raises:
-        GavoError: these settings know no such thing.
+        GavoError: no such mode.
     """
     if mode is None:
         return settings
-    for part in ("odometry", "alignment"):
-        options = getattr(settings, part)
-        if hasattr(options, "bodies"):
-            return replace(settings, **{part: replace(options, bodies="off" if mode == TOLD else mode)})
-    raise GavoError("--bodies: the settings know no bodies")
+    return replace(settings, odometry=replace(settings.odometry, bodies="off" if mode == TOLD else mode))
 
 
 @dataclass(eq=False)
