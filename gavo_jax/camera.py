@@ -80,7 +80,7 @@ class Camera:
         Raises:
             GavoError: the name is none of these.
         """
-        if name not in PRESETS:
+        if not isinstance(name, str) or name not in PRESETS:
             raise GavoError(f"unknown camera {name!r}: not one of {', '.join(PRESETS)}")
         return PRESETS[name]
 

@@ -187,7 +187,7 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
     Raises:
         GavoError: An unknown method or preset, or a method of a package that cannot be loaded.
     """
-    if method not in methods():
+    if not isinstance(method, str) or method not in methods():
         raise GavoError(f"unknown method {method!r}: not one of {', '.join(usable_methods())}")
     if method in _registered:
         if name != "default":
@@ -195,6 +195,8 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
         return _registered[method]
     if method not in METHODS:
         raise GavoError(faulty_plugins()[method])
+    if not isinstance(name, str) or name not in PRESETS:
+        raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")
     return _own(method, name)
 
 
@@ -219,7 +221,7 @@ def are_same(one: Settings, other: Settings) -> bool:
 
 
 def _own(method: str, name: str) -> Settings:
-    """The settings of one of `METHODS`."""
+    """The settings of one of `METHODS` by one of `PRESETS`."""
     if name == "paper":
         return Settings(
             _paper_solver(method),
@@ -238,6 +240,4 @@ def _own(method: str, name: str) -> Settings:
         return Settings(_DEFAULT[method], AlignmentOptions(), OdometryOptions())
     if name == "fast":
         return Settings(_FAST[method], AlignmentOptions(points=_FAST_POINTS), OdometryOptions())
-    if name == "wide":
-        return Settings(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())
-    raise GavoError(f"unknown preset {name!r}: not one of {', '.join(PRESETS)}")
+    return Settings(_WIDE[method], WIDE_OBJECTIVE, OdometryOptions())

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gavo_jax import presets
+from gavo_jax.camera import Camera
 from gavo_jax.errors import GavoError
 from gavo_jax.image.pyramid import LEVELS
 from gavo_jax.settings import Settings
@@ -98,6 +100,16 @@ def test_unknown_names_are_refused():
         presets.preset("genetic")
     with pytest.raises(GavoError, match="not one of default"):
         presets.preset("ga", "quick")
+
+
+@pytest.mark.parametrize("name", [None, [], np.eye(4), presets.preset("ga")])
+def test_what_is_no_name_is_refused(name: Any) -> None:
+    with pytest.raises(GavoError, match="unknown method"):
+        presets.preset(name)
+    with pytest.raises(GavoError, match="unknown preset"):
+        presets.preset("ga", name)
+    with pytest.raises(GavoError, match="unknown camera"):
+        Camera.preset(name)
 
 
 def test_every_preset_has_a_solver_for_all_levels():

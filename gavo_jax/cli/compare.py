@@ -231,7 +231,10 @@ def _parse_methods(text: str, preset: str) -> list[Contender]:
         if contender[1:] in [earlier[1:] for earlier in found]:
             raise GavoError(f"--methods: {label} is given twice")
         if contender.preset is not None:
-            presets.preset(method, contender.preset)
+            try:
+                presets.preset(method, contender.preset)
+            except GavoError as error:
+                raise GavoError(f"--methods: {label}: {error}") from None
         found.append(contender)
     return found
 

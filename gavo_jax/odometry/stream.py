@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified_at
+from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.settings import Settings
 from gavo_jax.solvers.base import Solver
@@ -35,12 +36,14 @@ def track(
         watch: Is shown every `Odometry.frame` with its step (None: it is the first).
 
     Raises:
-        GavoError: It is no sequence, or gives what is no frame.
+        GavoError: It is no sequence or gives what is no frame, or the driver is none.
         FrameError: The first frame cannot be read.
     """
     require_sequence(sequence)
     if odometry is None:
         odometry = Odometry(sequence.camera, settings, seed=seed)
+    elif not isinstance(odometry, Odometry):
+        raise GavoError(f"an Odometry is needed, not {type(odometry).__name__}: gavo.Odometry(camera, settings)")
 
     first = odometry.progress.last_index + 1
     for index, frame in enumerate(decoded(sequence, first), start=first):

@@ -5,12 +5,15 @@ import threading
 import tracemalloc
 import weakref
 from dataclasses import replace
+from typing import Any
 
 import jax
+import pytest
 from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, Altered, run, unreadable
 
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
+from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.stream import track
 
@@ -20,6 +23,12 @@ def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
     assert [step.index for step in result.steps] == [1, 2, 3, 4, 5]
     assert result.steps[-1].lost
     assert result.metrics["frames"] == 6 and not result.metrics["complete"]
+
+
+def test_what_is_no_driver_is_refused(sequence: SyntheticSequence) -> None:
+    driver: Any = PLAIN
+    with pytest.raises(GavoError, match=r"an Odometry is needed, not OdometryOptions: gavo\.Odometry\(camera"):
+        next(track(sequence, odometry=driver))
 
 
 def test_streams(sequence: SyntheticSequence) -> None:
