@@ -143,6 +143,16 @@ def _scannet_plus_plus(place: Place) -> str | None:
     )
 
 
+def _rays(place: Place) -> str | None:
+    rays = "have to be written into depth/, beside rgb/, as z = length / sqrt(1 + x^2 + y^2)"
+    names = {child.name for child in place.inside}
+    if {"photo", "depth", "instance"} <= names:
+        return f"depth/: SceneNet RGB-D's are lengths of rays, which {rays}; link photo/ as rgb/"
+    if (found := next((name for name in sorted(names) if name.startswith("distance_to_camera")), None)) is None:
+        return None
+    return f"{found[:60]}: Replicator's lengths of rays: write distance_to_image_plane there, or they {rays}"
+
+
 def _mid_air(place: Place) -> str | None:
     if not any((place.path / "color_left").glob("trajectory_*")):
         return None
@@ -181,6 +191,7 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _nyu,
     _spectacular,
     _scannet_plus_plus,
+    _rays,
     _mid_air,
     _recording,
     _part_of_source,

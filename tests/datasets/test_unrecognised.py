@@ -40,6 +40,12 @@ def made(folder: Path, *names: str) -> Path:
             tuple(f"{kind}/trajectory_0000/000000.x" for kind in ("color_left", "depth", "stereo_disparity")),
             r"Mid-Air, whose PNG hold floats of 16 bits: .* 512 / disparity",
         ),
+        (("rgb/rgb_0000.png", "distance_to_camera/distance_to_camera_0000.npy"), "distance_to_camera: .* of rays"),
+        (
+            ("rgb_0000.png", "distance_to_camera_0000.npy"),
+            r"distance_to_camera_0000\.npy: Replicator's lengths of",
+        ),
+        (("photo/0.jpg", "depth/0.png", "instance/0.png"), "depth/: SceneNet RGB-D's are lengths of rays"),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),

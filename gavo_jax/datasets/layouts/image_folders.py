@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gavo_jax.datasets.films import FILMS, frames_of
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.names import images_among
+from gavo_jax.datasets.names import form, images_among
 
 COLOR_FOLDERS = (
     *("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide"),
@@ -13,11 +13,11 @@ COLOR_FOLDERS = (
 )
 DEPTH_FOLDERS = (
     *("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth"),
-    *("depth_images", "depth_raw", "depth_rect"),
+    *("depth_images", "depth_raw", "depth_rect", "depth_map", "depth_maps", "distance_to_image_plane"),
 )
 """The first one counts, after those whose names say that they are registered, see `_is_registered`."""
 
-REGISTERED = {"aligned", "align", "registered", "to"}
+REGISTERED = {"aligned", "align", "registered", "transformed", "to"}
 """Words of which one stands in the name of a folder of depth that is registered to colour: beside such a one, another
 is that of its own camera."""
 
@@ -31,11 +31,18 @@ PLAIN_WORDS = {"image", "images", "raw"}
 PAIR = re.compile(r"(.*)(?<![a-z])(?:colou?r|rgb)(?![a-z])(.*)")
 """A folder of colour named as its scene is, as Redwood has it, or its camera; depth's has the same around its word."""
 
-DEPTH_WORD = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
-"""In the names of depth images that lie beside colour, as a part of its own, where some have it so."""
+DEPTH_WORD = re.compile(r"(?<![a-z])(?:depth|distance_to_image_plane)(?![a-z])", re.IGNORECASE)
+"""In the names of depth images that lie beside colour, as a part of its own, where some have it so; the latter is of
+Isaac Sim's Replicator."""
 
 NO_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?r(?:ed)?)(?![a-z])")
 """In the names of folders of what is made of depth, or said of it."""
+
+OF_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?)(?![a-z])", re.IGNORECASE)
+"""The same in the names of files beside which depth itself lies."""
+
+DEPTH_PART = re.compile(r"([-_. ]?)depth([-_. ]?)", re.IGNORECASE)
+"""What depth's name has more than that of its colour image, where colour's has no word of its own."""
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img", "left", r"^\d+\.")
 """In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
@@ -136,10 +143,18 @@ def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     if depth is not None and (film := _film_beside(path)) is not None:
         return frames_of(film), images_among(depth.glob("*"), DEPTH_SUFFIXES)
     files = list(path.glob("*"))
-    depths = _with_depth(images_among(files, DEPTH_SUFFIXES))
+    named_depth = _with_depth(images_among(files, DEPTH_SUFFIXES))
+    depths = [file for file in named_depth if not OF_DEPTH.search(file.name)] or named_depth
     others = sorted(set(images_among(files, COLOR_SUFFIXES)) - set(_with_depth(images_among(files, ALL_SUFFIXES))))
     named = ([file for file in others if re.search(word, file.name, re.IGNORECASE)] for word in COLOR_WORDS)
-    return next(filter(None, named), []), depths
+    return next(filter(None, named), _partners(others, depths)), depths
+
+
+def _partners(files: list[Path], depths: list[Path]) -> list[Path]:
+    """Files named as depth is but for its word, `desk_1.png` beside `desk_1_depth.png`, and others of their form."""
+    stems = {DEPTH_PART.sub(kept, file.stem) for file in depths for kept in ("", r"\1", r"\2")}
+    forms = {form(file.stem) for file in files if file.stem in stems}
+    return [file for file in files if form(file.stem) in forms]
 
 
 def _with_depth(files: list[Path]) -> list[Path]:
