@@ -35,6 +35,9 @@ FINER = 2
 METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 30.0), (300.0, 60000.0)
 """Median depth of a file of floats that is taken as one of metres, or of millimetres; between them lie centimetres."""
 
+Z_BUFFER = 0.9
+"""Floats that all lie from here to 1 are what a renderer keeps to tell what is in front: 1 - near / z, nearly."""
+
 STATED_MEDIANS = (0.05, 60.0)
 """Metres: a median depth that confirms the unit that a camera file says."""
 
@@ -114,6 +117,11 @@ def _states_unit(calibration: Calibration) -> bool:
 def _likely_unit(readings: Float[np.ndarray, " n"], calibration: Calibration, name: str) -> float:
     """The unit that readings are probably in; `name` is of a file, for messages."""
     is_stated, median = _states_unit(calibration), float(np.median(readings)) if readings.size else METRES
+    if not is_stated and readings.size and Z_BUFFER < readings.min() < readings.max() <= 1:
+        raise GavoError(
+            f"{name}: depth of {readings.min():.3g} to {readings.max():.3g}: a z-buffer, it seems, which counts no "
+            "distance: write near far / (far - (far - near) depth); say --depth-scale 1 if it is in metres"
+        )
     if not is_stated and readings.size and readings.min() < readings.max() == 1:
         raise GavoError(
             f"{name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "

@@ -280,6 +280,17 @@ def test_floats_that_were_scaled_to_the_farthest_are_refused(tmp_path, color_fil
     assert np.abs(sequence[0].depth / sequence.camera.depth_scale - METRES).max() < 1e-3
 
 
+@pytest.mark.parametrize("far", [10.0, float(METRES.max())])
+def test_a_buffer_of_a_renderer_is_refused(tmp_path, color_file, far):
+    """As OpenGL keeps depth, of PyBullet and MuJoCo: it was taken for metres, of a wall at one."""
+    near = np.float32(0.02)
+    buffer = write(tmp_path / "depth.npy", ((far - near * far / METRES) / (far - near)).astype(np.float32))
+    silent = Calibration(CAMERA, states_depth_scale=False)
+    with pytest.raises(GavoError, match=r"depth.npy: depth of 0\.9.* to .*: a z-buffer, .* say --depth-scale 1 if"):
+        open_pair([(color_file, buffer)], silent)[0]
+    assert open_pair([(color_file, buffer)], silent, Reading(depth_scale=1.0))[0].depth.any()
+
+
 def test_far_floats_get_a_coarser_unit(tmp_path, color_file):
     frame, camera = read(color_file, write(tmp_path / "depth.npy", METRES * 8))
     assert camera.depth_scale == 1000
