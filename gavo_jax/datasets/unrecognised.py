@@ -12,6 +12,8 @@ from gavo_jax.datasets.layouts.image_folders import (
     missing_folder,
     missing_images,
     missing_word,
+    plain_files,
+    several_pairs,
 )
 
 PACKED = {
@@ -39,6 +41,25 @@ RECORDINGS = {
     ".klg": "a log of ElasticFusion's logger: write its images and depth first",
 }
 """What holds a source in a form of its maker's alone."""
+
+ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as .npy of one frame each"
+
+PACKED_ARRAYS = {
+    **dict.fromkeys((".hdf5", ".h5"), f"arrays in HDF5: {ARRAYS} (h5py)"),
+    ".mat": f"arrays of MATLAB: {ARRAYS} (scipy.io.loadmat, or h5py from version 7.3 on)",
+    **dict.fromkeys((".npz", ".npy", ".pkl"), f"arrays of Python: {ARRAYS}"),
+    **dict.fromkeys((".parquet", ".arrow", ".tfrecord"), f"a table: {ARRAYS}"),
+    ".raw": f"images without a head: {ARRAYS}; of rs-convert name the .bag that it has read",
+    ".rrd": f"a recording of Rerun: {ARRAYS}",
+}
+"""What holds images in a form that is no image's and no recording's."""
+
+MODELS = (".ply", ".pcd", ".obj", ".glb", ".usdz", ".e57", ".las")
+"""Endings of files of points or surfaces."""
+
+MODEL = "a model or a cloud of points, without the images that it was made of"
+
+DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 
 WHAT_OF = re.compile(r"^(?:drive|export|recording|scan|scene) of ")
 """What the names of kinds begin with, and lists of all of them leave out."""
@@ -90,6 +111,17 @@ def _lone_file(place: Place) -> str | None:
 
 def _nothing(place: Place) -> str | None:
     return None if place.inside else f"an empty folder, not one of: {place.kinds}"
+
+
+def _frames_apart(place: Place) -> str | None:
+    """Of a folder for each frame, as SUN RGB-D has it."""
+    folders = [child for child in place.inside if child.is_dir() and not child.name.startswith(".")]
+    if len(folders) < 2 or any(tuple(map(len, plain_files(folder))) != (1, 1) for folder in folders):
+        return None
+    return (
+        f"{len(folders)} folders of one frame each, as {folders[0].name[:60]}: if they are of one recording, link "
+        "their images into rgb/ and depth/, by the numbers of the folders"
+    )
 
 
 def _sources(place: Place) -> str | None:
@@ -163,8 +195,19 @@ def _mid_air(place: Place) -> str | None:
 
 
 def _recording(place: Place) -> str | None:
-    film = next((child for child in place.inside if child.suffix.lower() in (*FILMS, *RECORDINGS)), None)
-    return None if film is None else f"{film.name}: {_in_file(film)}"
+    known = (*FILMS, *RECORDINGS, *PACKED)
+    found = next((child for child in place.inside if child.is_file() and child.suffix.lower() in known), None)
+    return None if found is None else f"{found.name[:60]}: {_in_file(found)}"
+
+
+def _record_3d(place: Place) -> str | None:
+    is_unzipped = (place.path / "rgbd").is_dir() and (place.path / "metadata").is_file()
+    return f"unzipped, {RECORDINGS['.r3d']}" if is_unzipped else None
+
+
+def _le_robot(place: Place) -> str | None:
+    is_one = (place.path / "meta" / "info.json").is_file() and (place.path / "data").is_dir()
+    return f"a dataset of LeRobot, of films and tables: of one episode {ARRAYS}" if is_one else None
 
 
 def _part_of_source(place: Place) -> str | None:
@@ -174,8 +217,11 @@ def _part_of_source(place: Place) -> str | None:
 
 def _folder(place: Place) -> str:
     there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in place.inside])}"
-    if (words := missing_folder(place.path) or missing_word(place.path)) is not None:
+    if (words := missing_folder(place.path) or missing_word(place.path) or several_pairs(place.path)) is not None:
         return f"{there}, and {words}"
+    known = PACKED_ARRAYS if any(child.is_dir() for child in place.inside) else (*PACKED_ARRAYS, *MODELS)
+    if (found := next((child for child in place.inside if child.suffix.lower() in known), None)) is not None:
+        return f"{there}; {found.name[:60]}: {_in_file(found)}"
     here = f"{there}: not one of: {place.kinds}"
     if not any(child.is_dir() for child in place.inside):
         return here
@@ -185,6 +231,7 @@ def _folder(place: Place) -> str:
 GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _lone_file,
     _nothing,
+    _frames_apart,
     _sources,
     _images_missing,
     _stereo,
@@ -193,6 +240,8 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _scannet_plus_plus,
     _rays,
     _mid_air,
+    _record_3d,
+    _le_robot,
     _recording,
     _part_of_source,
     _folder,
@@ -205,12 +254,19 @@ def _in_file(file: Path) -> str | None:
     before, last = ["", "", *(suffix.lower() for suffix in file.suffixes)][-2:]
     if (before, last) == (".bag", ".active"):
         return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+    if last in FILMS and DEPTH_IN_NAME.search(file.name):
+        return (
+            "a film of depth: where it has 16 bits, write its frames as images into depth/, beside rgb.mp4 or rgb/ "
+            "(ffmpeg -i FILM -start_number 0 depth/%06d.png); one of 8 bits is a picture of depth, and of no use"
+        )
     if last in RECORDINGS:
         return RECORDINGS[last]
     if last in FILMS:
         return (
             "a film: write its frames as images, into rgb/ beside depth/ (ffmpeg -i FILM -start_number 0 rgb/%06d.png)"
         )
+    if last in PACKED_ARRAYS or last in MODELS:
+        return PACKED_ARRAYS.get(last, MODEL)
     how = PACKED.get(last)
     return f"packed: unpack it first ({'tar -xf' if before == '.tar' else how})" if how else None
 

@@ -46,6 +46,23 @@ def made(folder: Path, *names: str) -> Path:
             r"distance_to_camera_0000\.npy: Replicator's lengths of",
         ),
         (("photo/0.jpg", "depth/0.png", "instance/0.png"), "depth/: SceneNet RGB-D's are lengths of rays"),
+        (("color.zip", "depth.zip"), r"color\.zip: packed: unpack it first \(unzip\)"),
+        (("rgb/0.png", "depth.tar.gz"), r"depth\.tar\.gz: packed: unpack it first \(tar -xf\)"),
+        (("rgb.mp4", "depth.mkv"), r"depth\.mkv: a film of depth: where it has 16 bits, write its frames as images"),
+        (("demo.hdf5", "model/"), r"; demo\.hdf5: arrays in HDF5: write its colour and depth as images"),
+        (("scan.ply", "notes.md"), r"; scan\.ply: a model or a cloud of points, without the images"),
+        (("scan.ply", "parts/"), "colour is looked for in "),
+        (("out_Color_1.5.raw", "out_Depth_1.5.raw"), r"1\.5\.raw: images without a head: .* name the \.bag"),
+        (("metadata", "rgbd/0.jpg", "rgbd/0.depth"), r"unzipped, a recording of Record3D: export it"),
+        (("meta/info.json", "data/chunk-000/", "videos/"), "a dataset of LeRobot, of films and tables: of one"),
+        (
+            tuple(f"{i:04}/{kind}.png" for i in range(3) for kind in ("color", "depth")),
+            "3 folders of one frame each, as 0000: if they are of one recording, link their images into rgb/",
+        ),
+        (
+            tuple(f"{camera}_{kind}/0.png" for camera in ("front", "wrist") for kind in ("rgb", "depth", "mask")),
+            r"2 folders of colour have one of depth beside them \(front_rgb, wrist_rgb\): link those of one as rgb/",
+        ),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
@@ -62,7 +79,15 @@ def test_a_folder_is_described(tmp_path: Path, names: tuple[str, ...], words: st
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("walk.bag.active", "was never closed"), ("walk.txt", "a file of 1 bytes, not one of: ")]
+    ("name", "words"),
+    [
+        ("walk.bag.active", "was never closed"),
+        ("walk.txt", "a file of 1 bytes, not one of: "),
+        ("nyu_depth_v2_labeled.mat", r"labeled\.mat: arrays of MATLAB: write its colour and depth as images into rgb/"),
+        ("walk.npz", r"walk\.npz: arrays of Python: write its colour and depth"),
+        ("walk.parquet", r"walk\.parquet: a table: write its colour and depth"),
+        ("walk.USDZ", r"walk\.USDZ: a model or a cloud of points"),
+    ],
 )
 def test_a_file_is_described(tmp_path: Path, name: str, words: str) -> None:
     with pytest.raises(GavoError, match=words):

@@ -71,14 +71,30 @@ def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _named_alike(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
-    """The same, of the one scene or camera that the names of both speak of; depth's may say more at its end."""
+    """The same, of the one scene or camera that the names of both speak of."""
+    found = _pairs(children)
+    return found[0] if len(found) == 1 else ([], [])
+
+
+def _pairs(children: dict[str, Path]) -> list[tuple[list[Path], list[Path]]]:
+    """A folder of colour and those of depth beside it, of each scene or camera; depth's may say more at its end."""
     matches = [match for name in children if (match := PAIR.fullmatch(name))]
-    found = [
+    return [
         ([children[match[0]]], depth)
         for match in matches
         if (depth := [children[name] for name in children if _is_depth_beside(match, name)])
     ]
-    return found[0] if len(found) == 1 else ([], [])
+
+
+def several_pairs(path: Path) -> str | None:
+    """Which folders of colour have depth beside them, where several have and none goes before the others."""
+    pairs = _pairs({child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()})
+    if len(pairs) < 2:
+        return None
+    names = ", ".join(color.name[:60] for (color, *_), _ in pairs[:3]) + ", …" * (len(pairs) > 3)
+    return (
+        f"{len(pairs)} folders of colour have one of depth beside them ({names}): link those of one as rgb/ and depth/"
+    )
 
 
 def _is_depth_beside(color: re.Match[str], name: str) -> bool:

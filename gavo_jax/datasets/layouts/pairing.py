@@ -161,7 +161,10 @@ def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Se
     numbers = sorted(found.color.keys() & found.depth.keys())
     if not numbers:
         counts = f"{len(color)} colour and {len(depth)} depth images"
-        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
+        lone = (
+            ": a frame is a file of each kind, with its number in their names" if len(color) == len(depth) == 1 else ""
+        )
+        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number{lone}")
     times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
     entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
     return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)

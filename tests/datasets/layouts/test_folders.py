@@ -189,7 +189,9 @@ def test_of_two_scenes_in_one_folder_none_is_taken(folder):
         shutil.copytree(folder / ("rgb" if "color" in new else "depth"), folder / new)
     shutil.rmtree(folder / "rgb")
     (folder / "depth").rename(folder / "a-depth")
-    with pytest.raises(GavoError, match="not one of"):
+    with pytest.raises(
+        GavoError, match=r"2 folders of colour have one of depth beside them \(a-color, b-color\): link"
+    ):
         open_source(folder)
     (folder / "b-depth").rename(folder / "c-depth")
     sequence = open_source(folder)

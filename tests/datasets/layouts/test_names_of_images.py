@@ -7,6 +7,7 @@ from written_folders import CAMERA, GREYS, METRES, image, raw
 
 from gavo_jax.datasets.files import FileSequence, Reading
 from gavo_jax.datasets.registry import open_source
+from gavo_jax.errors import GavoError
 
 
 def named(folder: Path, color: str, depth: str) -> FileSequence:
@@ -53,3 +54,8 @@ def test_depth_that_azure_kinect_transforms_to_colour_goes_before_its_own(tmp_pa
     sequence = named(tmp_path, "color/{}.png", "transformed_depth/{}.png")
     assert sequence[0].depth.shape == (CAMERA.height, CAMERA.width)
     assert list(sequence.left_out) == ["depth/: not read, depth is that of transformed_depth/"]
+
+
+def test_a_lone_pair_without_a_number_says_how_frames_are_named(tmp_path: Path) -> None:
+    with pytest.raises(GavoError, match=": a frame is a file of each kind, with its number in their names"):
+        named(tmp_path, "shot_Color.png", "shot_Depth.png")
