@@ -107,6 +107,11 @@ def decode_depth(data: bytes, name: str) -> Depth:
         image = image[0]
     if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
         found = _describe(image)
+        if image.dtype == np.uint8:
+            several = (
+                " or numbers packed into channels, as CARLA's: write those" if image.ndim == 3 else ": write depth"
+            )
+            found += f", a picture of depth{several} as 16 bits or floats"
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
     if image.dtype.kind in "ui" and image.max() <= NO_READING:
         return np.maximum(image, 0).astype(np.uint16)  # of 16 bits, whatever they are kept in

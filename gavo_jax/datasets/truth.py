@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
-from gavo_jax.datasets.names import FEWEST
+from gavo_jax.datasets.names import FEWEST, form
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.se3 import rigid
 from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
@@ -156,20 +156,24 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
         for entry in entries
         if entry.name not in found and (OTHER_FOLDERS if entry.is_dir() else OTHER_NAMES).fullmatch(entry.name)
     ]
-    return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [
-        f"{name}: {_how_to_name(folder / name)}" for name in others
-    ]
+    alike: dict[str, list[str]] = {}
+    for name in others:
+        alike.setdefault(form(name), []).append(name)
+    return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [_how_to_name(folder, names) for names in alike.values()]
 
 
-def _how_to_name(path: Path) -> str:
-    """What makes the truth of a file or a folder of poses."""
+def _how_to_name(folder: Path, names: list[str]) -> str:
+    """What makes the truth of a file or a folder of poses, or of a file for each frame, named alike."""
+    path, into = folder / names[0], f"write it as rows of timestamp tx ty tz qx qy qz qw into {TRUTH}"
+    if len(names) > 1:
+        return f"{names[0]} and {len(names) - 1} more: if they are the true trajectory, {into}"
     try:
         rows = data_rows(path)
     except GavoError:
         rows = []
     if path.is_dir() or (rows and len(rows[0][1]) != 8):
-        return f"if it is the true trajectory, write it as rows of timestamp tx ty tz qx qy qz qw into {TRUTH}"
-    return f"if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}"
+        return f"{path.name}: if it is the true trajectory, {into}"
+    return f"{path.name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}"
 
 
 def counted_in(trajectory: Trajectory) -> float:

@@ -263,6 +263,15 @@ def test_a_truth_by_another_name_is_told(tmp_path, layout, name):
     assert not left_out(open_source(tmp_path / "clip"))
 
 
+def test_poses_of_each_frame_are_told_in_one_line(tmp_path):
+    """As panoptic mapping's flat folders have them: a line for each of hundreds hid all other words."""
+    LAYOUTS["plain"][1](tmp_path)
+    for i in range(5):
+        (tmp_path / f"{i:06}_pose.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    (line,) = left_out(open_source(tmp_path))
+    assert line.startswith("000000_pose.txt and 4 more: if they are the true trajectory, write it as rows of")
+
+
 def test_two_trajectories_of_icl_are_refused(tmp_path):
     icl(tmp_path)
     icl(tmp_path, "livingRoom3.gt.freiburg")

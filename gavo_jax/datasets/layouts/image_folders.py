@@ -38,7 +38,7 @@ Isaac Sim's Replicator."""
 NO_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?r(?:ed)?)(?![a-z])")
 """In the names of folders of what is made of depth, or said of it."""
 
-OF_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?)(?![a-z])", re.IGNORECASE)
+OF_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?rmap)(?![a-z])", re.IGNORECASE)
 """The same in the names of files beside which depth itself lies."""
 
 DEPTH_PART = re.compile(r"([-_. ]?)depth([-_. ]?)", re.IGNORECASE)

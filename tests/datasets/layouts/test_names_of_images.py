@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from written_folders import CAMERA, GREYS, METRES, image, raw
 
@@ -48,6 +49,12 @@ def test_masks_beside_depth_are_neither(tmp_path: Path) -> None:
     assert len(sequence) == 4 and list(sequence.left_out) == ["1 colour images: no depth image of the same number"]
 
 
+def test_pictures_of_depth_beside_it_are_left_aside(tmp_path: Path) -> None:
+    for i in range(1, 5):
+        image(tmp_path / f"depth_colormap_{i}.png", np.dstack([GREYS[0]] * 3))
+    assert len(named(tmp_path, "color_image_{}.png", "depth_image_{}.png")) == 4
+
+
 def test_depth_that_azure_kinect_transforms_to_colour_goes_before_its_own(tmp_path: Path) -> None:
     for i in range(1, 5):
         image(tmp_path / f"depth/{i}.png", raw(METRES[0][::2, ::2], 1000))
@@ -59,3 +66,21 @@ def test_depth_that_azure_kinect_transforms_to_colour_goes_before_its_own(tmp_pa
 def test_a_lone_pair_without_a_number_says_how_frames_are_named(tmp_path: Path) -> None:
     with pytest.raises(GavoError, match=": a frame is a file of each kind, with its number in their names"):
         named(tmp_path, "shot_Color.png", "shot_Depth.png")
+
+
+@pytest.mark.parametrize(
+    ("channels", "words"),
+    [
+        (1, "found 1 channel of 8 bits, a picture of depth: write depth as 16 bits or floats"),
+        (
+            3,
+            "found 3 channels of 8 bits, a picture of depth or numbers packed into channels, as CARLA's: write",
+        ),
+    ],
+)
+def test_depth_of_8_bits_is_refused_with_what_it_may_be(tmp_path: Path, channels: int, words: str) -> None:
+    for i in range(4):
+        image(tmp_path / f"rgb/{i}.png", GREYS[0])
+        image(tmp_path / f"depth/{i}.png", np.stack([GREYS[0]] * channels, axis=-1))
+    with pytest.raises(GavoError, match=words):
+        open_source(tmp_path, Reading(CAMERA))[0]
