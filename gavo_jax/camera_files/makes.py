@@ -324,6 +324,8 @@ def _parse_numbers(path: Path, text: str) -> Table:
     except ValueError:
         named = re.search(r"^\s*fx\s*([:=])", text, re.MULTILINE)
         hint = f": with names, call it {'.yaml' if named[1] == ':' else '.toml'}" if named else ""
+        if re.search(r"^\s*\d+ (\w+_)?(PINHOLE|RADIAL|OPENCV|FISHEYE|FOV) \d", text, re.MULTILINE):
+            hint = ": of a line of COLMAP's write these four, cx and cy less by half a pixel"
         raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy{hint}") from None
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 

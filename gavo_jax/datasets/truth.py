@@ -142,7 +142,7 @@ def _is_without_gap(numbers: np.ndarray) -> bool:
 
 def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") -> list[str]:
     """A line for a file or folder of poses that is not read, where there is no other: it may be the true trajectory, or
-    is none.
+    is none. What a run has written into the folder of its source is passed over.
 
     Args:
         folder: of the frames.
@@ -151,10 +151,11 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
     """
     entries = [] if truth is not None else sorted(folder.iterdir())
     found = set(fnmatch.filter((entry.name for entry in entries), estimates))
+    ours = {"trajectory.txt"} if (folder / "metrics.json").is_file() else set()
     others = [
         entry.name
         for entry in entries
-        if entry.name not in found and (OTHER_FOLDERS if entry.is_dir() else OTHER_NAMES).fullmatch(entry.name)
+        if entry.name not in found | ours and (OTHER_FOLDERS if entry.is_dir() else OTHER_NAMES).fullmatch(entry.name)
     ]
     alike: dict[str, list[str]] = {}
     for name in others:

@@ -272,6 +272,15 @@ def test_poses_of_each_frame_are_told_in_one_line(tmp_path):
     assert line.startswith("000000_pose.txt and 4 more: if they are the true trajectory, write it as rows of")
 
 
+def test_what_a_run_found_is_not_proposed_as_the_truth(tmp_path):
+    """`gavo run clip --output clip` writes both; the estimate under the truth's name has no errors at all."""
+    LAYOUTS["plain"][1](tmp_path)
+    (tmp_path / "trajectory.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert len(left_out(open_source(tmp_path))) == 1
+    (tmp_path / "metrics.json").write_text("{}")
+    assert not left_out(open_source(tmp_path))
+
+
 def test_two_trajectories_of_icl_are_refused(tmp_path):
     icl(tmp_path)
     icl(tmp_path, "livingRoom3.gt.freiburg")
