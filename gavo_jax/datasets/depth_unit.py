@@ -162,14 +162,14 @@ def doubt_of_scale(sequence: FrameSequence) -> str | None:
         return None
     others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
     other = _most_usual(sample, others)
-    as_halves = _as_halves(sample)
-    if other is None and not as_halves:
+    as_bits = _as_halves(sample) or _as_shares(sample, scale)
+    if other is None and not as_bits:
         return None
     in_other = ""
     if other is not None:
         named = f"{name_of_unit(other)} (--depth-scale {other:g})"
         in_other = f"; in {named} it is {sample.median / other:.3g} m"
-    return f"a median of {sample.median / scale:.3g} m is unusual{in_other}{as_halves}"
+    return f"a median of {sample.median / scale:.3g} m is unusual{in_other}{as_bits}"
 
 
 def _as_halves(sample: DepthSample) -> str:
@@ -178,6 +178,13 @@ def _as_halves(sample: DepthSample) -> str:
         return ""
     metres = float(np.uint16(sample.median).view(np.float16))
     return f"; as bits of floats, which Mid-Air keeps in PNG, it is {metres:.3g}: write those as TIFF or .npy of floats"
+
+
+def _as_shares(sample: DepthSample, scale: float) -> str:
+    """What depth is if floats are shares of a greatest distance, as simulators have it; empty where they cannot be."""
+    if sample.is_whole or sample.far > 1 or scale != 1:
+        return ""
+    return "; floats up to 1 may be shares of a greatest distance: say --depth-scale 0.1 where 1 stands for 10 m"
 
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:

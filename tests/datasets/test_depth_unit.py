@@ -113,6 +113,16 @@ def test_a_depth_that_is_unusually_near_is_set_beside_another_unit(tmp_path, sca
     assert doubt is None if words is None else doubt and re.search(words, doubt)
 
 
+@pytest.mark.parametrize(("reach", "is_told"), [(40.0, True), (4.0, False)])
+def test_floats_that_may_be_shares_of_a_greatest_distance_are_told(tmp_path, reach, is_told):
+    """As Habitat normalises depth: it was a scene of a few centimetres, without a word but for each frame's."""
+    for i, metres in enumerate(METRES):
+        image(tmp_path / f"rgb/{i}.png", np.full((120, 160), 99, np.uint8))
+        image(tmp_path / f"depth/{i}.npy", (metres / reach).astype(np.float32))
+    doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA)))
+    assert (doubt is not None and "shares of a greatest distance: say --depth-scale 0.1 where" in doubt) == is_told
+
+
 @pytest.mark.parametrize("is_packed", [True, False])
 def test_floats_of_16_bits_in_png_are_told(tmp_path, is_packed):
     """Mid-Air keeps depth so; as millimetres it is a plausible street."""
