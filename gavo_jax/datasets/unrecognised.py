@@ -1,7 +1,8 @@
 """What lies at a path where no source is, in words that help: each guess says something, or leaves it to the next."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,6 +65,9 @@ DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 WHAT_OF = re.compile(r"^(?:drive|export|recording|scan|scene) of ")
 """What the names of kinds begin with, and lists of all of them leave out."""
 
+LOOKED_INTO = 200
+"""Folders two levels down that are looked into."""
+
 SHOWN = 5
 """Names that a message lists."""
 
@@ -115,7 +119,7 @@ def _nothing(place: Place) -> str | None:
 
 def _frames_apart(place: Place) -> str | None:
     """Of a folder for each frame, as SUN RGB-D has it."""
-    folders = [child for child in place.inside if child.is_dir() and not child.name.startswith(".")]
+    folders = list(filter(_is_open_folder, place.inside))
     if len(folders) < 2 or any(tuple(map(len, plain_files(folder))) != (1, 1) for folder in folders):
         return None
     return (
@@ -215,6 +219,24 @@ def _part_of_source(place: Place) -> str | None:
     return source and f"a folder inside a source: name the source, {source}"
 
 
+def _further_down(place: Place) -> str | None:
+    found = next((inner for inner in islice(_two_down(place), LOOKED_INTO) if place.is_source(inner)), None)
+    return found and f"no source itself, but one lies further down: name {found.relative_to(place.path)}"
+
+
+def _two_down(place: Place) -> Iterator[Path]:
+    """The folders inside those inside, hidden ones left out."""
+    for child in filter(_is_open_folder, place.inside):
+        try:
+            yield from filter(_is_open_folder, sorted(child.iterdir()))
+        except OSError:  # nobody may look
+            continue
+
+
+def _is_open_folder(path: Path) -> bool:
+    return path.is_dir() and not path.name.startswith(".")
+
+
 def _folder(place: Place) -> str:
     there = f"a folder of {_listed([child.name + '/' * child.is_dir() for child in place.inside])}"
     if (words := missing_folder(place.path) or missing_word(place.path) or several_pairs(place.path)) is not None:
@@ -244,6 +266,7 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _le_robot,
     _recording,
     _part_of_source,
+    _further_down,
     _folder,
 )
 """What may be said of a folder, in the order in which it is tried; the last one always has words."""

@@ -106,6 +106,14 @@ def test_sources_nearby_are_named(tmp_path: Path) -> None:
         open_source(made(scene / "seq-01", "more/notes.md") / "more")
 
 
+def test_a_source_further_down_is_named(tmp_path: Path) -> None:
+    """Of a dataset's root the list of all kinds said nothing."""
+    folder = made(tmp_path / "root", "notes.md", "kv1/.hidden/0.png", "kv1/sun/notes.md", "scenes/chess/rgb/0.png")
+    made(folder, "scenes/chess/depth/0.png")
+    with pytest.raises(GavoError, match="root: no source itself, but one lies further down: name scenes/chess$"):
+        open_source(folder)
+
+
 def test_a_link_in_a_circle_is_passed_over(tmp_path: Path) -> None:
     folder = made(tmp_path / "there", "notes.md", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
     (folder / "circle").symlink_to("circle")
