@@ -1,1 +1,1 @@
-"""Bodies that move on their own: what of an image the camera's motion does not explain, and how that moves."""
+"""Bodies that move on their own: which parts of an image the camera's motion does not explain, and how those move."""

@@ -1,7 +1,6 @@
-"""The camera's motion among bodies that move: several motions are kept, the image is shared out among them, one chosen.
+"""The camera's motion among moving bodies: several motions are kept, the image is shared out among them, one is chosen.
 
-`BodyAware` stands before a search. Where the motion that the search finds explains the image, and nothing was known to
-move, that is all.
+`BodyAware` wraps a search. Where the search's motion explains the image, and nothing was known to move, it stands.
 """
 
 from dataclasses import dataclass
@@ -31,47 +30,53 @@ from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import inverse
 
 DOUBTFUL = 0.1
-"""Share of what was at rest that moves, from which on a motion may not be the camera's."""
+"""Contradicted share, or lead of the prediction in support, above which the motion found may not be the camera's."""
 MAJORITY = 0.5
-"""Support from which on a motion is taken for the camera's although its points agree badly."""
+"""Support above which a motion is accepted as the camera's although its points fit badly."""
 ROUNDS = 3
-"""Most rounds of searching without what moves by the last round's motion."""
+"""Maximum number of repeated searches, each without what moves according to the one before."""
 RELUCTANT = 2.0
-"""Dissent from a motion, over that from the one which the area asks for, from which on another one is searched for."""
+"""Ratio of a motion's dissent to that from the motion which the area asks for, above which another one is searched for.
+"""
 BETTER = 1.2
-"""Dissent from a motion, over that from the one found instead, from which on the new one is taken."""
+"""Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
-"""Dissents from which on a motion may be a body's, without bodies in view and with some. Where only noise is left the
-middle block gains 5.3, the median of chi-squared with six degrees of freedom; real clips have about 9 in the middle
-pair and 17 in the worst.
+"""Dissents above which a motion may be a body's, without bodies in view and with some. With pure noise the median block
+gains 5.3, the median of chi-squared with six degrees of freedom. Real clips have about 9 in the median pair and 17 in
+the worst.
 """
 GAIN = 0.01
-"""Support that a round has to add for another one to follow."""
+"""Gain in support that a round needs for another one to follow."""
 LARGE = 0.25
-"""Share of the image that bodies cover, from which on the last motion may stand for one that cannot be found."""
+"""Share of the image covered by bodies above which the last motion may stand in for one that is not found."""
 MAX_CARRIED = 0.5
-"""Seconds for which the last motion may stand for one that cannot be found."""
+"""Longest time, in seconds, for which the last motion may stand in for one that is not found."""
 NEARLY_AS_GOOD = 0.85
-"""Support of another motion, over that of the camera's, from which on it may be the camera's as well."""
+"""Support of another motion, relative to the best one's, above which it may be the camera's as well."""
 SUSPICIOUS = 0.02
-"""Share of the image with bodies, away from where some were, from which on other motions are asked."""
+"""Share of the image with bodies, away from the last frame's bodies, above which other motions are tried."""
 SUSPECTED = 0.3
-"""Suspicion from which on a pixel's points take no part in the search."""
+"""Suspicion above which a pixel's points are left out of the search."""
 MOST_ASIDE = 0.6
-"""Share of the image that may be set aside on suspicion; where more is suspected, only what moves is set aside."""
+"""Largest share of the image that is set aside on suspicion; where more is suspected, only what moves is set aside."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
 GOES_ON = (0.01, 0.01)
-"""Least deviation, metres and radians, of a motion that goes on as before; more where the run's velocity changes so."""
+"""Least standard deviations, metres and radians, of the prior of constant velocity; larger where the run's velocity
+usually changes more.
+"""
 SURPRISE = 22.5
-"""Squared deviations between what was found and the last motion, gone on with, beyond which it did not go on:
-chi-squared with six degrees of freedom is larger once in a thousand times."""
+"""Squared Mahalanobis distance between the motion found and the prediction above which the two are not fused.
+Chi-squared with six degrees of freedom exceeds it once in a thousand times.
+"""
 FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
-"""Statuses of a motion that is worth asking about."""
+"""Statuses of a motion that may be considered as the camera's."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
-"""Findings that a body may cause by hiding what the points saw."""
+"""Findings that a body may cause by occluding points."""
 MOST = 0.9
-"""Share of the depth left in view by bodies that has to agree with a motion for `DEPTH_MISMATCH` to be excused."""
+"""Share of the image not covered or hidden by bodies whose depth has to agree with a motion for `DEPTH_MISMATCH` to be
+excused.
+"""
 
 
 class MotionCandidate(NamedTuple):
@@ -79,22 +84,22 @@ class MotionCandidate(NamedTuple):
 
     attempt: Attempt
     belief: Belief
-    """What the motion says of the last frame's pixels."""
+    """What the motion implies for the last frame's pixels."""
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """The larger, the better."""
+        """Sort key: the larger, the better."""
         return self.attempt.result.status in FOUND, float(self.belief.support)
 
 
 @dataclass(frozen=True)
 class BodyAware:
-    """An aligner that asks what of the image its motion explains.
+    """An aligner that checks how much of the image its motion explains.
 
     Attributes:
         first: Makes the first attempt at a frame.
-        search: What that is; it makes all others.
-        is_eager: Whether it learns what moves from a motion that may be a body's, too, and asks for no other one.
+        search: The search behind `first`; it makes all other attempts.
+        is_eager: Whether it learns what moves even from a motion that may be a body's, and tries no other motion.
     """
 
     first: Aligner
@@ -103,17 +108,17 @@ class BodyAware:
 
     @cached_property
     def segmenter(self) -> MotionSegmenter:
-        """What sees bodies."""
+        """The segmenter of moving bodies."""
         settings = self.search.settings
         return MotionSegmenter(as_exposed(self.search.camera, settings.odometry), settings)
 
     @property
     def search_of_bodies(self) -> Aligner | None:
-        """What finds each body's own motion; None where it is not looked for."""
+        """The search for each body's own motion; None where bodies are not tracked."""
         return self.search.plain if self.search.settings.odometry.bodies == "track" else None
 
     def warm_up(self) -> float:
-        """Compile what every frame needs, side by side: the search, and the look at what it explains."""
+        """Compile what every frame needs, in parallel: the search, and the check of what it explains."""
         state = self.blank_state()
 
         def look() -> None:
@@ -122,7 +127,7 @@ class BodyAware:
         return side_by_side(self.first.warm_up, look)
 
     def warm_up_second(self) -> None:
-        """Compile what is asked where what moves is shared out among motions."""
+        """Compile what is needed only where the image is shared out among several motions."""
         state = self.blank_state()
         self.segmenter.look_back(state.scene, state.tracker, np.eye(4))
 
@@ -132,16 +137,16 @@ class BodyAware:
         return AwareState(tracker, self.segmenter.blank(), tracker.previous)
 
     def start(self, frame: Frame) -> AwareState:
-        """A scene in which nothing is known to move."""
+        """Start with a scene in which nothing is known to move."""
         tracker = self.first.start(frame)
         return AwareState(tracker, self.segmenter.first(tracker), tracker.previous)
 
     def predict(self, state: AwareState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Predict by the search."""
+        """Predict with the underlying search."""
         return self.search.predict(state.tracker, elapsed)
 
     def align(self, state: AwareState, frame: Frame, clock: Clock) -> Attempt:
-        """Align, and look what moves."""
+        """Align a frame, and find what moves in it."""
         before = np.asarray(state.scene.tracks.labels) > 0
         first = self.first.align(state.tracker, frame, clock)
         seen, look = self._agreed(state, frame, clock, first)
@@ -161,13 +166,13 @@ class BodyAware:
     def _asks(
         self, first: Attempt, seen: Attempt, found: Integer[np.ndarray, "h w"], before: Bool[np.ndarray, "h w"]
     ) -> bool:
-        """Whether other motions are asked: where bodies appear away from those before, or beside bodies none was found.
+        """Whether to try other motions: where bodies appear away from earlier ones, or a search fails beside bodies.
 
         Args:
             first: The first attempt.
-            seen: What stands for it, where most of the image's area asked for another motion.
-            found: Bodies by that.
-            before: Where bodies were in the frame before.
+            seen: The attempt that replaces it if most of the image's area asks for another motion; else the same.
+            found: Bodies according to `seen`.
+            before: Where bodies were in the last frame.
         """
         has_arisen = np.mean((found > 0) & ~_near(before)) > SUSPICIOUS and seen is first
         is_lost = not seen.usable and (np.any(before) or np.any(found))
@@ -175,8 +180,9 @@ class BodyAware:
         return bool(has_arisen or is_lost) and not is_depth_wrong
 
     def _asked(self, state: AwareState, frame: Frame, clock: Clock, seen: Attempt) -> tuple[Attempt, float]:
-        """What other motions come to, and the seconds for which the last one has stood for those that were not found:
-        0 where one was.
+        """The best of several other motions, and how long the last one has stood in for a missing one.
+
+        The time is in seconds; 0 where a motion was found.
         """
         attempt, before = self._share_out(state, frame, clock, seen), state.scene.carried
         if attempt.usable or not before < MAX_CARRIED:
@@ -195,7 +201,7 @@ class BodyAware:
         found: Integer[np.ndarray, "h w"],
         carried: float,
     ) -> Attempt:
-        """An attempt with its bodies and all that is known after it; from a motion in doubt nothing is learnt."""
+        """Complete an attempt with its bodies and the state after it; nothing is learnt from a motion in doubt."""
         scene, segmenter = state.scene, self.segmenter
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
         if dissent > MISTRUSTED:
@@ -215,7 +221,7 @@ class BodyAware:
         after = segmenter.renewed(scene, look, elapsed)._replace(
             tracks=tracks, carried=np.asarray(carried, np.float32), suspected=suspected
         )
-        if carried or (is_doubted and not self.is_eager):  # by a wrong motion the scene seems to move
+        if carried or (is_doubted and not self.is_eager):  # under a wrong motion the static scene seems to move
             after = after._replace(known=look.belief.carried)
         elif np.any(bodies != found):
             known = np.asarray(after.known)
@@ -226,8 +232,10 @@ class BodyAware:
         return attempt._replace(state=AwareState(tracker, after, whole, np.asarray(is_doubted)), bodies=seen)
 
     def _agreed(self, state: AwareState, frame: Frame, clock: Clock, attempt: Attempt) -> tuple[Attempt, FrameView]:
-        """The attempt, or a search without what dissents where most of the image's area asks for another motion; and
-        what is seen by its motion.
+        """Search again without dissenting blocks while most of the image's area asks for another motion.
+
+        Returns:
+            The attempt to keep, and how the frame looks under its motion.
         """
         look = self._look(state, attempt)
         for _ in range(ROUNDS):
@@ -247,7 +255,7 @@ class BodyAware:
         return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference)
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
-        """A tracker without the points that dissent, whose search begins from the motion that the others ask for."""
+        """A tracker without the dissenting points, whose search starts from the motion that the others ask for."""
         motion = np.asarray(opinion.target_T_reference, np.float64)
         guess = np.float32(log(motion) * (float(tracker.seconds) / float(clock.elapsed)))
         return self.segmenter.without(tracker, opinion.dissenting)._replace(guess=guess)
@@ -255,9 +263,9 @@ class BodyAware:
     def _share_out(self, state: AwareState, frame: Frame, clock: Clock, first: Attempt) -> Attempt:
         """The motion that most of what was at rest agrees with.
 
-        Those that may be the camera's are the one that was found, that of what it leaves unexplained, and that of what
-        the last motion, gone on with, explains; where nothing was known to move, what was found may be a wrong one, and
-        the search that begins from rest is another. The best is searched for again without what moves by it.
+        Candidates are the motion found, that of the pixels it leaves unexplained, and that of the pixels which the
+        prediction explains. If the search failed and nothing was known to move, a search from rest is another. The best
+        one is searched for again without what moves according to it.
         """
         scene, tracker, segmenter = state.scene, state.tracker, self.segmenter
         known = bool(np.any(np.asarray(scene.tracks.labels)))
@@ -293,8 +301,10 @@ class BodyAware:
         return _judged(best, tried, known)
 
     def _helped_by_prediction(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
-        """An attempt with the help of the last motion, where what bodies leave in view does not tell the whole motion
-        or, of an image that is covered for the most part, nothing; else the attempt as it is.
+        """Help out an attempt that failed beside bodies with the predicted motion.
+
+        The two are fused if the attempt only lacks texture. Otherwise the prediction replaces it if bodies cover more
+        than `LARGE` of the image. Else the attempt is returned as it is.
         """
         result = attempt.result
         if int(result.findings) == bit(AlignmentStatus.LOW_TEXTURE) and np.all(np.isfinite(result.covariance)):
@@ -302,8 +312,9 @@ class BodyAware:
         return self._extrapolated(state, clock, attempt) if covered > LARGE else attempt
 
     def _fused_with_prediction(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
-        """The attempt with what its images do not tell of the motion filled in as the last one goes on: the mean of
-        both, weighted by their covariances. As it is where the two disagree: the camera did not go on as before.
+        """Fuse an attempt with the predicted motion: their mean, weighted by their covariances.
+
+        Where the two contradict each other, the velocity has changed, and the attempt is returned as it is.
         """
         found = np.asarray(attempt.result.target_T_reference)
         onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))
@@ -318,7 +329,7 @@ class BodyAware:
         return _moved(state, attempt, motion, share @ prior)
 
     def _extrapolated(self, state: AwareState, clock: Clock, attempt: Attempt) -> Attempt:
-        """The attempt with the motion that the camera has if it goes on as before."""
+        """The attempt with the predicted motion in place of its own."""
         motion = self.predict(state, float(clock.elapsed))
         attempt = _moved(state, attempt, motion, UNKNOWN)
         findings = bit(AlignmentStatus.MOVING_BODY)
@@ -329,11 +340,11 @@ class BodyAware:
 def _moved(
     state: AwareState, attempt: Attempt, motion: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
 ) -> Attempt:
-    """An attempt of another motion than the one that was found, which can be used."""
+    """A usable attempt with another motion than the one that was found."""
     xi: Any = log(motion).astype(np.float32)
     result = attempt.result._replace(target_T_reference=motion, xi=xi, covariance=covariance.astype(np.float32))
     tracker: TrackerState = attempt.state
-    before = state.tracker  # what the search made of the wrong motion is of no use
+    before = state.tracker  # what the search learnt from the wrong motion is useless
     tracker = tracker._replace(
         keyframe=tracker.previous,
         motion=xi,
@@ -346,11 +357,11 @@ def _moved(
 
 
 def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) -> Attempt:
-    """The best candidate's attempt with what the image as a whole says of it.
+    """The best candidate's attempt, judged by the image as a whole.
 
-    What all of the image at rest speaks for is not wrong because a body hides what its points saw; but the image has to
-    agree with it where its points still see. And where another motion has nearly as much support, or more of the image
-    speaks against this one than for it, it may be a body's.
+    A motion that most of the static scene supports is not wrong because a body hides its points. But the points that
+    are still visible have to agree with it. It may be a body's where another motion has nearly as much support, or
+    where more of the image contradicts it than supports it.
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
     seen = known or float(belief.contradicted) > LEAST
@@ -368,7 +379,7 @@ def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) ->
 
 
 def mistrusted(attempt: Attempt) -> Attempt:
-    """The attempt with the word that its motion may be a body's."""
+    """The attempt, flagged as possibly following a body."""
     return attempt._replace(result=with_finding(attempt.result, AlignmentStatus.MOVING_BODY))
 
 
@@ -383,5 +394,5 @@ def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], depth_disagrees: bo
 
 
 def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """A mask with a border as wide as a body moves from frame to frame."""
+    """A mask dilated by about as much as a body moves from frame to frame."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0

@@ -1,11 +1,11 @@
-"""What belongs to a body: evidence gathered over area and over time, shared out along surfaces.
+"""Which pixels belong to moving bodies: evidence gathered over time and area, and smoothed along surfaces.
 
-Each pixel has a belief between -1 (static) and +1 (moving on its own). It is carried along with the surface that it
-lies on, moved by what the new image says, and smoothed among neighbours that no depth edge separates.
+Each pixel has a belief between -1 (static) and +1 (moving on its own). It is carried along with the pixel's surface,
+updated from each new image, and smoothed among neighbours that no depth edge separates.
 
-A body that stops looks like the scene, and takes the camera along when it starts again. So a surface on which a body
-was seen stays suspected for about half a second, and so does what of it comes into view, unless it is at rest beyond
-doubt.
+A body that stops looks like the scene, and drags the camera along when it starts again. So a surface on which a body
+was seen stays suspected for about half a second, unless it is clearly at rest. The same holds for parts of it that come
+into view.
 """
 
 from functools import partial
@@ -21,42 +21,42 @@ from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
 KEPT = 0.85
-"""Part of a belief that stays from frame to frame where nothing new is known."""
+"""Factor by which a belief decays per frame where nothing new is known."""
 NOTHING = 0.004
-"""Share of the image known to move below which no body is looked for: sharing out takes longer than all else."""
+"""Share of the image known to move below which no body is looked for, as smoothing takes longer than all else."""
 FAR = 12.0
-"""Depth evidence beyond which what is seen is another surface and not the same one, moved."""
+"""Depth evidence above which a pixel shows another surface, rather than the same one moved."""
 SAME = 5.0
-"""Depth evidence up to which a pixel shows the surface that was seen at its place before."""
+"""Depth evidence below which a pixel shows the same surface as before."""
 FADING = 0.4
-"""Seconds in which a suspicion falls to 1/e."""
+"""Seconds in which a suspicion decays to 1/e."""
 RELEASED = -0.57
-"""Belief from which on a surface is at rest beyond doubt, and suspected no more."""
+"""Belief below which a surface is clearly at rest, and no longer suspected."""
 TIED = 0.5
-"""Two neighbours lie on one surface from this tie on; see `_links`."""
+"""Tie above which two neighbours lie on one surface; see `_links`."""
 ENTERING = 10
-"""Pixels that a suspicion spreads by in a frame, into what was not seen in the one before."""
+"""Pixels by which a suspicion spreads per frame, into areas that were not seen in the last one."""
 
 
 class Belief(NamedTuple):
-    """Of every pixel of a view, what is known of it and what is concluded."""
+    """What is known and concluded about every pixel of a view."""
 
     known: Float[Array, "h w"]
-    """From -1, static, to 1, moving; from the pixel itself and its past."""
+    """Belief from -1, static, to 1, moving, from the pixel's own evidence and its past."""
     moving: Float[Array, "h w"]
-    """The same shared out along surfaces: positive where the pixel is taken to be a body's."""
+    """Belief smoothed along surfaces: positive where the pixel is taken to be a body's."""
     support: Float[Array, ""]
     """Share of what was known to be static that is seen at rest."""
     contradicted: Float[Array, ""]
-    """Share of it that moves."""
+    """Share of what was known to be static that moves."""
     hidden: Bool[Array, "h w"]
-    """Which pixels the first of the others does not see, as something stands before them."""
+    """Pixels that are occluded in the first of the other views."""
     carried: Float[Array, "h w"]
-    """What was known before, on the same surfaces, without what this frame says."""
+    """Belief before this frame, carried over to the same surfaces."""
     suspected: Float[Array, "h w"]
-    """From 0 to 1: how lately a body was seen on the pixel's surface, before this frame."""
+    """How recently a body was seen on the pixel's surface, before this frame; from 0 to 1."""
     in_view: Float[Array, " v"]
-    """Share of what was known to be static that lies inside each of the others."""
+    """Share of what was known to be static that lies inside each of the other views."""
 
 
 @partial(jax.jit, static_argnames="carried")
@@ -70,16 +70,16 @@ def form_belief(
     *,
     carried: bool,
 ) -> Belief:
-    """What a motion makes of every pixel of a view.
+    """Form the belief that a motion implies for every pixel of a view.
 
     Args:
         here: The view.
-        others: V others that it is compared with; the first is its neighbour in time, the others further off.
-        others_T_here: The motions into them.
-        camera: Of the views' level.
-        before: What was known before: of the first of the others' pixels where it is to be `carried`, else of these.
-        suspected: What was suspected before, likewise; of no account where it is not carried.
-        carried: See `before`.
+        others: V views to compare it with; the first is its neighbour in time, the others are further off.
+        others_T_here: Motions into the other views.
+        camera: Camera of the views' level.
+        before: Earlier belief, for the pixels of the first other view if `carried`, else for those of `here`.
+        suspected: Earlier suspicion, for the pixels of the first other view; ignored unless `carried`.
+        carried: Whether to carry `before` and `suspected` over from the first other view.
     """
     evidence = gather_evidence(here, others, others_T_here, camera)
     known = _carry(before, evidence, _seen_before(evidence, SAME)) if carried else before
@@ -113,20 +113,21 @@ def form_belief(
 def suspect(
     belief: Belief, bodies: Bool[np.ndarray, "h w"], elapsed: float, *, trusted: bool
 ) -> Float[np.ndarray, "h w"]:
-    """What is suspected after a frame: its bodies, and what was suspected before.
+    """Suspicions after a frame: its bodies, and earlier suspicions, which fade.
 
     Args:
-        belief: Of the frame's pixels.
+        belief: Belief about the frame's pixels.
         bodies: Where the frame shows bodies.
-        elapsed: Seconds since the frame before.
-        trusted: Whether the camera's motion is; by a wrong one the scene seems to move, and nothing is learnt.
+        elapsed: Seconds since the last frame.
+        trusted: Whether the camera's motion is trusted. If not, nothing is learnt: under a wrong motion the scene seems
+            to move.
     """
     before = np.where(np.asarray(belief.known) < RELEASED, 0.0, np.asarray(belief.suspected))
     return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies) if trusted else before, np.float32)
 
 
 def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """How far each pixel speaks for moving, and how far for rest; 0 to 1."""
+    """How strongly each pixel indicates motion, and how strongly rest; both from 0 to 1."""
     views = e.grey.shape[0]
     lenient = jnp.where(jnp.arange(views) > 0, 2.0, 1.0)[:, None, None]
     jump = jnp.abs(e.depth)
@@ -143,7 +144,7 @@ def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
 
 
 def _carry(before: Float[Array, "h w"], e: PixelEvidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
-    """What was known of the surfaces that the pixels lie on, where these are the `same` in the first other view."""
+    """Earlier values on the surfaces that the pixels show; 0 where the first other view lacks the `same` surface."""
     height, width = before.shape
     u, v = jnp.round(e.place[0]).astype(jnp.int32)
     u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
@@ -151,7 +152,7 @@ def _carry(before: Float[Array, "h w"], e: PixelEvidence, same: Bool[Array, "h w
 
 
 def _seen_before(e: PixelEvidence, limit: float) -> Bool[Array, "h w"]:
-    """Which pixels' surfaces the first other view shows: by depth, up to some evidence against it."""
+    """Pixels whose surface the first other view shows, too: depth evidence is missing or below a limit."""
     return (e.seen[0] > 0) & ((e.measured[0] == 0) | (jnp.abs(e.depth[0]) < limit))
 
 
@@ -160,7 +161,9 @@ def _after(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, 
 
 
 def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Suspicions carried with their surfaces, which may have moved, and spread to what of these was not seen before."""
+    """Carry suspicions along with their surfaces, which may have moved, and spread them to newly visible parts of
+    these.
+    """
     same = _seen_before(e, 2.0 * FAR) & (e.measured[0] > 0)
     across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))
 
@@ -188,16 +191,17 @@ DEPTH_EDGE = 0.015
 GREY_EDGE = 25.0
 """Step of grey, grey levels, across which neighbours are hardly tied where depth is missing."""
 ALIKE, HALF_KNOWN = 0.3, 0.03
-"""Tie of neighbours without depth, and of two of which one has some: a body ends where its depth does."""
+"""Ties of neighbours that both lack depth, and of neighbours of which one has depth: a body ends where its depth does.
+"""
 
 
 def share_out(
     known: Float[Array, "h w"], grey: Float[Array, "h w"], inverse_depth: Float[Array, "h w"]
 ) -> Float[Array, "h w"]:
-    """Beliefs smoothed among neighbours on one surface, from a coarse image to the full one.
+    """Smooth beliefs among neighbours on one surface, from coarse to fine.
 
-    It minimises Σ c (m − b)² + Σ w (m − m')² over the pixels' m and pairs of neighbours m, m', where c is the strength
-    of a pixel's own belief b and w is small across an edge of depth.
+    This minimises Σ c (m − b)² + Σ w (m − m')² over the pixels' m and pairs of neighbours m, m'. Here c is the strength
+    of a pixel's own belief b, and w is small across a depth edge.
     """
     stack = [(known, jnp.abs(known) + 0.01, grey, inverse_depth)]
     while len(stack) < len(ROUNDS) and min(stack[-1][0].shape) >= 16:
@@ -218,7 +222,7 @@ def _settle(
     links: tuple[Float[Array, "h w"], Float[Array, "h w"]],
     rounds: int,
 ) -> Float[Array, "h w"]:
-    """Some rounds of Jacobi's method."""
+    """Run some iterations of Jacobi's method."""
     across, down = links
     data = c * jnp.clip(3.0 * b, -1.0, 1.0)
     weight = c + across + jnp.pad(across, ((0, 0), (1, 0)))[:, :-1] + down + jnp.pad(down, ((1, 0), (0, 0)))[:-1]
@@ -233,7 +237,7 @@ def _settle(
 
 
 def _links(grey: Float[Array, "h w"], q: Float[Array, "h w"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """How firmly each pixel is tied to the next one on its right and to the one below; 0 at the image's end."""
+    """How firmly each pixel is tied to its right and its lower neighbour; 0 at the image's border."""
 
     def tie(axis: int) -> jax.Array:
         end = [(0, 0), (0, 0)]

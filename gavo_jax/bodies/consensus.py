@@ -1,8 +1,8 @@
-"""What the image's area says of a motion: block after block has one vote, whatever its contrast.
+"""What the image's area says of a motion: each block has one vote, whatever its contrast.
 
-A search counts points by how much they tell, so a body of much contrast outweighs a larger, plainer scene, which a
-slightly different motion explains nearly as well. Here every block of the image tells how much better a motion of its
-own would explain it. A plain block tells that as firmly as a rich one, by all its pixels together.
+A search weighs points by their information. So a high-contrast body outweighs a larger, plainer scene, which a slightly
+wrong motion explains nearly as well. Here every block of the image tells how much better a motion of its own would
+explain it. A plain block tells this as firmly as a rich one, from all its pixels together.
 """
 
 from typing import NamedTuple
@@ -20,45 +20,50 @@ from gavo_jax.objective.derivatives import pixel_jacobian
 from gavo_jax.se3 import exp
 
 STRIDE = 2
-"""Pixels of the image from one that is asked to the next, along either side."""
+"""Spacing of the sampled pixels along either side of the image."""
 CELL = 4
-"""Asked pixels along either side of a block."""
+"""Sampled pixels along either side of a block."""
 LEAST_GREY, LEAST_DEPTH = 1.0, 8e-4
-"""Smallest deviations of a pixel's residuals: grey levels, 1/m."""
+"""Smallest standard deviations of a pixel's residuals: grey levels, 1/m."""
 BOUND = 6.0
-"""Deviations at which a single pixel's residual counts by half as much: what is hidden, and edges."""
+"""Standard deviations at which a residual's weight falls to a quarter, which limits the effect of occlusions and edges.
+"""
 FARTHER = 2.0
-"""A pixel counts by the area of the surface that it shows, depth squared, up to so many times the usual depth."""
+"""Largest depth, over the median depth, up to which a pixel's weight grows: it is the area of its surface, depth
+squared.
+"""
 ROUNDS = 4
-"""Rounds of re-weighting the blocks, about their median."""
+"""Rounds of re-weighting the blocks by their gains, relative to the median."""
 DRAWS, DRAWN = 48, 6
-"""Draws to begin from, and blocks of each: where a body is strong, the median's next minimum is not its least one."""
+"""Random draws to start from, and blocks in each: beside a strong body, the median's nearest minimum is not its least
+one.
+"""
 HALVINGS = 16
 DISSENT = 6.0
-"""Times the usual: from there on a block does not move as the others do."""
+"""Gain of a block, over the median gain, above which it does not move with the others."""
 
 
 class Blocks(NamedTuple):
-    """The normal equations of B blocks at one motion, by a step δ on the target's side; and how much each counts."""
+    """Normal equations of B blocks at one motion, for a step δ on the target's side, and the weight of each block."""
 
     hessian: Float[Array, "b 6 6"]
     gradient: Float[Array, "b 6"]
     whitened: Float[Array, "b 6 7"]
-    """L⁻¹ of Hessian and gradient, [H g], where LLᵀ is the Hessian, damped."""
+    """L⁻¹ [H g], the whitened Hessian and gradient, where LLᵀ is the damped Hessian."""
     credit: Float[Array, " b"]
 
 
 class Opinion(NamedTuple):
-    """What the area says of a motion."""
+    """The opinion of the image's area on a motion."""
 
     dissent: Float[Array, ""]
-    """What the middle one of the blocks would gain by a motion of its own."""
+    """What the median block would gain by a motion of its own."""
     least: Float[Array, ""]
-    """The same with the motion below."""
+    """What the median block would gain at `target_T_reference`."""
     target_T_reference: Float[Array, "4 4"]
     """The motion that the area asks for."""
     dissenting: Bool[Array, "h w"]
-    """Pixels of blocks that do not move by it."""
+    """Pixels of blocks that do not follow `target_T_reference`."""
 
 
 def has_blocks(camera: Camera) -> bool:
@@ -69,14 +74,14 @@ def has_blocks(camera: Camera) -> bool:
 def ask_area(
     here: View, there: View, target_T_here: Float[Array, "4 4"], credit: Float[Array, "h w"], camera: Camera
 ) -> Opinion:
-    """What the area of a view says of a motion, and which one it asks for: the least median of what blocks would gain.
+    """The opinion of a view's area on a motion, and the motion with the least median of what blocks would gain.
 
     Args:
         here: The view.
-        there: The one that the motion leads to.
+        there: The view that the motion leads to.
         target_T_here: The motion.
-        credit: How far each pixel counts.
-        camera: Of the views' level.
+        credit: Weight of each pixel.
+        camera: Camera of the views' level.
     """
     blocks = _equations(here, there, target_T_here, credit, camera)
 
@@ -105,15 +110,17 @@ def ask_area(
 
 
 def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
-    """Return by how much each block's squared residuals, in variances, fall if it moves as it likes, not by δ:
-    pᵀH⁻¹p, where p = Hδ + g.
+    """Return by how much each block's squared residuals, in variances, would fall under a motion of its own instead of
+    δ.
+
+    This is pᵀH⁻¹p, where p = Hδ + g.
     """
     pull = blocks.whitened[..., :6] @ delta + blocks.whitened[..., 6]
     return jnp.sum(pull**2, axis=-1)
 
 
 def _steps_of_few(blocks: Blocks) -> Float[Array, "d 6"]:
-    """The steps that draws of a few blocks ask for; the same draws for every image of a size."""
+    """Steps that random draws of a few blocks ask for; the draws depend on the number of blocks only."""
     of = np.random.default_rng(0).integers(0, len(blocks.credit), (DRAWS, DRAWN))
     credit = blocks.credit[of]
     hessian = jnp.einsum("db,dbij->dij", credit, blocks.hessian[of])
@@ -122,16 +129,16 @@ def _steps_of_few(blocks: Blocks) -> Float[Array, "d 6"]:
 
 
 def _grid(camera: Camera) -> tuple[int, int]:
-    """Rows and columns of blocks."""
+    """Rows and columns of the grid of blocks."""
     rows, columns = (-(-size // STRIDE) // CELL for size in (camera.height, camera.width))
     return rows, columns
 
 
 def _pixels_of(blocks: Bool[Array, " b"], camera: Camera) -> Bool[Array, "h w"]:
-    """The pixels of some blocks; none of what is left over beside them."""
+    """Pixels of the given blocks; pixels at the right and bottom that belong to no block are never among them."""
     rows, columns = _grid(camera)
     pixels = jnp.repeat(jnp.repeat(blocks.reshape(rows, columns), CELL * STRIDE, 0), CELL * STRIDE, 1)
-    pixels = pixels[: camera.height, : camera.width]  # of an odd side, a block's last pixel may lie outside
+    pixels = pixels[: camera.height, : camera.width]  # where a side is odd, the last block may reach beyond it
     return jnp.pad(pixels, ((0, camera.height - pixels.shape[0]), (0, camera.width - pixels.shape[1])))
 
 
@@ -167,14 +174,14 @@ def _equations(
 
 
 def surface_area(inverse_depth: Float[Array, " n"]) -> Float[Array, " n"]:
-    """How large a surface each pixel shows, in those of the usual depth; 0 where there is no reading."""
+    """Relative area of the surface that each pixel shows, 1 at the median depth; 0 where there is no reading."""
     has = inverse_depth > 0
     depth = jnp.where(has, 1.0 / jnp.maximum(inverse_depth, 1e-3), 0.0)
     return jnp.minimum(depth / jnp.maximum(median_by_bisection(depth, has), 1e-3), FARTHER) ** 2
 
 
 def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b"]:
-    """Sum values at all pixels asked by blocks; what is left over at the right and below is left out."""
+    """Sum the values of sampled pixels over each block; pixels left over at the right and bottom are dropped."""
     height, width = (-(-size // STRIDE) for size in (camera.height, camera.width))
     rows, columns = _grid(camera)
     image = values.reshape(-1, height, width)[:, : rows * CELL, : columns * CELL]
@@ -182,7 +189,7 @@ def block_sums(values: Float[Array, "c n"], camera: Camera) -> Float[Array, "c b
 
 
 def _solved(matrices: Float[Array, "b 6 6"], right: Float[Array, "b 6"]) -> Float[Array, "b 6"]:
-    """Solve positive definite systems by Gauss-Jordan elimination: LAPACK's call takes ten times as long."""
+    """Solve positive definite systems by Gauss-Jordan elimination: a call of LAPACK takes ten times as long."""
     rows = jnp.moveaxis(jnp.concatenate([matrices, right[..., None]], axis=-1), 0, -1)
     for k in range(6):
         pivot = rows[k] / rows[k, k]
@@ -191,10 +198,10 @@ def _solved(matrices: Float[Array, "b 6 6"], right: Float[Array, "b 6"]) -> Floa
 
 
 def _whitened(matrices: Float[Array, "b 6 6"], right: Float[Array, "b 6 c"]) -> Float[Array, "b 6 c"]:
-    """L⁻¹ of what stands to the right of positive definite matrices LLᵀ, by Gauss's elimination."""
+    """L⁻¹ times the right-hand sides, for positive definite matrices LLᵀ, by Gaussian elimination."""
     rows = jnp.moveaxis(jnp.concatenate([matrices, right], axis=-1), 0, -1)
     whitened = []
-    for _ in range(6):  # of the rows that are left, the first column and row go
+    for _ in range(6):  # each pass removes the first row and column that are left
         pivot = rows[0] / jnp.sqrt(rows[0, 0])
         rows = rows[1:, 1:] - rows[1:, :1] / rows[0, 0] * rows[0, 1:]
         whitened.append(pivot[-right.shape[-1] :])
@@ -202,8 +209,9 @@ def _whitened(matrices: Float[Array, "b 6 6"], right: Float[Array, "b 6 c"]) -> 
 
 
 def median_by_bisection(values: Float[Array, " n"], counted: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median of some of many values from 0 on, to a small part of their largest, by bisection: sorting takes longer
-    than all else here.
+    """Median of the `counted` non-negative values, to a small fraction of the largest one.
+
+    Bisection is used, as sorting would take longer than all else here.
     """
     half = 0.5 * jnp.sum(counted)
 
@@ -217,8 +225,9 @@ def median_by_bisection(values: Float[Array, " n"], counted: Bool[Array, " n"]) 
 
 
 def weighted_median(values: Float[Array, " b"], weights: Float[Array, " b"]) -> Float[Array, ""]:
-    """The least of some values from 0 on up to which half of the weight lies, by bisection of its bits: those of floats
-    stand in the same order, and sorting takes twenty times as long.
+    """Smallest of some non-negative values up to which half of the weight lies.
+
+    This bisects the bits of the floats, which sort as the floats do: sorting takes twenty times as long.
     """
     half = 0.5 * jnp.sum(weights)
     bits = jax.lax.bitcast_convert_type(values, jnp.int32)

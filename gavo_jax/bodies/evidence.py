@@ -1,6 +1,6 @@
-"""How far a motion explains a whole image, pixel by pixel, against other images of the same scene.
+"""How well a motion explains a whole image, pixel by pixel, against other images of the same scene.
 
-A search weighs few points, the steepest ones; here every pixel of one level has its say, as a body is known by its area
+A search weighs a few points, the steepest ones. Here every pixel of one level counts, as a body is known by its area
 and not by its contrast.
 """
 
@@ -22,31 +22,32 @@ from gavo_jax.objective.estimates import LARGE_DEPTH_RESIDUAL, estimate_brightne
 from gavo_jax.objective.points import SATURATED, swept
 
 WIDEST = 160
-"""Pixels: the finest level searched that is not wider is the one that bodies are seen on."""
+"""Width in pixels: bodies are seen on the finest searched level that is no wider."""
 
 
 class View(NamedTuple):
-    """One level of a frame, packed as a `Target`, and how the camera moved while its rows were exposed."""
+    """One level of a frame, packed as a `Target`, and the camera's motion while its rows were exposed."""
 
     image: Target
     """The level's grey and depth, [h, w]."""
     sweep: Float[Array, "*v 6"]
-    """Twist of the points in the camera during one readout; 0 where all rows are exposed at once, not-a-number of a
-    first frame, before which there is no other."""
+    """Twist of the points in the camera during one readout. It is 0 for a global shutter, and NaN in the first frame,
+    which has no predecessor.
+    """
 
     def moving_as(self, other: Float[Array, " 6"]) -> "View":
-        """The view with another one's sweep where its own is not known."""
+        """The view with another view's sweep where its own is unknown."""
         return self._replace(sweep=jnp.where(jnp.isnan(self.sweep), jnp.nan_to_num(other), self.sweep))
 
 
 def seen_level(levels: Levels) -> int:
-    """Place, among the levels searched, of the one that bodies are seen on."""
+    """Index, among the searched levels, of the one that bodies are seen on."""
     narrow = [place for place, (_, width) in enumerate(levels.sizes) if width <= WIDEST]
     return narrow[-1] if narrow else 0
 
 
 def view_of(packed: Target, levels: Levels, sweep: Float[Array, " 6"]) -> View:
-    """The level that bodies are seen on, from all packed levels of a frame."""
+    """Cut the level that bodies are seen on from all packed levels of a frame."""
     place = seen_level(levels)
     (row, column), (height, width) = levels.layout.corners[place], levels.sizes[place]
     cut: list[UInt32[Array, "h w"]] = [channel[row : row + height, column : column + width] for channel in packed]
@@ -59,14 +60,16 @@ def inverse_depth_of(view: View) -> Float64[np.ndarray, "h w"]:
 
 
 class PixelEvidence(NamedTuple):
-    """What every pixel of a view says of a motion, by each of V others; [V, h, w]."""
+    """Evidence on a motion from every pixel of a view, by each of V other views."""
 
     grey: Float[Array, "v h w"]
-    """Grey residual over what noise and a small shift of the image would give; 0 where that cannot be told."""
+    """Grey residual over what noise and a small shift of the image would cause; 0 where it cannot be told."""
     depth: Float[Array, "v h w"]
-    """The same of inverse depth: positive where the pixel shows a surface nearer than the one seen there before."""
+    """Inverse-depth residual in the same units: positive where the pixel shows a surface nearer than the one seen there
+    before.
+    """
     texture: Float[Array, "v h w"]
-    """How far grey would tell a wrong motion: its gradient over what noise gives."""
+    """How clearly grey would reveal a wrong motion: its gradient over the noise."""
     seen: Float[Array, "v h w"]
     """1 where the pixel has depth and lies inside the other view, else 0."""
     measured: Float[Array, "v h w"]
@@ -78,25 +81,25 @@ class PixelEvidence(NamedTuple):
 
 
 GREY_NOISE = 4.0
-"""Grey levels, interpolation and compression included."""
+"""Noise of grey in grey levels, interpolation and compression included."""
 DEPTH_NOISE = 0.006
-"""1/m: twice the quantisation of a structured-light sensor."""
+"""Noise of inverse depth, 1/m: twice the quantisation of a structured-light sensor."""
 SLACK = 0.4
-"""Pixels that a true motion may seem off by: shutter, stamps and registration of depth."""
+"""Pixels by which a correct motion may seem off, because of shutter, timestamps and registration of depth."""
 SLACK_OF_FLOW = 0.04
-"""The same for each pixel that the image moves by between neighbouring frames."""
+"""Additional slack for each pixel of image motion between neighbouring frames."""
 FEW = 16
-"""One pixel of so many tells the brightness."""
+"""One pixel in this many is used to estimate brightness."""
 
 
 def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera) -> PixelEvidence:
-    """Every pixel of a view seen in V other views.
+    """Gather the evidence of every pixel of a view against V other views.
 
     Args:
-        here: The view whose pixels are asked.
+        here: The view whose pixels are tested.
         others: The views they are compared with, a leading axis V on every leaf.
         others_T_here: Maps points of the camera here into the cameras of the others.
-        camera: Of the views' level.
+        camera: Camera of the views' level.
     """
     width, height = camera.width, camera.height
     compared = compare(here, others, others_T_here, camera)
@@ -122,19 +125,19 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
 
 
 class Compared(NamedTuple):
-    """Pixels of a view beside what V others show there; flat arrays of N."""
+    """Pixels of a view beside what V other views show there; flat arrays of N."""
 
     residuals: Residuals
-    """[V, N]; of grey, with brightness taken off, and the light that changes from place to place."""
+    """Residuals [V, N]; those of grey are corrected for brightness and for local changes of light."""
     grey: GreySample
     """Grey of the view itself, with its slopes."""
     inverse_depth: Float[Array, " n"]
     place: tuple[Float[Array, " n"], Float[Array, " n"]]
     """Column and row of each pixel in the view."""
     as_bright: Float[Array, "v n"]
-    """Grey of the view as bright as the others are on the whole."""
+    """Grey of the view, adjusted to the overall brightness of the others."""
     light: Float[Array, "v n"]
-    """How much brighter the others show each place beyond that, as a share of it."""
+    """How much brighter the others show each place than `as_bright`, as a share of it."""
     same: Float[Array, "v n"]
     """1 where both show the same surface, as far as depth tells, and neither is saturated, else 0."""
 
@@ -142,7 +145,7 @@ class Compared(NamedTuple):
 def compare(
     here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera, stride: int = 1
 ) -> Compared:
-    """Every pixel of a view, or one of `stride` along either side, in V others; see `gather_evidence`."""
+    """Compare every pixel of a view, or one in `stride` along either side, with V others; see `gather_evidence`."""
     plane = image_plane(camera)
     here = here.moving_as(others.sweep[0])
     others = others.moving_as(here.sweep)
@@ -179,7 +182,7 @@ def compare(
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)
     few: Residuals = jax.tree.map(lambda leaf: leaf[:, :: max(1, FEW // stride**2)], r)
-    # a regression on what shows other surfaces would take contrast out, and the dark parts of the scene would change
+    # pixels of other surfaces would lower the regression's gain, and dark parts of the scene would seem to change
     few = few._replace(inside=few.inside * (jnp.abs(few.depth) < LARGE_DEPTH_RESIDUAL))
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
     brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)

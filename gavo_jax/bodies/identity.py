@@ -1,4 +1,4 @@
-"""From a mask to bodies: which parts of it hang together, and which body of the frame before each one is."""
+"""From a mask to bodies: its connected parts, and which body of the last frame each one is."""
 
 import itertools
 from typing import NamedTuple
@@ -10,40 +10,42 @@ from jaxtyping import Bool, Float, Int32, Integer
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 
 LEAST = 0.008
-"""Share of the image that a body covers at least."""
+"""Smallest share of the image that a body covers."""
 SHOWS = 0.03
-"""Evidence (belief that pixels move, summed, as a share of the image) from which on a component is a new body."""
+"""Evidence above which a component is a new body: summed belief that its pixels move, as a share of the image."""
 EXPLAINS = 0.015
-"""The same for the largest component where depth disagrees with the motion found: a body would explain that."""
+"""Evidence that suffices for the largest component where depth disagrees with the motion found: a body would explain
+that.
+"""
 KEEPS = 0.006
-"""The same for a body that was known in the frame before."""
+"""Evidence that suffices for a body known from the last frame."""
 THICK = 6 / 160
-"""Radius, over the image's width, of a disc that lies within a body."""
+"""Radius, over the image's width, of a disc that has to fit inside a new body."""
 MOST = 8
-"""Bodies at a time; the largest ones count."""
+"""Maximum number of bodies at a time; the largest ones are kept."""
 UNSEEN = 15
-"""Frames after which a body that is not seen is forgotten."""
+"""Frames after which an unseen body is forgotten."""
 
 
 class BodyTracks(NamedTuple):
-    """The bodies that are known, and where they were seen last."""
+    """The known bodies, and where each was last seen."""
 
     labels: Integer[np.ndarray, "h w"]
     """Number of the body that each pixel of the last frame shows, 0 for none."""
     numbers: Integer[np.ndarray, " n"]
-    """Numbers of the bodies that are known; 0 where there is none."""
+    """Numbers of the known bodies; 0 in free places."""
     ages: Integer[np.ndarray, " n"]
     """Frames since each was seen."""
     motions: Float[np.ndarray, "n 6"]
-    """Twist of each one's last motion in the camera; 0 where it is not known."""
+    """Twist of each body's last motion in the camera; 0 where it is unknown."""
     seconds: Float[np.ndarray, " n"]
-    """Time that it took; `UNKNOWN_SECONDS` where it is not known."""
+    """Duration of each body's last motion, seconds; `UNKNOWN_SECONDS` where it is unknown."""
     last: Integer[np.ndarray, ""]
     """The largest number given so far."""
 
     @classmethod
     def empty(cls, size: tuple[int, int]) -> "BodyTracks":
-        """Nothing is known, of an image of some height and width."""
+        """No known bodies, for an image of some height and width."""
         return cls(
             np.zeros(size, np.int32),
             np.zeros(MOST, np.int32),
@@ -60,15 +62,15 @@ def body_components(
     before: Bool[np.ndarray, "h w"],
     depth_disagrees: bool = False,
 ) -> Integer[np.ndarray, "h w"]:
-    """Parts of a mask that hang together and are bodies: 1, 2, … from the largest one; else 0.
+    """Connected parts of a mask that are bodies, numbered 1, 2, … from the largest one; 0 elsewhere.
 
-    What is thin, or of which little is known, is none: along edges of a true motion depth and grey disagree, too. Less
-    will do for a body that was known.
+    Thin parts, and parts with little evidence, are dropped: depth and grey disagree along edges of a correct motion,
+    too. The limits are lower for a body that was already known.
 
     Args:
         moving: Positive where something moves; see `Belief`.
         known: See `Belief`.
-        before: Where bodies were in the frame before.
+        before: Where bodies were in the last frame.
         depth_disagrees: Whether depth disagrees with the motion found.
     """
     mask = moving > 0
@@ -96,14 +98,14 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
     """Give each part of a mask the number of the known body that it overlaps most, or a new one.
 
     Args:
-        found: Of `body_components`, in the new frame.
-        tracks: Of the frame before, its labels moved to where they are expected in the new one.
+        found: Parts from `body_components`, in the new frame.
+        tracks: Tracks of the last frame.
     """
     given = _numbers(found, tracks)
     seen = given[1:]
     labels = given[found]
     lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < UNSEEN]
-    for i in lasting:  # hidden, or at rest for a moment: where it was seen it is expected
+    for i in lasting:  # hidden, or at rest for a moment: expected where it was last seen
         labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
     last = np.int32(max(int(tracks.last), *given))
     after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels, last=last)  # pyright: ignore[reportArgumentType]
@@ -116,8 +118,9 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
 
 
 def _numbers(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> Int32[np.ndarray, " parts"]:
-    """The number of each part of a mask, and 0 for what is none: those that overlap most are one body, and no two parts
-    are the same one.
+    """The body number of each part of a mask, after a 0 for the background.
+
+    Parts are matched with known bodies one to one, the largest overlap first; the other parts get new numbers.
     """
     parts = range(1, int(found.max(initial=0)) + 1)
     overlaps = sorted(

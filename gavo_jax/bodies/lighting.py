@@ -1,8 +1,8 @@
-"""Light that changes from place to place: lenses darken corners, lamps flicker while rows are exposed, shadows fall.
+"""Local changes of light: lenses darken corners, lamps flicker while rows are exposed, shadows fall.
 
-One gain and bias for the whole image leave such changes over: a part of the scene would seem to move, and a motion be
-found that explains them. They are smooth, or alike along a row, and texture that moved is neither: its residuals are of
-both signs within a small part of the image.
+One gain and bias for the whole image cannot model such changes. Static parts would seem to move, and the search would
+find a motion that explains them. Changes of light are smooth, or uniform along a row. Texture that moved is neither:
+its residuals have both signs within a small part of the image.
 """
 
 import jax
@@ -11,29 +11,31 @@ import numpy as np
 from jaxtyping import Array, Float
 
 CELLS, SMALLEST = 10, 6.0
-"""Cells along the longer side of the image, and pixels of the smallest one: a gain of less would explain texture.
-The gain is linear from the centre of one cell to that of the next."""
+"""Cells along the longer side of the image, and side of the smallest cell in pixels: gains of smaller ones would
+explain texture. The gain is linear between the centres of cells.
+"""
 STRIP = 3.0
-"""Pixels of the height of a strip of rows that has a gain of its own, where a lamp flickers."""
+"""Height in pixels of the strips of rows that have a gain of their own where a lamp flickers."""
 FLICKER = 0.8
-"""Part of the residuals' power that the gains of strips leave at most where a lamp does. Without such a lamp at least
-0.91 is left of clips."""
+"""Share of the residuals' power below which the strips' gains have to bring it for a lamp to count as flickering. Clips
+without such a lamp keep at least 0.91.
+"""
 UNCHANGED = 900.0
-"""Squared grey levels of a cell's mean pixel at which its gain is half-way between 1 and the regression's."""
+"""Mean squared grey of a cell, squared grey levels, at which its gain is half-way between 1 and the regression's."""
 LARGE = 20.0
-"""Grey levels at which a residual counts by a quarter."""
+"""Residual, in grey levels, whose weight is a quarter."""
 ROUNDS = 2
 
 
 def light_change(
     residual: Float[Array, "v h w"], grey: Float[Array, "v h w"], weight: Float[Array, "v h w"]
 ) -> Float[Array, "v h w"]:
-    """Return how much brighter every place became, as a share of its grey: its gain less 1.
+    """Return how much brighter every place became, as a share of its grey: the local gain less 1.
 
     Args:
-        residual: Of pixels in V other images, grey levels.
+        residual: Residuals of pixels in V other images, grey levels.
         grey: The pixels as bright as the others show them, grey levels.
-        weight: How far each pixel counts.
+        weight: Weight of each pixel.
     """
     height, width = residual.shape[1:]
     cell = max(max(height, width) / CELLS, SMALLEST)

@@ -1,4 +1,4 @@
-"""Search without the points that are taken to be a body's."""
+"""Searches without the points that lie on bodies."""
 
 import cv2
 import jax
@@ -14,13 +14,13 @@ from gavo_jax.odometry.tracking import TrackerState
 def without_points(
     state: TrackerState, planes: ImagePlane, moving: Bool[np.ndarray, "h w"], levels: Levels
 ) -> TrackerState:
-    """The state of a tracker whose references have lost the points that fall on a mask; on the host, as masks are.
+    """Remove the points that fall on a mask from a tracker's references, on the host, where masks are.
 
     Args:
-        state: Of the tracker.
-        planes: Of the levels searched, [L], on the host.
-        moving: Which pixels, of one of these levels, are not to take part.
-        levels: The levels.
+        state: The tracker's state.
+        planes: Image planes of the searched levels, [L], on the host.
+        moving: Mask of the pixels to leave out, at the size of one of these levels.
+        levels: The searched levels.
     """
     height, width = moving.shape
     place = next(i for i, size in enumerate(levels.sizes) if size == (height, width))
@@ -42,6 +42,6 @@ def without_points(
 
 
 def _widened(mask: Bool[np.ndarray, "h w"], seen: int, number: int) -> Bool[np.ndarray, "h w"]:
-    """A mask with a border: as wide as a pixel of the level, which mixes with its neighbours."""
+    """A mask dilated by a pixel of level `number`, which mixes with its neighbours."""
     radius = max(2 ** (number - seen), 1) if number > seen else 1
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0

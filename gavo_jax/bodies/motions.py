@@ -1,4 +1,4 @@
-"""Which bodies a frame shows, and how each has moved: the same search on a body's own points."""
+"""Which bodies a frame shows, and how each has moved: the camera's search on each body's own points."""
 
 from typing import Any
 
@@ -30,17 +30,17 @@ def find_motions(
     belief: Belief,
     inverse_depth: Float64[np.ndarray, "h w"],
 ) -> tuple[BodyTracks, tuple[Seen, ...]]:
-    """The bodies of a new frame by their numbers, with their motions where these are asked for.
+    """The numbered bodies of a new frame, with their motions where these are asked for.
 
     Args:
-        search: Finds a body's motion on its own points; None where masks alone are asked for.
-        segmenter: Of the frames.
-        state: Before the frame.
-        frame: The new one.
+        search: Finds a body's motion from its own points; None where only masks are asked for.
+        segmenter: Segmenter of the frames.
+        state: State before the frame.
+        frame: The new frame.
         clock: When it was taken.
         found: Parts of the new frame that are bodies.
-        belief: Of its pixels.
-        inverse_depth: Of them, 1/m; 0 where there is no reading.
+        belief: Belief about its pixels.
+        inverse_depth: Inverse depth of its pixels, 1/m; 0 where there is no reading.
     """
     before = BodyTracks(*map(np.asarray, state.scene.tracks))
     tracks = associate(found, before)
@@ -71,7 +71,7 @@ def _align(
     before: BodyTracks,
     number: int,
 ) -> Alignment:
-    """Motion of a body in the camera, by the search on its own points in the last frame."""
+    """Motion of a body in the camera, from a search on its own points in the last frame."""
     place = int(np.flatnonzero(before.numbers == number)[0])
     whole = state.whole
     if np.any(state.tracker.instant_motion):
@@ -91,7 +91,9 @@ def _align(
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
-    """A frame's points where its rows saw them: the shutter was undone by the camera's motion, not by a body's."""
+    """Move a frame's points back to where their rows saw them: the shutter was undone for the camera's motion, not a
+    body's.
+    """
     twist = tracker.instant_motion * readout_share(segmenter.full, tracker.seconds)
     return apply_rolling_shutter(whole, twist, segmenter.planes)
 
@@ -99,7 +101,7 @@ def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: Mo
 def _centroid(
     part: np.ndarray, inverse_depth: Float64[np.ndarray, "h w"], segmenter: MotionSegmenter
 ) -> Float64[np.ndarray, " 3"]:
-    """Mean of the points that the pixels of a mask show, in the camera; not-a-number without any reading."""
+    """Centroid, in the camera, of the points that a mask's pixels show; NaN without any reading."""
     v, u = np.nonzero(part & (inverse_depth > 0))
     if len(u) == 0:
         return np.full(3, np.nan)

@@ -1,4 +1,4 @@
-"""What is told of a body: where it is, how it moved, how well that is known."""
+"""Records of moving bodies: where each one is, how it moved, and how well that is known."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -18,16 +18,17 @@ class Seen(NamedTuple):
     """A body in one frame, as the camera sees it."""
 
     number: int
-    """The same from frame to frame, from 1."""
+    """Number of the body, from 1; the same in all frames."""
     field: Float[np.ndarray, "h w"]
-    """Pixels of the level that bodies are seen on; positive where the body is."""
+    """Segmentation on the level that bodies are seen on; positive where the body is."""
     share: float
     """Share of the image that it covers."""
     centroid: Float64[np.ndarray, " 3"]
-    """Centroid of the points of it that are seen, metres, in the camera."""
+    """Centroid of the body's visible points, metres, in the camera."""
     alignment: Alignment | None = None
-    """Its motion in the camera, from the reference frame to this one; None where it was not asked for, or where the
-    body was not seen before."""
+    """The body's motion in the camera, from the reference frame to this one. None where it was not asked for, or where
+    the body was not seen before.
+    """
 
 
 @dataclass(frozen=True)
@@ -35,20 +36,21 @@ class Body:
     """A body in one frame, in the world of the run."""
 
     number: int
-    """The same from frame to frame, from 1."""
+    """Number of the body, from 1; the same in all frames."""
     share: float
     """Share of the image that it covers."""
     centroid: Float64[np.ndarray, " 3"]
-    """Centroid of the part of it that is seen, metres, in the world."""
+    """Centroid of the body's visible points, metres, in the world."""
     displacement: Float64[np.ndarray, " 3"]
-    """Way of that centroid since the reference frame, metres, in the world; not-a-number where it is not known."""
+    """Displacement of the centroid since the reference frame, metres, in the world; NaN where it is unknown."""
     rotation: Float64[np.ndarray, " 3"]
-    """Rotation vector since then, radians, in the world; likewise."""
+    """Rotation vector since the reference frame, radians, in the world; NaN where it is unknown."""
     alignment: Alignment | None
-    """Its motion in the camera from the reference frame to this one: covariance and status are of it. None where it
-    was not asked for, or where the body was not seen before."""
+    """The body's motion in the camera from the reference frame to this one, with covariance and status. None where it
+    was not asked for, or where the body was not seen before.
+    """
     field: Float[np.ndarray, "h w"]
-    """Where it is in the image, on a coarse level of it; see `mask`."""
+    """Segmentation on a coarse level of the image; positive where the body is. See `mask`."""
     size: tuple[int, int]
     """Height and width of the image."""
 
@@ -58,12 +60,12 @@ class Body:
         return self.mask_at(self.size)
 
     def mask_at(self, size: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-        """The same of an image of another height and width."""
+        """The body's mask for an image of another height and width."""
         height, width = size
         return cv2.resize(self.field, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
     def moved(self, new_T_old: Float64[np.ndarray, "4 4"]) -> Self:
-        """The same body in another world, in which the camera was found."""
+        """The same body in another world frame."""
         rotation = new_T_old[:3, :3]
         return replace(
             self,
@@ -79,7 +81,7 @@ class Body:
 
 
 BORDER = 1 / 80
-"""Share of the image's width that is left out round a body: a pixel of the level that bodies are seen on."""
+"""Width of the border left out around a body, over the image's width: a pixel of the level that bodies are seen on."""
 
 
 def covered(bodies: Iterable[Body]) -> Bool[np.ndarray, "height width"] | None:
@@ -93,8 +95,8 @@ def without_moving(frame: Frame, moving: Bool[np.ndarray, "height width"] | None
 
     Args:
         frame: The frame.
-        moving: Pixels that do; None: nothing does.
-        border: Width of what is left out around these, over the image's width.
+        moving: Pixels that move; None where nothing does.
+        border: Width of the border left out around these, over the image's width.
     """
     if moving is None:
         return frame
@@ -109,12 +111,13 @@ def in_world(
     world_T_reference: Float64[np.ndarray, "4 4"] | None,
     size: tuple[int, int],
 ) -> Body:
-    """A body where the camera's poses say that it is.
+    """A body placed in the world by the camera's poses.
 
     Args:
-        seen: By the camera.
-        world_T_camera: Of the frame.
-        world_T_reference: Of the frame that its motion is from; None where the camera's own motion since is unknown.
+        seen: The body in the camera.
+        world_T_camera: Pose of the camera at the frame.
+        world_T_reference: Pose at the frame that the body's motion starts from; None where the camera's own motion
+            since is unknown.
         size: Height and width of the image.
     """
     centroid = world_T_camera[:3, :3] @ seen.centroid + world_T_camera[:3, 3]

@@ -1,10 +1,10 @@
 """A second motion kept beside the first until it is clear which one is the camera's.
 
-Where a body covers much of the image from the start, a search ends with the body's motion, or with one that explains
-both to the eye: a turn makes up for a step. One pair of frames can't tell. So what stands before other surfaces is set
-aside, the rest is tracked on its own, and the two motions are compared, frame after frame. What the far part shows on
-its own is the camera's motion if it is well determined and contradicts the other one: a body hides the scene, and not
-the other way round.
+Where a body covers much of the image from the start, a search may find the body's motion. It may also find a compromise
+that seems to explain both, as a rotation looks like a translation. One pair of frames can't tell. So surfaces that
+stand before others are set aside, the rest is tracked on its own, and the two motions are compared frame after frame.
+The far part's motion is the camera's if it is well determined and contradicts the other one: a body occludes the scene,
+not the other way round.
 """
 
 from dataclasses import dataclass, replace
@@ -33,39 +33,39 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 FORGOTTEN = 1.0
-"""Seconds after which it counts as clear whose motion the first one's is."""
+"""Seconds after which the first motion is no longer in question."""
 
 
 class Rival(NamedTuple):
-    """Another motion that may be the camera's, since some frame, its anchor."""
+    """Another motion since some frame, its anchor, that may be the camera's."""
 
     state: AwareState
     """State of the rival's own search."""
     anchor: View
     near: Bool[np.ndarray, "h w"]
-    """What the anchor shows of surfaces that are taken for bodies."""
+    """Pixels of the anchor on surfaces that are taken for bodies."""
     stands_before: Any
-    """Whether these stand before the rest: only then it says something that both searches agree."""
+    """Whether these surfaces stand before the rest: only then does agreement of both searches mean anything."""
     motions: Motions
-    """By the first search, and by the rival's."""
+    """Motions since the anchor, by the first search and by the rival's."""
     age: Span
     """Time since the anchor."""
     ahead: Any
-    """Frames for which the margins have held."""
+    """Consecutive frames for which the margins have been large enough."""
 
     @property
     def is_there(self) -> bool:
-        """Whether there is one."""
+        """Whether there is a rival."""
         return self.age.lasts
 
 
 class RivalledState(NamedTuple):
-    """State of the first search, and of its rival."""
+    """State of the first search and of its rival."""
 
     first: AwareState
     rival: Rival
     open_for: Span
-    """As long as it has been open whether the first one's motion is the camera's."""
+    """How long it has been open whether the first motion is the camera's."""
 
     @property
     def tracker(self) -> TrackerState:
@@ -85,11 +85,11 @@ class WithRival:
 
     @cached_property
     def second(self) -> BodyAware:
-        """Follows the rival, which has to learn as it goes."""
+        """The aligner that tracks the rival; it is eager, as it has to learn as it goes."""
         return BodyAware(self.first.search, self.first.search, is_eager=True)
 
     def warm_up(self) -> float:
-        """That of the first one; votes are compiled, or loaded, when they are needed: few runs do."""
+        """Warm up the first one only; votes are compiled, or loaded, when needed, as few runs need them."""
         return self.first.warm_up()
 
     def warm_up_second(self) -> None:
@@ -102,15 +102,17 @@ class WithRival:
         return self._alone(self.first.blank_state(), OVER)
 
     def start(self, frame: Frame) -> RivalledState:
-        """A scene in which nothing is known to move, and a rival if something stands before the rest. It is open whose
-        motion is found, too, where nothing does: a body may fill the image.
+        """Start with a scene in which nothing is known to move, and a rival if some part of the image stands out as
+        nearer.
+
+        Even without a rival it is open whose motion will be found: a body may fill the image.
         """
         state = self.first.start(frame)
         rival = self._rival_of(state)
         return RivalledState(state, rival, BEGUN)
 
     def predict(self, state: RivalledState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Predict by the first one."""
+        """Predict with the first search."""
         return self.first.predict(state.first, elapsed)
 
     def align(self, state: RivalledState, frame: Frame, clock: Clock) -> Attempt:
@@ -125,17 +127,19 @@ class WithRival:
             if attempt.usable:
                 return self._decide(attempt, other, aged, open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
-            if deviation(other) < EXACT and not depth_is_doubted:  # that motion has ended; whose it was stays open
+            if deviation(other) < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
-        if not attempt.usable:  # should it be used all the same, a rival would have missed a frame
+        if not attempt.usable:  # if it is used all the same, a rival would have missed a frame
             rival = self._nobody
         elif other is not None:
             rival = self._rival_of(attempt.state) if float(open_for.seconds) < DROPPED_AFTER else self._nobody
         return _open(attempt, open_for)._replace(state=RivalledState(attempt.state, rival, open_for))
 
     def _called(self, state: RivalledState, attempt: Attempt) -> tuple[Rival, Span]:
-        """The rival, if there is none a new one where one is needed, and how long it has been open who is the camera's:
-        where the first one's motion is in doubt, or something comes to stand before the rest while that is open.
+        """The rival, and how long the first motion has been in question.
+
+        A new rival is made where there is none and the first motion is in doubt. It is also made where a surface comes
+        to stand before the rest while the question is open.
         """
         rival, open_for, is_doubted = state.rival, state.open_for, bool(attempt.state.is_doubted)
         if rival.is_there or not attempt.usable or not (is_doubted or open_for.lasts):
@@ -144,7 +148,9 @@ class WithRival:
         return rival, BEGUN if rival.is_there and not open_for.lasts else open_for
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span) -> Attempt:
-        """Which of two attempts at a frame stands for it, and whether the rival, of the age it has then, is kept."""
+        """Decide which of two attempts stands for a frame, and whether the rival, which has its age at that frame, is
+        kept.
+        """
         duel = self._duel(attempt, other, rival)
         open_after = OVER if rival.stands_before else open_for
         if duel.is_won:
@@ -159,7 +165,7 @@ class WithRival:
         return attempt._replace(state=RivalledState(attempt.state, kept, open_for))
 
     def _duel(self, attempt: Attempt, other: Attempt, rival: Rival) -> Duel:
-        """How the two stand; the pixels of the anchor are asked only where it matters."""
+        """Compare the two motions; the anchor's pixels vote only where the choice matters."""
         motions = rival.motions.after(attempt.result, other.result)
         duel = Duel.of(motions, attempt.result, deviation(other), rival.age, stands_before=bool(rival.stands_before))
         if not duel.asks_for_votes:
@@ -171,15 +177,16 @@ class WithRival:
     def _taken(
         self, other: Attempt, rival: Rival, open_for: Span, open_after: Span, *, clearly: bool = False
     ) -> Attempt:
-        """The rival's attempt in place of the first one's, by the way from where its camera was believed to be.
+        """The rival's attempt in place of the first one's, its motion starting where the first camera was believed to
+        be.
 
         Args:
-            other: The rival's.
-            rival: Before it, of the age it has then.
-            open_for: How long it was open whose motion the first one's is.
-            open_after: How long it is from now on.
-            clearly: Whether motions that differ by no more than the rival's errors are the same: nothing speaks for
-                the rival but that it goes on.
+            other: The rival's attempt.
+            rival: The rival before the attempt, but with its age after it.
+            open_for: How long the first motion has been in question.
+            open_after: How long it is from this frame on.
+            clearly: Whether motions that differ by no more than the rival's errors count as the same: all that speaks
+                for the rival is that it was not lost.
         """
         first_T_anchor, rival_T_anchor, _ = rival.motions.exact()
         onward = np.asarray(other.result.target_T_reference) @ rival_T_anchor
@@ -187,7 +194,7 @@ class WithRival:
         taken = other._replace(state=self._alone(other.state, open_after), result=result)
         earlier = int(rival.age.frames) - 1
         parted = rival.motions.have_parted(clearly=clearly)
-        if parted or earlier == 0:  # else the motions before were the same by both
+        if parted or earlier == 0:  # else both agreed on the earlier motions
             unknown = max(int(open_for.frames) - earlier - 1, 0)
             taken = taken._replace(unknown=unknown, revises=unknown + earlier)
         return mistrusted(taken)
@@ -203,8 +210,9 @@ class WithRival:
         return RivalledState(state, self._nobody, open_for)
 
     def _rival_of(self, state: AwareState, standing_before: bool = False) -> Rival:
-        """The motion of what the last frame shows behind all that stands before other surfaces, from here on; nobody if
-        only such surfaces are asked for, and there are none.
+        """A new rival from the last frame on: the motion of all that lies behind the nearer surfaces.
+
+        There is none if nothing is nearer than the rest, or if `standing_before` and no surface stands before others.
         """
         segmenter, anchor = self.first.segmenter, _view(state)
         near, stands_before = nearer_part(inverse_depth_of(anchor))
@@ -227,18 +235,18 @@ class WithRival:
 
 
 def _open(attempt: Attempt, open_for: Span) -> Attempt:
-    """The attempt; its motion is unknown where it may be a body's, as the ones before may have been."""
+    """Mark an attempt's motion as unknown if it may be a body's and earlier ones may be, too."""
     doubted = open_for.lasts and AlignmentStatus.MOVING_BODY in attempt.result.statuses
     return attempt._replace(unknown=1) if doubted else attempt
 
 
 def _view(state: AwareState) -> View:
-    """Return the last frame's view, on the host: to slice a device's array takes a program."""
+    """Return the last frame's view on the host: slicing an array on the device would compile a program."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], state.scene.views)
 
 
 def _returned(result: Alignment, motion: Float64[np.ndarray, "4 4"]) -> Alignment:
-    """The rival's result with the way from where the first one's camera was believed to be: that is not known well."""
+    """The rival's result with its motion starting where the first camera was believed to be, which is poorly known."""
     return result._replace(
         target_T_reference=motion,
         xi=log(motion).astype(np.float32),

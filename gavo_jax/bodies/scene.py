@@ -1,4 +1,4 @@
-"""What is kept of earlier frames' images, to tell what moves in the next one."""
+"""What is kept of earlier images to tell what moves in the next one."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -25,53 +25,54 @@ from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
 OLD = 0.22
-"""Age in seconds at which the view between takes the place of the older one."""
+"""Age in seconds at which the middle view replaces the older one."""
 FAR_OFF = 0.7
-"""Share of what is at rest that the older view sees, below which it is replaced at once: over a long way, errors of the
-poses and other light look like bodies."""
+"""Share of the static scene inside the older view below which it is replaced at once. Over a long way, pose errors and
+other light look like bodies.
+"""
 
 
 class Scene(NamedTuple):
-    """What is known of the last frame's image, and of older ones to compare the next one with."""
+    """What is known of the last image, and of older ones to compare the next one with."""
 
     known: Float[Array, "h w"]
-    """What is known of the last frame's pixels; see `Belief.known`."""
+    """Belief about the last frame's pixels; see `Belief.known`."""
     suspected: Float[Array, "h w"]
-    """Which of these pixels are suspected; see `belief.suspect`."""
+    """Suspicion of the last frame's pixels; see `belief.suspect`."""
     tracks: BodyTracks
-    """The bodies that it shows."""
+    """The bodies that the last frame shows."""
     views: View
-    """Views of the last frame, an older one and one between them, [3]: what moves slowly shows in the older one."""
+    """Views of the last frame, of an older one and of one between them, [3]: slow motion shows in the older one."""
     views_T_last: Float[Array, "3 4 4"]
-    """Motions from the last frame's camera into these."""
+    """Motions from the last frame's camera into those of `views`."""
     age: Float[np.ndarray, ""]
-    """Seconds since the one between them."""
+    """Age of the middle view, seconds."""
     carried: Float[np.ndarray, ""]
-    """Seconds for which the last motion has stood in for one that could not be found."""
+    """Seconds for which the last motion has stood in for one that was not found."""
 
 
 class AwareState(NamedTuple):
     """State of a search and what is known of the scene."""
 
     tracker: TrackerState
-    """Its references have no points on bodies."""
+    """State of the search; its references have no points on bodies."""
     scene: Scene
     whole: Reference
-    """The last frame's points with those on bodies."""
+    """The last frame's points, including those on bodies."""
     is_doubted: Any = np.zeros((), bool)
-    """Whether the last motion may be a body's, by a stricter measure than the status's."""
+    """Whether the last motion may be a body's, by a stricter measure than its status."""
 
 
 class FrameView(NamedTuple):
-    """A new frame as it looks if some motion is the camera's."""
+    """A new frame, as it looks if some motion is the camera's."""
 
     belief: Belief
-    """What the motion says of the new frame's pixels."""
+    """Belief about the new frame's pixels under that motion."""
     views: View
-    """The scene's, should that be its motion, and `views_T_here` the motions into them."""
+    """The scene's views under that motion, the new frame among them; `views_T_here` are the motions into them."""
     views_T_here: Float[Array, "3 4 4"]
     opinion: Opinion | None
-    """What the area of the last frame says of that motion; None where an image is too small to be asked."""
+    """Opinion of the last frame's area on that motion; None where the image is too small for blocks."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class MotionSegmenter:
         return self.camera.height, self.camera.width
 
     def view(self, tracker: TrackerState) -> View:
-        """Return a tracker's last frame, on the host: to slice a device's array takes a program."""
+        """Return a tracker's last frame on the host: slicing an array on the device would compile a program."""
         sweep = np.asarray(tracker.instant_motion) * readout_share(self.full, np.asarray(tracker.seconds))
         return self._cut(tracker, sweep)
 
@@ -122,8 +123,8 @@ class MotionSegmenter:
         return Scene(unknown, unknown, BodyTracks.empty(self.size), views, still, nothing, nothing)
 
     def first(self, tracker: TrackerState) -> Scene:
-        """A scene of which one frame is known."""
-        unknown = np.full(6, np.nan, np.float32)  # of the type of every scene's: another one takes another program
+        """A scene with a single known frame."""
+        unknown = np.full(6, np.nan, np.float32)  # the dtype of every scene: another one would compile another program
         view = self._cut(tracker, unknown)
         return self.blank()._replace(views=jax.tree.map(lambda leaf: np.stack([leaf] * 3), view))
 
@@ -132,7 +133,7 @@ class MotionSegmenter:
         return view_of(image, self.levels, sweep)
 
     def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> FrameView:
-        """What a motion makes of the new frame's pixels, and what the last frame's say of it."""
+        """The belief about a new frame's pixels under a motion, and the last frame's opinion on that motion."""
         keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
@@ -144,7 +145,7 @@ class MotionSegmenter:
         )
 
     def look_back(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> Belief:
-        """What a motion makes of the last frame's pixels, on the host."""
+        """The belief about the last frame's pixels under a motion, on the host."""
         belief = _look_back(
             (scene.known, scene.views),
             (tracker.previous_image, tracker.instant_motion, tracker.seconds),
@@ -155,7 +156,7 @@ class MotionSegmenter:
         return jax.device_get(belief)
 
     def renewed(self, scene: Scene, look: FrameView, elapsed: float) -> Scene:
-        """The scene with the new frame as its last one, so many seconds later."""
+        """The scene with the new frame as its last one, after `elapsed` seconds."""
         is_far_off = np.asarray(look.belief.in_view)[1] < FAR_OFF
         age = OLD if is_far_off else _age_after(scene, elapsed)
         return scene._replace(
@@ -171,7 +172,7 @@ class MotionSegmenter:
 
 
 def _age_after(scene: Scene, elapsed: float) -> float:
-    """Return the view's age, seconds, between the last frame and the older one; 0 where it became the older one."""
+    """Return the age of the middle view, seconds, at the new frame; 0 where that view becomes the older one."""
     age = float(scene.age) + elapsed
     return age if age < OLD else 0.0
 
@@ -186,7 +187,7 @@ def _look(
     *,
     levels: Levels,
 ) -> FrameView:
-    """One program for all that is asked about every frame: a call costs more than what it computes."""
+    """Evaluate in one program all that every frame needs: a call costs more than what it computes."""
     before, suspected, views, views_T_last = known
     image, instant_motion, seconds = new
     here = view_of(image, levels, instant_motion * readout_share(camera, seconds))
@@ -211,7 +212,7 @@ def _look_back(
     *,
     levels: Levels,
 ) -> Belief:
-    """One program, so that it is kept between processes: it is asked for in the middle of a run."""
+    """Form the belief in a program that is cached between processes: it is first needed in the middle of a run."""
     before, views = known
     image, instant_motion, seconds = new
     here = view_of(image, levels, instant_motion * readout_share(camera, seconds))

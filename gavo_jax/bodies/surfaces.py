@@ -1,7 +1,7 @@
-"""Which surfaces stand before others: what may be a body, told from one depth image.
+"""Surfaces that stand before others: what may be a body, according to one depth image.
 
-A body hides the scene and not the other way round. So the surfaces that stand before their neighbours are those that
-may move, whatever the motion.
+A body occludes the scene, not the other way round. So surfaces that stand before their neighbours may move, whatever
+the motion.
 """
 
 from typing import NamedTuple
@@ -11,39 +11,41 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 FLAT, FLAT_NOISE = 0.02, 0.004
-"""Share of the larger inverse depth, and 1/m added to it: two neighbours that differ by less lie on one surface."""
+"""Step of inverse depth, relative to the larger one plus 1/m, below which two neighbours lie on one surface."""
 STEP, STEP_NOISE = 0.04, 0.01
-"""The same: of two neighbours that differ by more, one stands before the other."""
+"""Step of inverse depth, relative to the larger one plus 1/m, above which one neighbour stands before the other."""
 WIDEST_SHADOW = 6
-"""Pixels without depth across which two surfaces still are neighbours."""
+"""Distance in pixels, across missing depth, up to which two surfaces are still neighbours."""
 BEFORE = 0.75
-"""Share of its border along which a surface has to stand before its neighbours to count as one that may move."""
+"""Share of its border along which a surface has to stand before its neighbours to count as a candidate."""
 LEAST_BORDER = 8
-"""Fewest pixels of such a border."""
+"""Fewest pixels of border along which a candidate stands before its neighbours."""
 LEAST_AREA = 0.015
-"""Smallest share of the image that such a surface covers."""
+"""Smallest share of the image that a candidate covers."""
 MOST_TOGETHER = 0.5
-"""Share of the image up to which smaller surfaces than the largest one count, too."""
+"""Share of the image up to which smaller candidates than the largest one count, too."""
 LEAST_NEAR, MOST_NEAR = 0.04, 0.95
-"""Share of the image that may move together; less or more is not worth to ask about."""
+"""Smallest and largest share of the image worth setting aside as a possible body."""
 PART, LARGEST_COMPLETED = 0.3, 0.6
-"""Share of such a surface that moves, from which on all of it does, if it fills no more of the image than this."""
+"""Share of a surface that has to move for all of it to count as moving, and the largest share of the image that it
+fills.
+"""
 BINS = 64
 
 
 class NearerPart(NamedTuple):
-    """The pixels of what may be a body; none where nothing may."""
+    """Pixels that may be a body; none where nothing may."""
 
     mask: Bool[np.ndarray, "h w"]
     stands_before: bool
-    """Whether these are surfaces that stand before others, and not just the nearer part of the image."""
+    """Whether these surfaces stand before others, and are not just the nearer part of the image."""
 
 
 def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
     """Surfaces that stand before others, or else the nearer part of the image.
 
     Args:
-        inverse_depth: 1/m; 0 where there is no reading.
+        inverse_depth: Inverse depth, 1/m; 0 where there is no reading.
     """
     for find, stands_before in ((standing_before, True), (_nearer_class, False)):
         mask = find(inverse_depth)
@@ -53,20 +55,22 @@ def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
 
 
 def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The pixels of surfaces that stand before their neighbours along most of their border."""
+    """Pixels of surfaces that stand before their neighbours along most of their border."""
     return _standing_surfaces(inverse_depth) > 0
 
 
 def whole_surfaces(
     bodies: Integer[np.ndarray, "h w"], lately: Bool[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
 ) -> Integer[np.ndarray, "h w"]:
-    """Bodies with all of each surface that stands before others and of which a part is theirs: a body that turns is
-    nearly at rest about its axis. Where no body was seen on the rest they only seem to be one surface.
+    """Extend each body to the whole of a surface that stands before others and of which a large part is the body's.
+
+    A body that turns is nearly at rest about its axis. Where no body was recently seen on the rest of the surface, the
+    two only seem to be one surface.
 
     Args:
         bodies: Number of the body that each pixel shows, 0 for none.
-        lately: Where a body was seen lately.
-        inverse_depth: 1/m; 0 where there is no reading.
+        lately: Where a body was seen recently.
+        inverse_depth: Inverse depth, 1/m; 0 where there is no reading.
     """
     if not np.any(bodies):
         return bodies
@@ -81,7 +85,7 @@ def whole_surfaces(
 
 
 def _standing_surfaces(inverse_depth: Float[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:
-    """A number for each pixel of a surface that stands before its neighbours along most of its border; else 0."""
+    """Label each pixel of a surface that stands before its neighbours along most of its border; 0 elsewhere."""
     labels, count = _surfaces(inverse_depth)
     before, behind = np.zeros(count), np.zeros(count)
     for q, surface in ((inverse_depth, labels), (inverse_depth.T, labels.T)):
@@ -102,7 +106,7 @@ def _standing_surfaces(inverse_depth: Float[np.ndarray, "h w"]) -> Integer[np.nd
 
 
 def _surfaces(q: Float[np.ndarray, "h w"]) -> tuple[Integer[np.ndarray, "h w"], int]:
-    """A number for each pixel's surface, and how many there are; pixels and the ties between them make one image."""
+    """Label each pixel's surface, and count the labels; pixels and the ties between them form one image."""
     height, width = q.shape
     ties = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
     ties[::2, ::2] = q > 0
@@ -117,7 +121,7 @@ def _tied(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _nearer_class(q: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The nearer one of two classes of inverse depth, by Otsu's threshold."""
+    """The nearer of two classes of inverse depth, by Otsu's threshold."""
     known = q[q > 0]
     if known.size == 0 or known.min() == known.max():
         return np.zeros(q.shape, bool)

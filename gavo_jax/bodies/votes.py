@@ -1,7 +1,7 @@
-"""Two motions before the image's area: which of them explains each block better.
+"""Votes of an image's area between two motions: which one explains each block better.
 
-A comparison needs one measure. So residuals of both are taken on the pixels that both see, in units of the scale that
-the better one of them leaves.
+The comparison needs one measure. So the residuals of both are taken on pixels that both see, in units of the scale that
+the better one leaves.
 """
 
 from functools import partial
@@ -17,11 +17,11 @@ from gavo_jax.camera import Camera
 from gavo_jax.compilation.programs import CachedProgram
 
 DECISIVE = 6.0
-"""Difference of two costs from which on a block has its whole vote."""
+"""Difference of two costs from which on a block casts its whole vote."""
 QUORUM = 0.5
-"""Part of the blocks that have to be in view of both for a margin to count in full."""
+"""Share of the area that has to be in view of both for a margin to count in full."""
 FREEDOM = 5.0
-"""Degrees of freedom of the t distribution that a pixel's cost is of (Kerl et al. 2013)."""
+"""Degrees of freedom of the t-distribution that defines a pixel's cost (Kerl et al. 2013)."""
 
 
 class Margin(NamedTuple):
@@ -38,10 +38,10 @@ def vote(here: View, there: View, motions: Float[Array, "2 4 4"], near: Bool[Arr
     """Have the blocks of a view choose between two motions into another; a block counts by the area of its surface.
 
     Args:
-        here: The view whose blocks are asked.
+        here: The view whose blocks vote.
         there: The other view.
         motions: The two motions there_T_here.
-        near: Pixels of `here` that are not of its far part.
+        near: Pixels of `here` outside its far part.
         camera: Camera of the views' level.
     """
     others = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), there)
