@@ -56,7 +56,7 @@ class Body:
 
     @cached_property
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """Pixels of the image, without distortion, that the body covers."""
+        """Pixels of the undistorted image that the body covers."""
         return self.mask_at(self.size)
 
     def mask_at(self, size: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:

@@ -102,8 +102,7 @@ class WithRival:
         return self._alone(self.first.blank_state(), OVER)
 
     def start(self, frame: Frame) -> RivalledState:
-        """Start with a scene in which nothing is known to move, and a rival if some part of the image stands out as
-        nearer.
+        """Start with a scene in which nothing is known to move, and a rival where part of the image is nearer.
 
         Even without a rival it is open whose motion will be found: a body may fill the image.
         """
@@ -148,9 +147,7 @@ class WithRival:
         return rival, BEGUN if rival.is_there and not open_for.lasts else open_for
 
     def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span) -> Attempt:
-        """Decide which of two attempts stands for a frame, and whether the rival, which has its age at that frame, is
-        kept.
-        """
+        """Decide which of two attempts stands for a frame, and whether the rival, of its age then, is kept."""
         duel = self._duel(attempt, other, rival)
         open_after = OVER if rival.stands_before else open_for
         if duel.is_won:
@@ -177,8 +174,7 @@ class WithRival:
     def _taken(
         self, other: Attempt, rival: Rival, open_for: Span, open_after: Span, *, clearly: bool = False
     ) -> Attempt:
-        """The rival's attempt in place of the first one's, its motion starting where the first camera was believed to
-        be.
+        """The rival's attempt in place of the first one's, moving from where the first camera was believed to be.
 
         Args:
             other: The rival's attempt.

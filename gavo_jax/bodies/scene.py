@@ -77,11 +77,11 @@ class FrameView(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionSegmenter:
-    """The level of the pyramid that bodies are seen on, and how beliefs are formed there.
+    """Forms beliefs about what moves, on the level of the pyramid that bodies are seen on.
 
     Attributes:
         full: Camera of level 0.
-        settings: Of the search.
+        settings: Settings of the search.
     """
 
     full: Camera
@@ -89,7 +89,7 @@ class MotionSegmenter:
 
     @cached_property
     def levels(self) -> Levels:
-        """The levels searched."""
+        """The searched levels."""
         return levels_of(self.full, self.settings.solver, self.settings.alignment)
 
     @cached_property
@@ -99,12 +99,12 @@ class MotionSegmenter:
 
     @cached_property
     def planes(self) -> ImagePlane:
-        """Image planes of the levels searched, on the host."""
+        """Image planes of the searched levels, on the host."""
         return jax.tree.map(np.asarray, self.levels.planes(self.full))
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of that level."""
+        """Height and width of the level that bodies are seen on."""
         return self.camera.height, self.camera.width
 
     def view(self, tracker: TrackerState) -> View:

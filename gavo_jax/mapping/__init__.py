@@ -1,1 +1,1 @@
-"""A map of keyframes: loops, a pose graph, and the way back after a loss."""
+"""A map of keyframes: loop closures, a pose graph, and relocalisation."""

@@ -1,6 +1,6 @@
-"""A map that is made beside the tracking: a worker takes notice of the frames, in order, while others are aligned.
+"""A mapper in the background: a worker thread watches the frames, in order, while later ones are aligned.
 
-Tracking never looks at the map but where a frame has to be found in it, and then the map has seen all frames before. So
+Tracking looks at the map only to find a frame in it, and waits until the map has seen all frames before that one. So
 the result is that of a map made frame by frame, whatever the timing.
 """
 
@@ -18,13 +18,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 MOST_AHEAD = 16
-"""Frames that the tracking may be ahead of the map, then it waits: that bounds memory, and what an end waits for."""
+"""Frames that tracking may be ahead of the map before it waits: this bounds memory, and the wait at the end."""
 
 
 class BackgroundMapper:
-    """A mapper that works in a thread of its own.
-
-    What goes wrong there is raised by a later call.
+    """A mapper that works in a thread of its own; its errors are raised by a later call.
 
     Args:
         mapper: The mapper that works there; nobody else may use it meanwhile.
@@ -36,35 +34,35 @@ class BackgroundMapper:
         self._ahead: deque[Future[Any]] = deque()
 
     def warm_up(self) -> float:
-        """Compile what is needed, or load it; the seconds this took."""
+        """Compile what is needed, or load it; return the seconds this took."""
         return self._after_all(self.mapper.warm_up)
 
     def watch(self, frame: Frame | None, step: Step | None) -> None:
-        """Take notice of a frame, soon; see `Mapper.watch`."""
+        """Queue a frame for the mapper; see `Mapper.watch`."""
         self._wait_for(MOST_AHEAD - 1)
         self._ahead.append(self._worker.submit(in_32_bits(self.mapper.watch), frame, step))
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Return where a frame was taken, by a map of all frames before; see `driver.Relocaliser`."""
+        """Return where a frame was taken, by a map of all earlier frames; see `driver.Relocaliser`."""
         return self._after_all(self.mapper.find, frame, segment)
 
     def replay(
         self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving, is_drawn_on: bool = False
     ) -> None:
-        """Take notice of what a run did before it was cut short; see `Mapper.replay`."""
+        """Rebuild the map of a run that was cut short; see `Mapper.replay`."""
         self._after_all(self.mapper.replay, sequence, steps, moving, is_drawn_on)
 
     def finish(self, steps: Iterable[Step] = ()) -> Loops:
-        """The whole map; see `Mapper.finish`."""
+        """Finish the map; see `Mapper.finish`."""
         return self._after_all(self.mapper.finish, steps)
 
     def _after_all(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-        """What a function returns that the worker runs once the map has seen all frames."""
+        """Run a function in the worker once the map has seen all frames, and return its result."""
         self._wait_for(0)
         return self._worker.submit(in_32_bits(work), *args, **kwargs).result()
 
     def _wait_for(self, most: int) -> None:
-        """Wait until the worker has no more than so many frames left."""
+        """Wait until the worker has at most that many frames left."""
         while self._ahead and (len(self._ahead) > most or self._ahead[0].done()):
             self._ahead[0].result()
             self._ahead.popleft()

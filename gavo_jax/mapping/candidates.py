@@ -1,4 +1,4 @@
-"""Which earlier keyframes may show what a new one shows: those that would look like it from where it stands."""
+"""Loop candidates: earlier keyframes that, from where a new one stands, would look like it."""
 
 from typing import NamedTuple
 
@@ -12,23 +12,25 @@ from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MOST = 4
-"""Candidates of one keyframe, which bounds the work."""
+"""Maximum number of candidates per keyframe, which bounds the work."""
 LOOKED_AT = 48
-"""Earlier keyframes, those that see most of what the new one sees, that are compared with it: this bounds the work."""
+"""Maximum number of earlier keyframes compared with a new one, those that see most of the same; it bounds the work."""
 FEW_POINTS = 60
-"""Points of the new keyframe by which these are chosen."""
+"""Points of the new keyframe that are used to choose these."""
 MIN_SECONDS = 0.2
-"""Least time between the two keyframes: within that, the odometry's own keyframe saw both, and nothing is learnt."""
+"""Shortest time between the two keyframes, seconds: within it, the odometry's own keyframe saw both, and nothing is
+learnt.
+"""
 MIN_OVERLAP = 0.5
-"""Smallest predicted share of either keyframe's points that the other one sees."""
+"""Smallest predicted share of the points of either keyframe that the other one sees."""
 NEARLY = 0.8
-"""Part of that, by few points, from which on a keyframe is looked at more closely."""
+"""Part of `MIN_OVERLAP`, by few points, from which on a keyframe is examined more closely."""
 MIN_LIKENESS = 0.88
 """Smallest correlation of the grey of what both keyframes see."""
 APART = 2
-"""Keyframes between two candidates: neighbours would say the same twice."""
+"""Least distance between two candidates, in keyframes: neighbours would add no information."""
 ANOTHER_GUESS = (0.02, 0.02)
-"""Metres and radians by which a guess has to differ from one that led to nothing."""
+"""Metres or radians by which a guess has to differ from one that led to nothing."""
 
 
 class LoopCandidate(NamedTuple):
@@ -37,15 +39,15 @@ class LoopCandidate(NamedTuple):
     earlier: Keyframe
     later: Keyframe
     later_T_earlier: Float64[np.ndarray, "4 4"]
-    """The motion between the two as it is known now: the guess."""
+    """The motion between the two, as known at this time; it is the guess."""
     overlap: float
-    """Predicted share of the points of either keyframe that the other one sees, the smaller one of the two."""
+    """Predicted share of the points of either keyframe that the other one sees; the smaller one of the two."""
     likeness: float
-    """Correlation of the grey of what both see, the smaller one of the two directions."""
+    """Correlation of the grey of what both keyframes see; the smaller one of the two directions."""
 
 
 def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[LoopCandidate]:
-    """The candidates of a keyframe among earlier ones that have their images, the likest first; no more than `MOST`.
+    """Find a keyframe's candidates among earlier ones that have their images: at most `MOST`, the most similar first.
 
     Args:
         new: The later keyframe.
@@ -71,7 +73,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
 
 
 def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
-    """Those of some earlier keyframes that were not tried yet and see most of what a new one sees."""
+    """Earlier keyframes that were not tried yet and see most of what the new one sees."""
     old = [o for o in others if new.timestamp - o.timestamp >= MIN_SECONDS and not _was_tried(new, o)]
     points = new.thumbnail.points[:, :: max(1, new.thumbnail.points.shape[1] // FEW_POINTS)]
     if not old or not points.size:
@@ -85,7 +87,7 @@ def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> 
 
 
 def _was_tried(new: Keyframe, other: Keyframe) -> bool:
-    """Whether they are linked, or were aligned in vain from about the same guess."""
+    """Whether two keyframes are linked, or an alignment from about the same guess failed."""
     if other.number in new.linked:
         return True
     guess = new.tried.get(other.number)

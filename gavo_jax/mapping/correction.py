@@ -1,4 +1,4 @@
-"""A run's trajectory as its map corrects it."""
+"""Correction of a run's trajectory by its map."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,29 +13,30 @@ from gavo_jax.rigid_motions import interpolate
 from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 IN_DOUBT = 100.0
-"""How much more a guessed motion counts than one that was found, where a correction has to change."""
+"""Weight of a guessed motion over that of one that was found, where a correction changes along the trajectory."""
 
 
 class Doubts(NamedTuple):
     """Which poses of a trajectory are no more than guesses."""
 
     guessed: Bool[np.ndarray, " n"]
-    """Poses whose motion from the one before is a guess: lost, or taken to have gone on behind a body."""
+    """Poses whose motion from the last one is a guess: lost, or taken to have gone on behind a body."""
     lost: Bool[np.ndarray, " n"]
     """Guessed poses of frames that were lost."""
 
 
 def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) -> Trajectory:
-    """A trajectory of the odometry corrected as its keyframes were.
+    """Correct a trajectory of the odometry as its keyframes were corrected.
 
-    Between two keyframes the correction changes over from one's to the other's, along the screw that joins the two
-    poses which they give; where motions between them are guesses, nearly all of it there. Segments that a loop joins
-    become one.
+    Between two keyframes the correction blends from one's to the other's, along the screw between the poses that they
+    give. Where motions in between are guesses, nearly all of the change is put there. Segments that a loop joins become
+    one.
 
     Args:
-        odometry: The trajectory, as the odometry has it.
-        loops: The map, with its keyframes as they were corrected.
-        doubts: Which poses are guesses; those that are lost are put between those around, if these belong together.
+        odometry: The trajectory of the odometry.
+        loops: The map, with its corrected keyframes.
+        doubts: Which poses are guesses. Lost poses are interpolated between their neighbours if these are of one
+            segment.
     """
     placed = _placed(loops.keyframes, odometry)
     if not placed:
@@ -59,8 +60,10 @@ def correct(odometry: Trajectory, loops: Loops, doubts: Doubts | None = None) ->
 
 
 def _placed(keyframes: list[Keyframe], odometry: Trajectory) -> list[tuple[Keyframe, int]]:
-    """Keyframes with their places among the poses: both are in the order in which the frames came, which need not be
-    that of their stamps, as a clock may have been set back. The map may be ahead of a run that was interrupted.
+    """Keyframes with their indices among the poses.
+
+    Both are in the order in which the frames came. That need not be the order of their timestamps, as a clock may have
+    been set back. The map may be ahead of a run that was interrupted.
     """
     places_of: dict[str, list[int]] = {}
     for i, stamp in enumerate(odometry.timestamps.tolist()):
@@ -76,9 +79,7 @@ def _placed(keyframes: list[Keyframe], odometry: Trajectory) -> list[tuple[Keyfr
 
 
 def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64[np.ndarray, " n"]:
-    """Seconds since the first pose, those of a guessed motion counted more often; where a clock was set back, the usual
-    time passes.
-    """
+    """Seconds since the first pose; guessed motions count more. Where a clock was set back, the usual time passes."""
     between = np.diff(stamps)
     grows = between > 0
     usual = np.median(between[grows]) if np.any(grows) else 1.0
@@ -87,7 +88,7 @@ def _passed(stamps: Float64[np.ndarray, " n"], doubts: Doubts | None) -> Float64
 
 
 def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
-    """A trajectory with the poses that were lost between two others of one segment put on the way between these."""
+    """Interpolate the poses that were lost between two others of the same segment."""
     known = np.flatnonzero(~lost)
     poses, segments = trajectory.world_T_camera.copy(), trajectory.segments
     passed = _passed(trajectory.timestamps, None)
@@ -100,19 +101,19 @@ def bridged(trajectory: Trajectory, lost: Bool[np.ndarray, " n"]) -> Trajectory:
 
 
 def _begins(keyframes: Sequence[Keyframe], number: int, segment: int) -> bool:
-    """Whether a frame before that keyframe belongs to it and not to the one before."""
+    """Whether a frame before a keyframe belongs to that keyframe rather than to the one before."""
     return number < len(keyframes) and keyframes[number].segment == segment
 
 
 def joined(segments: Int[np.ndarray, " n"], loops: Loops) -> Int[np.ndarray, " n"]:
-    """The segments of poses, those that loops join under the number of the first of them."""
+    """Segments of poses, where those that loops join get the number of the first of them."""
     weighted = zip(loops.edges, loops.solution.weights, strict=True)
     first = tied_segments(loops.keyframes, (edge for edge, weight in weighted if weight > COUNTED))
     return np.array([first.get(int(segment), int(segment)) for segment in segments])
 
 
 def loop_figures(loops: Loops) -> dict[str, int | float]:
-    """Entries of metrics.json that tell of the map."""
+    """Entries of metrics.json about the map."""
     counted = int(np.sum(loops.solution.weights > COUNTED))
     return {
         "keyframes": len(loops.keyframes),

@@ -1,4 +1,4 @@
-"""Keyframes: the frames that a map is made of, few enough to be bounded, near enough to overlap."""
+"""Keyframes: the frames that a map is made of, few enough to bound memory, close enough to overlap."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
@@ -16,35 +16,37 @@ from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
 MAX_IMAGES = 300
-"""Keyframes that keep their images, and what was made of these: some 0.45 MB each at 640 x 480. Of more the most
-redundant one loses them, and keeps what the graph needs, some 2 kB."""
+"""Maximum number of keyframes that keep their images, and what was made of these: some 0.45 MB each at 640 x 480.
+Beyond it the most redundant keyframe gives them up, and keeps what the graph needs, some 2 kB.
+"""
 SPACING = 0.15
-"""Shift of the image, radians, after which a new keyframe is due: 9 degrees, or 15 cm at 1 m."""
+"""Image shift, radians, after which a new keyframe is due: 9 degrees, or 15 cm at 1 m."""
 SMALLER = 3
-"""Pyramid level, from the keyframe's images, of the small blurred image that tells whether two keyframes look alike
-(Klein and Murray, ECCV 2008); 40 x 30 pixels of a frame of 640 x 480."""
+"""Pyramid level, counted from the keyframe's images, of the small blurred image that tells whether two keyframes look
+alike (Klein and Murray, ECCV 2008). It has 40 x 30 pixels for a frame of 640 x 480.
+"""
 FEWEST_PIXELS = 60
-"""Of that image; it is of a finer level where frames are smaller than about 150 x 110."""
+"""Fewest pixels of the small image; it is of a finer level where frames are smaller than about 150 x 110."""
 BLUR = 1.0
-"""Standard deviation of that image's blur, in its pixels."""
+"""Standard deviation of the small image's blur, in its pixels."""
 FEWEST = 30
-"""Fewest points that have to be seen for two thumbnails to be compared."""
+"""Fewest points that have to be visible for two thumbnails to be compared."""
 USUAL_DISTANCE = 2.0
-"""Median depth, metres, that is taken where depth says nothing."""
+"""Median depth, metres, that is assumed where there is no depth."""
 
 
 class Thumbnail(NamedTuple):
-    """A small blurred image, and where the things are that it shows."""
+    """A small blurred image, and the 3-D points that it shows."""
 
     small: Float32[np.ndarray, "h w"]
     points: Float64[np.ndarray, "3 n"]
-    """Points that its pixels with a reading show, metres in the camera."""
+    """Points that the pixels with a reading show, metres in the camera."""
     grey: Float32[np.ndarray, " n"]
-    """Grey of these pixels."""
+    """Grey of the pixels with a reading."""
 
     @classmethod
     def of(cls, images: CompensatedImages, camera: Camera) -> Self:
-        """That of a keyframe's images, and their camera."""
+        """The thumbnail of a keyframe's images, taken by `camera`."""
         level = level_of_thumbnail(camera)
         tiny, side = camera.level(level), 2**level
         small = cv2.resize(images.grey, (tiny.width, tiny.height), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -63,7 +65,7 @@ class Thumbnail(NamedTuple):
     def agreement(
         self, other: "Thumbnail", other_T_self: Float64[np.ndarray, "4 4"], camera: Camera
     ) -> tuple[float, float]:
-        """How well another one shows the same from another pose.
+        """How well another thumbnail shows the same from another pose.
 
         Args:
             other: The other keyframe's thumbnail.
@@ -85,7 +87,7 @@ class Thumbnail(NamedTuple):
 
 
 def level_of_thumbnail(camera: Camera) -> int:
-    """Pyramid level of the small image, from the images of keyframes of a camera."""
+    """Pyramid level of the small image, counted from the images of a camera's keyframes."""
     coarse_to_fine = range(SMALLER, 0, -1)
     return next((k for k in coarse_to_fine if (camera.width >> k) * (camera.height >> k) >= FEWEST_PIXELS), 0)
 
@@ -95,7 +97,7 @@ NOTHING_SEEN = Thumbnail(np.zeros((0, 0), np.float32), np.zeros((3, 0)), np.zero
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's, 0 where one of the two is flat."""
+    """Pearson correlation; 0 where one of the two is flat."""
     a, b = a - a.mean(), b - b.mean()
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float((a * b).sum()) / size if size > 1e-3 else 0.0
@@ -129,7 +131,7 @@ class Keyframe:
     images: CompensatedImages | None
     thumbnail: Thumbnail
     tried: dict[int, Float64[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Earlier keyframes that it was aligned with, by number, with the guess of that."""
+    """Guesses from which it was aligned with earlier keyframes, by their numbers."""
     linked: set[int] = field(default_factory=set)
     """Numbers of the earlier keyframes that it has an edge to."""
     features: Features | None = None
@@ -137,27 +139,27 @@ class Keyframe:
     """Whether something speaks against the odometry's motion from the keyframe before."""
 
     def give_up_images(self) -> None:
-        """Forget all that is heavy; the pose stays."""
+        """Drop all that takes memory; the pose stays."""
         self.images, self.thumbnail, self.features = None, NOTHING_SEEN, None
         self.tried.clear()
 
 
 def shift(a_T_b: Float64[np.ndarray, "*n 4 4"], distance: float) -> Float64[np.ndarray, "*n"]:
-    """How far motions shift the image of things at a distance (m), about, in radians."""
+    """About how far motions shift the image of a scene at a distance in metres, radians."""
     length, angle = length_and_angle(a_T_b)
     return angle + length / max(distance, 0.1)
 
 
 def shifts(world_T_camera: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "n n"]:
     """`shift` between any two of some poses."""
-    # entry by entry: in a product of matrices this small the threads of BLAS cost many times what they give
+    # entry by entry: for matrices this small the threads of BLAS cost many times what they save
     trace = sum(entry[:, None] * entry for entry in world_T_camera[:, :3, :3].reshape(-1, 9).T)
     squared = sum((axis[:, None] - axis) ** 2 for axis in world_T_camera[:, :3, 3].T)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) + np.sqrt(squared) / max(distance, 0.1)
 
 
 class Keyframes:
-    """The keyframes of a run, in their order.
+    """The keyframes of a run, in order.
 
     Args:
         camera: Camera of the frames as they come, without distortion.
@@ -169,7 +171,7 @@ class Keyframes:
         self.all: list[Keyframe] = []
 
     def is_due(self, world_T_camera: Float64[np.ndarray, "4 4"], segment: int) -> bool:
-        """Whether a frame at a pose of the odometry should become one."""
+        """Whether a frame at a pose of the odometry should become a keyframe."""
         if not self.all or self.all[-1].segment != segment:
             return True
         last = self.all[-1]
@@ -184,7 +186,7 @@ class Keyframes:
         twist: Float64[np.ndarray, " 6"],
         step: Float64[np.ndarray, "6 6"] | None = None,
     ) -> Keyframe:
-        """A frame as the next keyframe, which it is not yet.
+        """Make a keyframe of a frame, without adding it.
 
         Args:
             frame: The images.
@@ -209,8 +211,8 @@ class Keyframes:
         )
 
     def add(self, keyframe: Keyframe) -> None:
-        """Keep a keyframe, placed as the last one of its segment was corrected; another one's images are given up where
-        there are too many.
+        """Add a keyframe, corrected like the last one of its segment; if there are too many images, drop those of
+        another.
         """
         before = next((other for other in reversed(self.all) if other.segment == keyframe.segment), None)
         if before is not None:
@@ -220,12 +222,14 @@ class Keyframes:
         self._thin()
 
     def searchable(self) -> list[Keyframe]:
-        """Those that have their images."""
+        """Keyframes that have their images."""
         return [keyframe for keyframe in self.all if keyframe.images is not None]
 
     def _thin(self) -> None:
-        """Give up images where there are too many, those of the later one of the two keyframes that are nearest to each
-        other: the older a keyframe, the more a loop to it tells.
+        """Drop the images of one keyframe where there are too many.
+
+        It is the later one of the two keyframes that are nearest to each other: the older a keyframe, the more a loop
+        to it tells.
         """
         kept = self.searchable()
         if len(kept) <= self.most:

@@ -1,4 +1,4 @@
-"""The map of a run: keyframes as it goes, loops between them, and in the end a trajectory that fits all of them."""
+"""The map of a run: keyframes as it goes, loops between them, and at the end a trajectory that fits all of them."""
 
 import time
 from collections import OrderedDict
@@ -23,27 +23,27 @@ from gavo_jax.status import GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse, stamp_name
 
 STEP_FLOOR = 5e-4
-"""Metres and radians that a step of the odometry is off by beside what its covariance says."""
+"""Standard deviation, metres and radians, of a step's error beyond what its covariance says."""
 DOUBTED = 0.1
-"""Metres and radians: standard deviation given to a motion that something speaks against."""
+"""Standard deviation given to a motion that something speaks against, metres and radians."""
 UNTIED = 1.0
-"""Metres and radians: standard deviation given to a motion of which nothing is known."""
+"""Standard deviation given to an unknown motion, metres and radians."""
 GROWTH = 1.25
-"""Factor by which keyframes grow between two optimisations: what they cost a frame does not grow with the run."""
+"""Factor by which the number of keyframes grows between two optimisations, which bounds their cost per frame."""
 FIRST = 20
-"""Keyframes of the first one."""
+"""Number of keyframes at the first optimisation."""
 SOUGHT_OF_SEGMENT = 5
-"""Keyframes of a segment that nothing ties to others which are looked for among those of the others."""
+"""Number of keyframes of a segment tied to no other one that are searched for among those of the others."""
 MOST_IN_THE_END = 100
-"""Candidates, the likest ones, that are aligned when loops are looked for once more in the end."""
+"""Number of candidates, the most similar ones, that are aligned when loops are searched for again at the end."""
 REMEMBERED = 64
-"""Frames since a keyframe whose covariance is kept, for those that refer to them."""
+"""Number of frames since a keyframe whose covariance is kept, for later frames that refer to them."""
 SPEAKS_AGAINST = frozenset(GRAVITY)
-"""What can be found of a motion that is not lost."""
+"""Findings on a motion that speak against it although it is not lost."""
 
 
 class Loops(NamedTuple):
-    """What a map says of a run."""
+    """The map of a run."""
 
     keyframes: list[Keyframe]
     edges: list[Edge]
@@ -54,7 +54,7 @@ class _Way(NamedTuple):
     """The odometry's motion since the last keyframe."""
 
     covariance: Float64[np.ndarray, "6 6"]
-    """Of δ in a_T_b · exp(δ), metres and radians."""
+    """Covariance of δ in a_T_b · exp(δ), metres and radians."""
     in_doubt: bool
     """Whether something speaks against one of its pairs."""
 
@@ -63,8 +63,8 @@ class Mapper:
     """Watches a run and keeps its map.
 
     Args:
-        camera: Of the frames, without distortion.
-        most: Keyframes that keep their images.
+        camera: Camera of the frames, without distortion.
+        most: Maximum number of keyframes that keep their images.
 
     Raises:
         GavoError: GTSAM is not installed.
@@ -83,25 +83,25 @@ class Mapper:
         self._next, self._scale = FIRST, 1.0
 
     def warm_up(self) -> float:
-        """Compile what is needed, or load it; the seconds this took."""
+        """Compile what is needed, or load it; return the seconds this took."""
         start = time.perf_counter()
         self.verifier.warm_up()
         return time.perf_counter() - start
 
     def watch(self, frame: Frame | None, step: Step | None, moving: Moving = seen_moving) -> None:
-        """Take notice of a frame (None: it could not be read) with its step (None: it is the first).
+        """Take in a frame (None: it could not be read) with its step (None: it is the first).
 
         What moves on its own is no part of a map: two frames that show the same body would be tied by it.
 
         Args:
             frame: The frame.
-            step: What the driver says of it.
+            step: The driver's step for it.
             moving: Where bodies are in the frame of a step.
         """
         if step is None:
             self._first = frame
             return
-        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
+        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # no frame before was usable
             self._first = None
         if step.lost:
             return
@@ -129,7 +129,7 @@ class Mapper:
             self._newest = frame, step, twist
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Return where a frame was taken that nothing ties to the frames before; see `driver.Relocaliser`."""
+        """Return where a frame was taken that nothing ties to earlier frames; see `driver.Relocaliser`."""
         self._place = place = self._find(frame, [k for k in self.keyframes.searchable() if k.segment != segment])
         if place is None or place.edge.alignment is None:
             return None
@@ -137,26 +137,26 @@ class Mapper:
         return Found(place.edge.alignment, place.keyframe.timestamp, world_T_camera, place.keyframe.segment)
 
     def _find(self, frame: Frame, keyframes: list[Keyframe]) -> Place | None:
-        """Return where a frame was taken, among some keyframes."""
+        """Return where a frame was taken, according to some keyframes."""
         lost = self.keyframes.make(frame, -1, -1, np.eye(4), np.zeros(6))
         return self.recogniser.find(lost, keyframes)
 
     def is_due(self, step: Step) -> bool:
         """Whether a step's frame will become a keyframe."""
-        if step.origin != "tracked":  # a guess ties nothing to the rest
+        if step.origin != "tracked":  # a guess ties it to nothing
             return step.origin == "relocalised"
         return step.depth_is_trusted and self.keyframes.is_due(step.world_T_camera, step.segment)
 
     def replay(
         self, sequence: Sequence, steps: list[Step], moving: Moving = seen_moving, is_drawn_on: bool = False
     ) -> None:
-        """Take notice of what a run did before it was cut short; only what becomes a keyframe, or may, is decoded.
+        """Rebuild the map of a run that was cut short; only frames that are, or may become, keyframes are decoded.
 
         Args:
-            sequence: The frames that the run is over.
+            sequence: The frames of the run.
             steps: The steps that it had made.
             moving: Where bodies are in the frame of a step.
-            is_drawn_on: Whether something is drawn into the images: then all of them are decoded, to tell it again.
+            is_drawn_on: Whether overlays are drawn into the images: then all of them are decoded, to find these again.
         """
         frames = AsTracked(sequence, is_drawn_on)
         self.watch(_decoded(frames, 0), None)
@@ -170,10 +170,10 @@ class Mapper:
             self.watch(frame, step, moving)
 
     def finish(self, steps: Iterable[Step] = ()) -> Loops:
-        """Make the last frame a keyframe, look for loops once more with what is known now, and optimise.
+        """Make the last frame a keyframe, search for loops once more with all that is known, and optimise.
 
         Args:
-            steps: The run's steps, as later ones have shown them to be: more of them may be in doubt.
+            steps: The run's steps, as revised by later ones: more of them may be in doubt.
         """
         if self._newest is not None:
             frame, step, twist = self._newest
@@ -190,7 +190,7 @@ class Mapper:
         return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
     def _join(self) -> None:
-        """Look for segments that no edge ties to earlier ones, by their first keyframes."""
+        """Try to tie segments without an edge to earlier ones, by their first keyframes."""
         kept = self.keyframes.searchable()
         for segment in sorted({keyframe.segment for keyframe in kept}):
             first = tied_segments(self.keyframes.all, self.edges)
@@ -205,14 +205,14 @@ class Mapper:
                     break
 
     def _made(self, frame: Frame, step: Step, twist: Float64[np.ndarray, " 6"], way: "_Way | None") -> Keyframe:
-        """A step's frame as a keyframe, and the way to it from the last one."""
+        """A step's frame as a keyframe, with the covariance of the way to it from the last one."""
         covariance = None if way is None else way.covariance
         keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, covariance)
         keyframe.in_doubt = way is not None and way.in_doubt
         return keyframe
 
     def _doubt(self, steps: Iterable[Step]) -> None:
-        """Doubt the ways between keyframes that lead over motions which are in doubt in hindsight."""
+        """Mark the ways between keyframes as doubtful that contain motions which are in doubt in hindsight."""
         tracked = {stamp_name(step.timestamp): step for step in steps if not step.lost}
         stamps = {stamp_name(keyframe.timestamp) for keyframe in self.keyframes.all}
         for keyframe in self.keyframes.all:
@@ -223,7 +223,7 @@ class Mapper:
                 step = None if before in stamps else tracked.get(before)
 
     def _follow(self, step: Step) -> None:
-        """Keep the covariance of the motion since the last keyframe."""
+        """Accumulate the covariance of the motion since the last keyframe."""
         before = self._known.get(stamp_name(step.reference_timestamp))
         covariance = _covariance(step)
         if before is not None and np.isfinite(covariance).all():
@@ -234,7 +234,9 @@ class Mapper:
                 self._known.popitem(last=False)
 
     def _look_back(self, step: Step) -> None:
-        """Keep the covariance of the motion from a new keyframe to its reference, by which later frames may go on."""
+        """Keep the covariance of the motion from a new keyframe to its reference, as later frames may continue from
+        there.
+        """
         covariance = _covariance(step)
         if np.isfinite(covariance).all():
             self._known[stamp_name(step.reference_timestamp)] = _Way(covariance, is_in_doubt(step))
@@ -261,19 +263,19 @@ class Mapper:
             self.edges.append(edge._replace(alignment=None))
 
     def _candidates(self, keyframe: Keyframe) -> list[LoopCandidate]:
-        """The loops that a keyframe may close."""
+        """Loop candidates of a keyframe."""
         earlier = [other for other in self.keyframes.searchable() if other.number < keyframe.number]
         return find_candidates(keyframe, earlier, self.keyframes.camera)
 
     def _close(self, candidates: list[LoopCandidate]) -> None:
-        """Keep those loops that stand."""
+        """Verify candidates, and keep the loops that stand."""
         for candidate, edge in zip(candidates, self.verifier.verify(candidates), strict=True):
             candidate.later.tried[candidate.earlier.number] = candidate.later_T_earlier
             if edge is not None:
                 self._link(candidate.later, edge)
 
     def _optimise(self, reweighted: int = 0) -> Solution:
-        """Move all keyframes to where odometry and loops want them."""
+        """Optimise the poses of all keyframes."""
         keyframes = self.keyframes.all
         poses = np.stack([keyframe.world_T_camera for keyframe in keyframes])
         solution = optimise(poses, self.odometry_edges(), self.edges, self._scale, reweighted)
@@ -283,7 +285,7 @@ class Mapper:
         return solution
 
     def odometry_edges(self) -> list[Edge]:
-        """The odometry's motions from keyframe to keyframe."""
+        """The odometry's motions between consecutive keyframes."""
         keyframes = self.keyframes.all
         edges = []
         for a, b in zip(keyframes, keyframes[1:], strict=False):
@@ -300,8 +302,10 @@ def _covariance(step: Step) -> Float64[np.ndarray, "6 6"]:
 
 
 def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
-    """Motion of the points in the camera at a step's moment, m/s and rad/s: the mean since its reference, and what the
-    rolling shutter tells of the camera's own; none where the stamps tell no time.
+    """Motion of the points in the camera at a step's moment, m/s and rad/s.
+
+    This is the mean since its reference, corrected by the sway that the rolling shutter reveals; 0 where the timestamps
+    tell no time.
     """
     seconds = step.timestamp - step.reference_timestamp
     if seconds <= 0:
@@ -311,14 +315,15 @@ def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
 
 
 def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
-    """The upper triangle of a covariance on both sides, as motions.csv keeps it: one that was computed is symmetric but
-    for its last digits, and a resumed run is to make the same map.
+    """A covariance made exactly symmetric from its upper triangle, as motions.csv keeps it.
+
+    A computed covariance is symmetric but for its last digits, and a resumed run has to make the same map.
     """
     return np.triu(covariance) + np.triu(covariance, 1).T
 
 
 def tied_segments(keyframes: list[Keyframe], edges: Iterable[Edge]) -> dict[int, int]:
-    """Return, of each segment, the first one that edges tie it to, over others or not; itself where nothing does."""
+    """Return, for each segment, the first one that edges tie it to, directly or not; itself where nothing does."""
     first = {keyframe.segment: keyframe.segment for keyframe in keyframes}
     for edge in edges:
         a, b = (first[keyframes[number].segment] for number in (edge.earlier, edge.later))

@@ -1,8 +1,8 @@
-"""Where all keyframes stand: least squares over the odometry's motions and the loops, deaf to loops that are wrong.
+"""Pose graph optimisation: least squares over the odometry's motions and the loops, robust to false loops.
 
-The graph is GTSAM's. Graduated non-convexity (Yang, Antonante, Tzoumas and Carlone, RA-L 2020) starts with all
-loops and ends with those that agree with each other and with the odometry, so that neither a large drift nor a false
-loop decides where it ends.
+The graph is GTSAM's. Graduated non-convexity (Yang, Antonante, Tzoumas and Carlone, RA-L 2020) starts with all loops
+and ends with those that agree with each other and with the odometry. So neither a large drift nor a false loop decides
+where it ends.
 """
 
 from functools import cache
@@ -17,27 +17,31 @@ from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.trajectory import inverse
 
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
-"""Places in a twist of ours in GTSAM's order: rotation first."""
+"""Indices of our twists in GTSAM's order: rotation first."""
 PROBABILITY = 0.99
-"""Probability that the residual of a right loop stays below what makes a loop count as wrong."""
+"""Probability that the residual of a correct loop stays below the limit from which a loop counts as false."""
 REWEIGHTED = 2
-"""Times that the odometry's weight is told anew and the graph optimised with it."""
+"""Number of times that the odometry's weight is estimated anew and the graph optimised with it."""
 SECOND_CHANCES = 4
-"""Times that the loops which fit are told anew."""
+"""Maximum number of times that the set of loops which fit is updated."""
 IMPOSSIBLE = 1.0 - 1e-6
-"""Probability that the residual of a right loop against the odometry alone stays below what makes it look wrong."""
+"""Probability that a correct loop's residual against the odometry alone stays below the limit from which it looks
+false.
+"""
 MISTRUST = 4.0
-"""Factor on the odometry's covariances while false loops are sought: it drifts to one side, which they don't say."""
+"""Factor on the odometry's covariances while false loops are sought: odometry drifts to one side, which they don't
+model.
+"""
 SCALES = (0.1, MISTRUST)
-"""Smallest and largest factor on the odometry's covariances that the loops may ask for."""
+"""Smallest and largest factor on the odometry's covariances that loops can lead to."""
 BELIEF = 20.0
-"""Weight of the odometry's own covariances against what the loops say of them, as a number of residuals."""
+"""Weight of the odometry's own covariances against the evidence of the loops, as a number of residuals."""
 COUNTED = 0.5
-"""Weight from which on a loop counts as right."""
+"""Weight above which a loop counts as correct."""
 MOST_ROWS, PROBES = 512, 128
-"""Rows whose leverages are summed up exactly, and random sums of more of them."""
+"""Rows whose leverages are summed exactly, and number of random sums that are used for more rows."""
 FIXED = 1e-6
-"""Metres and radians within which the first keyframe stays."""
+"""Standard deviation of the prior that fixes the first keyframe, metres and radians."""
 
 
 class Solution(NamedTuple):
@@ -47,13 +51,13 @@ class Solution(NamedTuple):
     weights: Float64[np.ndarray, " loops"]
     """Weight of each loop, from 1 (counted) to 0 (refused)."""
     residuals: Float64[np.ndarray, "loops 6"]
-    """δ of each loop in earlier_T_later · exp(δ) = what the poses say, metres and radians."""
+    """δ of each loop in earlier_T_later · exp(δ) = the motion by the poses, metres and radians."""
     scale: float
     """Factor on the odometry's covariances, as the loops ask for."""
 
 
 def require_gtsam() -> Any:
-    """GTSAM.
+    """Import GTSAM.
 
     Raises:
         GavoError: it is not installed.
@@ -75,11 +79,11 @@ def optimise(
     """Optimise a pose graph.
 
     Args:
-        poses: world_T_camera to start from; the first one stays.
-        odometry: Motions between neighbours, which count whatever they say.
-        loops: Motions between others, each right or wrong.
-        scale: Of the odometry's covariances, to start from.
-        reweighted: Times that the scale is told anew.
+        poses: Initial world_T_camera; the first one stays.
+        odometry: Motions between neighbours, which are always trusted.
+        loops: Motions between other pairs, each of them correct or false.
+        scale: Initial factor on the odometry's covariances.
+        reweighted: Number of times that the scale is estimated anew.
 
     Raises:
         GavoError: GTSAM is not installed.
@@ -126,7 +130,7 @@ def _settled(
     loops: list[Edge],
     scale: float,
 ) -> tuple[Any, Bool[np.ndarray, " loops"]]:
-    """The optimum with the loops that count, told anew by whether they fit it until that changes nothing."""
+    """The optimum with the loops that count; these are updated by whether they fit, until that changes nothing."""
     before = counted
     for _ in range(SECOND_CHANCES):
         graph = _graph(gtsam, first, odometry, _chosen(loops, counted), scale)
@@ -140,7 +144,7 @@ def _settled(
 def _plausible(
     poses: Float64[np.ndarray, "n 4 4"], odometry: list[Edge], loops: list[Edge]
 ) -> Bool[np.ndarray, " loops"]:
-    """Which loops are within what odometry that drifts can be off by."""
+    """Which loops are within the possible drift of the odometry."""
     chain, spread = [poses[0]], [np.zeros((6, 6))]
     for edge in odometry:
         chain.append(chain[-1] @ edge.earlier_T_later)
@@ -181,8 +185,9 @@ def _without_false_loops(gtsam: Any, graph: Any, start: Any, trusted: int) -> tu
 
 
 def _surprise(graph: Any, values: Any, trusted: int) -> float:
-    """Variance of the odometry's residuals over what their covariances say, by their redundancy (Förstner 1979); near 1
-    where the loops say little of it.
+    """Variance factor of the odometry: its squared residuals over their redundancy (Förstner 1979).
+
+    It is near 1 where the loops tell little of it.
     """
     from scipy.sparse import csc_array
 
@@ -197,8 +202,10 @@ def _surprise(graph: Any, values: Any, trusted: int) -> float:
 
 
 def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
-    """Sum of the leverages of some rows of a sparse Jacobian J, the diagonal of J (JᵀJ)⁻¹ Jᵀ; of many rows estimated by
-    sums of them with random signs (Hutchinson 1989), within a per cent: this bounds the work.
+    """Sum of the leverages of some rows of a sparse Jacobian J, on the diagonal of J (JᵀJ)⁻¹ Jᵀ.
+
+    For many rows it is estimated from their sums with random signs (Hutchinson 1989), to within a per cent: this bounds
+    the work.
     """
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
@@ -212,7 +219,7 @@ def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
 
 
 def _fits(gtsam: Any, values: Any, edge: Edge) -> bool:
-    """Whether what the poses say of a loop is within what its covariance allows."""
+    """Whether a loop's residual at the poses is within what its covariance allows."""
     residual = _residual(gtsam, values, edge)
     return bool(residual @ np.linalg.solve(edge.covariance, residual) < _chi_squared_below(PROBABILITY))
 
@@ -228,7 +235,7 @@ def _pose(gtsam: Any, transform: np.ndarray) -> Any:
 
 @cache
 def _chi_squared_below(probability: float) -> float:
-    """The value that chi-squared with six degrees of freedom stays below with a probability."""
+    """Value that chi-squared with six degrees of freedom stays below with a given probability."""
     from scipy.special import chdtri  # a sixth of the time in which the command starts, and most runs close no loops
 
     return float(chdtri(6, 1.0 - probability))

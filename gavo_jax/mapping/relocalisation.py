@@ -1,7 +1,7 @@
-"""Where a frame is that nothing ties to the frames before: keyframes that look like it, features, an alignment.
+"""Relocalisation of a frame that nothing ties to earlier ones: keyframes that look alike, features, an alignment.
 
-Small images tell which keyframes are worth a look, matched keypoints give a motion without any guess, and the alignment
-there and back decides: it is the same that verifies loops.
+Small images tell which keyframes are worth a look, and matched keypoints give a motion without any guess. The alignment
+there and back decides, as it does for loops.
 """
 
 from typing import NamedTuple
@@ -18,42 +18,42 @@ from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.verification import Edge, Verifier
 
 LOOKED_AT = 8
-"""Keyframes whose features are matched, those most like the frame."""
+"""Number of keyframes whose features are matched: those that look most like the frame."""
 ALIGNED = 4
-"""Of these, the keyframes that are aligned, the best ones by matches."""
+"""Number of these keyframes that are aligned: those with most matches."""
 MARGIN = 0.2
-"""Share of a small image's width and height by which two may be shifted against each other and still look alike."""
+"""Share of a small image's width and height by which two images may be shifted and still look alike."""
 MIN_MATCHES = 15
-"""Matched keypoints that agree with a motion."""
+"""Fewest matched keypoints that have to agree with a motion."""
 MIN_LIKENESS = 0.7
-"""Correlation of what both see, by the motion that was found."""
+"""Smallest correlation of what both see under the motion found."""
 
 
 class Place(NamedTuple):
-    """Where a frame is."""
+    """The place of a frame in the map."""
 
     keyframe: Keyframe
     edge: Edge
-    """From that keyframe to the frame."""
+    """Edge from that keyframe to the frame."""
 
 
 class Recogniser:
     """Finds frames among keyframes.
 
     Args:
-        camera: Of the keyframes' images.
-        verifier: What decides.
+        camera: Camera of the keyframes' images.
+        verifier: Decides whether a motion is right.
     """
 
     def __init__(self, camera: Camera, verifier: Verifier):
         self.camera, self.verifier = camera, verifier
 
     def find(self, frame: Keyframe, keyframes: list[Keyframe]) -> Place | None:
-        """Return where a frame is, as a keyframe of its own; None where none of the others shows that.
+        """Return the place of a frame among keyframes; None where none of them shows it.
 
         Args:
-            frame: Its poses say nothing.
-            keyframes: The others, with their images.
+            frame: The frame, made a keyframe; its poses are not used.
+            keyframes: The keyframes to search, with their images.
         """
         alike = sorted(keyframes, key=lambda other: -likeness(frame.thumbnail, other.thumbnail))[:LOOKED_AT]
         seen = self._detect(frame)
@@ -75,8 +75,9 @@ class Recogniser:
         return None
 
     def _known(self, keyframe: Keyframe) -> Features:
-        """Keypoints of a keyframe, found when they are first needed. SIFT's descriptors are whole numbers below 256,
-        and kept as bytes.
+        """Keypoints of a keyframe, detected when first needed.
+
+        SIFT's descriptors are whole numbers below 256, and are kept as bytes.
         """
         if keyframe.features is None:
             found = self._detect(keyframe)
@@ -90,7 +91,7 @@ class Recogniser:
 
 
 def likeness(a: Thumbnail, b: Thumbnail) -> float:
-    """Correlation of two small images at the shift that suits them best."""
+    """Correlation of two small images at the shift that fits best."""
     height, width = a.small.shape
     rows, columns = int(MARGIN * height), int(MARGIN * width)
     middle: Float32[np.ndarray, "h w"] = a.small[rows : height - rows, columns : width - columns]

@@ -1,7 +1,7 @@
-"""Whether two keyframes show the same place, and where they stand to each other: aligned there and back.
+"""Verification of loops: whether two keyframes show the same place, and their relative pose, by aligning them both
+ways.
 
-Before a wall that repeats itself both ways may agree on a motion that is off by a period; such a pair
-is no edge.
+Before a repetitive wall both ways may agree on a motion that is off by a period; such a pair gives no edge.
 """
 
 import os
@@ -34,23 +34,25 @@ SETTINGS = Settings(
         points=(4800, 1200, 1200, 1200, 1200), depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3), views=(1, 1, 1, 1, 1)
     ),
 )
-"""Gauss-Newton from the guess, both ways. The images have half the size, so that a level here is the next coarser one
-of the frame's."""
+"""Gauss-Newton from the guess, both ways. The images have half the frame's size, so a level here is the next coarser
+level of the frame.
+"""
 MIN_OVERLAP = 0.5
-"""Smallest overlap of the alignment, there and back."""
+"""Smallest overlap of the alignment, in both directions."""
 MAX_DISAGREEMENT = (0.02, 0.02)
-"""Metres and radians between the motions found there and back."""
+"""Largest difference between the motions found there and back, metres and radians."""
 FLOOR = 1e-3
-"""Metres and radians that a pair of keyframes is off by beside what its covariance says: each keyframe's velocity,
-hence its rolling shutter, is known to a few per cent."""
+"""Standard deviation, metres and radians, of a pair's error beyond what its covariance says. Each keyframe's velocity,
+and so its rolling shutter, is known only to a few per cent.
+"""
 SIDE_BY_SIDE = min(os.cpu_count() or 1, 8)
-"""Lots of candidates that are aligned at once."""
+"""Maximum number of batches of candidates that are aligned in parallel."""
 SHARED = 4.0
-"""Factor on the covariance, for what a keyframe's edges have in common: its blur, its depth, its velocity."""
+"""Factor on the covariance for errors that a keyframe's edges share: its blur, its depth, its velocity."""
 
 
 class Edge(NamedTuple):
-    """What is known of the motion between two keyframes."""
+    """The motion between two keyframes, and its uncertainty."""
 
     earlier: int
     later: int
@@ -59,9 +61,9 @@ class Edge(NamedTuple):
     """Covariance of δ in earlier_T_later · exp(δ), metres and radians."""
     overlap: float = 1.0
     disagreement: tuple[float, float] = (0.0, 0.0)
-    """Metres and radians between there and back."""
+    """Difference between the motions found there and back, metres and radians."""
     alignment: Alignment | None = None
-    """There: the earlier keyframe is the reference. A map's edges are kept without it."""
+    """Alignment with the earlier keyframe as the reference. A map's edges are kept without it."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,8 @@ class Verifier:
     """Aligns candidates both ways, from the guess.
 
     Attributes:
-        camera: Of the keyframes' images.
-        settings: How.
+        camera: Camera of the keyframes' images.
+        settings: Settings of the alignment.
     """
 
     camera: Camera
@@ -83,8 +85,10 @@ class Verifier:
         self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
 
     def verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
-        """Edges of the candidates that stand; None for the others. More than one keyframe's are asked about in the end,
-        when nothing else is computed: several lots of them are aligned side by side.
+        """Verify candidates: return an edge for each one that stands, None for the others.
+
+        At the end of a run there are candidates of many keyframes, and nothing else is computed: batches of them are
+        aligned in parallel.
         """
         lots = [candidates[start : start + MOST] for start in range(0, len(candidates), MOST)]
         if len(lots) < 2:
@@ -93,7 +97,7 @@ class Verifier:
             return [edge for edges in workers.map(in_32_bits(self._verify), lots) for edge in edges]
 
     def _verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
-        """Align there, and back only what stands; each from the guess, so that they are two opinions."""
+        """Align there, then back only what stands; each from the guess, so that the two are independent."""
         guesses = [candidate.later_T_earlier for candidate in candidates]
         sides = ([candidate.earlier.images for candidate in candidates], [c.later.images for c in candidates])
         there = self._one_way(sides[0], sides[1], guesses)
@@ -107,8 +111,9 @@ class Verifier:
         return edges
 
     def _is_unique(self, candidate: LoopCandidate, there: Alignment) -> bool:
-        """Whether no other motion explains the images as well, as one does before a pattern that repeats itself. Which
-        one it was, the map's guess does not tell: it drifts, and who knows by how much.
+        """Whether no other motion explains the images as well, as is the case before a repetitive pattern.
+
+        The map's guess cannot tell which motion is right, as its drift is unknown.
         """
         images = candidate.earlier.images
         assert images is not None
@@ -147,7 +152,7 @@ def _stands(result: Alignment) -> bool:
 
 
 def _edge(candidate: LoopCandidate, there: Alignment, back: Alignment) -> Edge | None:
-    """The edge of a candidate that was aligned there and back, if these agree."""
+    """The edge of a candidate that was aligned there and back; None if the two disagree."""
     by_way_there, by_way_back = inverse(np.asarray(there.target_T_reference)), np.asarray(back.target_T_reference)
     metres, radians = (float(part) for part in length_and_angle(inverse(by_way_there) @ by_way_back))
     if metres > MAX_DISAGREEMENT[0] or radians > MAX_DISAGREEMENT[1]:

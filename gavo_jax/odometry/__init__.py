@@ -1,1 +1,1 @@
-"""From frames to a trajectory: the program for a frame, who aligns it, the driver, a whole run."""
+"""From frames to a trajectory: the program for a frame, the aligners, the driver, a whole run."""

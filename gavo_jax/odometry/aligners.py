@@ -1,7 +1,7 @@
-"""Who finds the motion of a new frame: the search, or what is put around it or in its place.
+"""Aligners find the motion of a new frame: the search, and what wraps or replaces it.
 
 An aligner is a value that the driver holds: it starts from a frame and then makes an `Attempt` at each new one. What it
-knows of earlier frames is a state that the driver keeps and hands back, so that an attempt that fails leaves no trace.
+knows of earlier frames is a state that the driver keeps and hands back, so a failed attempt leaves no trace.
 """
 
 import gc
@@ -34,28 +34,28 @@ from gavo_jax.trajectory import inverse
 
 
 class Attempt(NamedTuple):
-    """What an aligner made of a frame."""
+    """An aligner's attempt at a frame."""
 
     state: Any
-    """What it knows then, should the frame become the reference."""
+    """The aligner's state if the frame becomes the reference."""
     result: Alignment
     """The motion and what is known of it, on the host."""
     usable: bool
     """Whether the motion can be used."""
     fit: bool = True
-    """Whether the frame may become the reference, should its motion be usable."""
+    """Whether the frame may become the reference, provided that its motion is usable."""
     candidates: tuple[Population, ...] = ()
     """Candidates of the search, one entry per level, coarsest first; empty unless they are recorded."""
     bodies: tuple[Seen, ...] = ()
-    """What moves on its own, as far as that was asked."""
+    """Bodies that move on their own, as far as they were looked for."""
     unknown: int = 0
-    """So many of the last motions, this one included, are guesses."""
+    """Number of the last motions, this one included, that are guesses."""
     revises: int = 0
-    """So many of the motions before this one are wrong, as is seen now: see `Step.revises`."""
+    """Number of motions before this one that turn out to be wrong; see `Step.revises`."""
 
     @property
     def is_found(self) -> bool:
-        """Whether the motion can be used and the images tell of it: a guess fits any depth and any time."""
+        """Whether the motion is usable and comes from the images: a guess fits any depth and any time."""
         return self.usable and not is_unknown(self.result)
 
 
@@ -63,7 +63,7 @@ class Aligner(Protocol):
     """Finds the motion of a new frame."""
 
     def warm_up(self) -> float:
-        """Compile, or load, what is needed; the seconds this took."""
+        """Compile, or load, what is needed; return the seconds this took."""
         ...
 
     def start(self, frame: Frame) -> Any:
@@ -75,7 +75,7 @@ class Aligner(Protocol):
         ...
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """target_T_reference if the camera goes on as before for so many seconds."""
+        """target_T_reference if the camera keeps its velocity for `elapsed` seconds."""
         ...
 
 
@@ -89,12 +89,12 @@ class FrameSearch(Aligner, Protocol):
 
     @property
     def settings(self) -> Settings:
-        """What searches, and how."""
+        """Settings of the search."""
         ...
 
     @property
     def plain(self) -> "FrameSearch":
-        """It without second thoughts."""
+        """The search without second thoughts."""
         ...
 
     def blank_state(self) -> TrackerState:
@@ -108,12 +108,12 @@ BEGINNING = Clock(np.float32(1.0), np.float32(0.0), np.uint32(0))
 
 @dataclass(frozen=True)
 class Search:
-    """Our own: the compiled program of `tracking.track_frame`.
+    """Our own search: the compiled program of `tracking.track_frame`.
 
     Attributes:
         camera: Camera of the frames, without distortion.
-        settings: What searches, and how.
-        key: The run's; every random number follows from it and the frame's index.
+        settings: Settings of the search.
+        key: The run's key; every random number follows from it and the frame's index.
         record: Whether the candidates are kept.
     """
 
@@ -125,7 +125,7 @@ class Search:
     def warm_up(self) -> float:
         """Compile the program for a frame, or load it from the cache."""
         start, collects = time.perf_counter(), gc.isenabled()
-        gc.disable()  # tracing makes objects by the hundred thousand that all stay; looking through them takes a fifth
+        gc.disable()  # tracing makes 100,000s of objects that stay; the collector would take a fifth of the time
         try:
             self.start(self._blank_frame())
         finally:
@@ -135,7 +135,7 @@ class Search:
 
     @property
     def plain(self) -> "Search":
-        """It has no second thoughts."""
+        """The search itself, as it has no second thoughts."""
         return self
 
     def blank_state(self) -> TrackerState:
@@ -143,7 +143,7 @@ class Search:
         return blank_state(self.camera, self.settings.solver, self.settings.alignment)
 
     def start(self, frame: Frame) -> TrackerState:
-        """The state after a first frame, by the program that serves every frame: there is nothing to find yet."""
+        """The state after a first frame, by the program that serves every frame; there is no motion to find yet."""
         return self.align(self.blank_state(), frame, BEGINNING).state
 
     def _blank_frame(self) -> Frame:
@@ -157,7 +157,7 @@ class Search:
         return state, *images, clock, self.key, self.camera, settings.solver, settings.alignment, odometry
 
     def is_kept(self) -> bool:
-        """Whether the program was compiled before, so that `warm_up` loads it."""
+        """Whether the program was compiled before, so that `warm_up` only loads it."""
         inputs = self._inputs(self.blank_state(), self._blank_frame(), BEGINNING)
         return track_frame.is_kept(*inputs, record=self.record)
 
@@ -170,10 +170,10 @@ class Search:
     def judged(
         self, state: TrackerState, after: TrackerState, result: Alignment, frame: Frame, clock: Clock
     ) -> Attempt:
-        """The attempt that a result makes, which may be off by a period where the image repeats itself.
+        """The attempt that a result makes, checked for being off by a period where the image repeats itself.
 
-        Where the motion before is known, such a motion is of no use. Where it is not, the one that was found is taken,
-        and the next frame has no motion to expect: it would only repeat the error.
+        If it may be off and the last motion is known, the attempt is unusable. If the last motion is unknown the result
+        is used, but the next frame gets no prediction from it: that would only repeat the error.
 
         Args:
             state: State before the frame.
@@ -203,8 +203,9 @@ class Search:
 
 
 def expecting(state: Any, xi: Float64[np.ndarray, " 6"], seconds: float) -> Any:
-    """The state of a search, however it is wrapped, if the camera moves so far in so many seconds; anybody else's state
-    as it is.
+    """A search's state, however it is wrapped, that expects the motion `xi` after `seconds`.
+
+    States of other aligners are returned as they are.
     """
     for name in ("tracker", "first"):
         if name in getattr(state, "_fields", ()):
@@ -235,7 +236,7 @@ def traced_part(options: OdometryOptions) -> OdometryOptions:
 
 
 def side_by_side(here: Callable[[], Any], beside: Callable[[], Any]) -> float:
-    """Compile by two functions at once, the second one in a thread; the seconds this took."""
+    """Compile with two functions at once, the second one in a thread; return the seconds this took."""
     start = time.perf_counter()
     with ThreadPoolExecutor(max_workers=1) as worker:
         other = worker.submit(in_32_bits(beside))
@@ -245,10 +246,10 @@ def side_by_side(here: Callable[[], Any], beside: Callable[[], Any]) -> float:
 
 
 AGREEMENT = (0.02, 0.02)
-"""Metres and radians within which two searches ended at the same motion."""
+"""Metres and radians within which two searches have found the same motion."""
 
 
 def agree(first: Alignment, second: Alignment, within: tuple[float, float] = AGREEMENT) -> bool:
-    """Whether two motions are the same within so many metres and radians."""
+    """Whether two motions are the same within some metres and radians."""
     between = inverse(np.asarray(first.target_T_reference)) @ second.target_T_reference
     return bool(np.linalg.norm(between[:3, 3]) < within[0] and rotation_angle(between[:3, :3]) < within[1])

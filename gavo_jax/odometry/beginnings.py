@@ -1,36 +1,36 @@
-"""Whose motion a run has followed since its beginning, or since it was broken.
+"""Whether a run has followed the scene or a body since its beginning, or since its last break.
 
-A body that fills the image is taken for the scene: nothing moves against it. It shows only when it leaves. Then the
-track breaks. Nothing had been seen to move before; now a large part of the first pair behind the break moves on its
-own, or something came to move just before the break: the scene, seen from the body. So the body was what the pairs
-before the break had followed.
+A body that fills the image is taken for the scene, as nothing moves against it. This shows only when the body leaves
+and the track breaks. Nothing had been seen to move before. But a large part of the first pair after the break moves on
+its own, or something began to move just before the break: the scene, seen from the body. Then the pairs before the
+break followed the body.
 """
 
 from typing import NamedTuple
 
 PROVEN_AFTER = 1.0
-"""Seconds of an unbroken track in which nothing moved, after which that was the scene."""
+"""Seconds of an unbroken track in which nothing moved after which it has followed the scene."""
 SURVIVED = 0.3
-"""Seconds for which a track has to last once something moves in it: who follows what leaves loses it sooner."""
+"""Seconds for which a track has to last once something moves in it: one that follows a leaving body breaks sooner."""
 LARGE = 0.25
-"""Share of an image that a body covers which may have filled an earlier one."""
+"""Share of an image covered by bodies above which a body may have filled an earlier image."""
 
 
 class Beginning(NamedTuple):
-    """A track of which it is not known yet whether it followed the scene."""
+    """A track that is not yet known to have followed the scene."""
 
     since: float
-    """Stamp of its first frame, or of the first one behind its last break."""
+    """Timestamp of its first frame, or of the first one after its last break."""
     references: int = 0
     """Frames that became the reference since its first one."""
     is_broken: bool = True
     """Whether the reference begins a segment."""
     moving_since: float | None = None
-    """Stamp of the first frame in which something was seen to move; None before there is one."""
+    """Timestamp of the first frame in which something was seen to move; None if there is none yet."""
 
 
 def begun(before: Beginning | None, stamp: float) -> Beginning:
-    """Begin a segment with a frame: what was not known before it is not known yet."""
+    """Begin a segment with a frame; what was in question before still is."""
     if before is None:
         return Beginning(stamp)
     return before._replace(since=stamp, references=before.references + 1, is_broken=True)
@@ -40,9 +40,9 @@ def followed(before: Beginning | None, stamp: float, share: float, *, is_referen
     """Add a frame whose motion was found.
 
     Args:
-        before: The track up to it; None if that is known to have followed the scene.
-        stamp: Of the frame.
-        share: Of the image that its bodies cover.
+        before: The track so far; None if it is known to have followed the scene.
+        stamp: Timestamp of the frame.
+        share: Share of the image that its bodies cover.
         is_reference: Whether it became the reference.
     """
     if before is None:
@@ -58,7 +58,7 @@ def followed(before: Beginning | None, stamp: float, share: float, *, is_referen
 
 
 def revised_by(before: Beginning | None, share: float) -> int:
-    """How many of the pairs before a frame it shows to have followed a body; see `Step.revises`."""
+    """Number of pairs before a frame that turn out to have followed a body; see `Step.revises`."""
     if before is None or not before.is_broken:
         return 0
     return before.references if share > LARGE or before.moving_since is not None else 0

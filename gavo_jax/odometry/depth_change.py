@@ -1,8 +1,8 @@
-"""Whether the motions that were found explain how depth changes.
+"""Whether the motions found explain how depth changes.
 
-Depth that becomes wrong is unlike that of the frames before (`plausibility`). Depth that was wrong from the first frame
-on is not: mirrored, of another camera, of other moments, or not depth at all. But it does not change as the motions of
-the image say, and those explain it hardly better than if the camera had stood still.
+Depth that becomes wrong differs from that of earlier frames (`plausibility`). Depth that was wrong from the first frame
+on does not: it may be mirrored, of another camera, of other moments, or no depth at all. But it does not change as the
+image's motions say. They explain its change hardly better than a camera at rest would.
 """
 
 from typing import Any, NamedTuple
@@ -17,44 +17,48 @@ from gavo_jax.rigid_motions import exp, log
 from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
-"""Points across an image, on a regular grid: points of much contrast would lie at the edges of things."""
+"""Points across an image, on a regular grid: high-contrast points would lie on the edges of objects."""
 SMALLEST_CHANGE = 0.01
-"""1/m by which the motion and rest have to differ at a point for it to tell anything: three times the noise of a
-structured-light sensor."""
+"""Difference between motion and rest, 1/m, above which a point is informative: three times the noise of a
+structured-light sensor.
+"""
 CHANGED = 0.25
-"""Share of all points that are asked: those at which the motion and rest differ most."""
+"""Share of all points that is used: those at which motion and rest differ most."""
 LEAST_POINTS = 50
-"""Fewest points that tell anything."""
+"""Fewest points needed for a figure."""
 EDGE = 0.05
-"""1/m between neighbouring pixels, from which on two things lie beside each other."""
+"""Difference between neighbouring pixels, 1/m, above which they show different objects."""
 REMEMBERED, MIN_REMEMBERED = 15, 8
-"""Pairs of which the median tells, and the fewest that do."""
+"""Number of last pairs whose median counts, and the fewest that suffice."""
 MOST_LEFT = 0.7
-"""Largest part of the change of depth that the motions may leave: 1 is no better than rest. Clean clips reach 0.24, and
-0.42 with a body over 40 % of the image."""
+"""Largest part of the change of depth that the motions may leave unexplained; 1 is no better than rest. Clean clips
+reach 0.24, and 0.42 with a body over 40 % of the image.
+"""
 RIGHT_BEFORE = 5
-"""So many more pairs whose change of depth was explained than others, from the first remembered one on, say that depth
-was right until then."""
+"""Surplus of pairs whose change of depth was explained, counted from the first remembered one, that shows that depth
+was right until then.
+"""
 LEAST_EXPLAINED = 0.95
-"""Share of the grey residuals that are not large where depth of one number is a wall, straight ahead: there the slide
-along it explains all. Rooms whose depth was made one number have 0.93 and less."""
+"""Share of small grey residuals above which depth of a single value is accepted as a wall straight ahead: a translation
+along it explains the image. Rooms whose depth was set to one value have 0.93 and less.
+"""
 
 
 class DepthChange(NamedTuple):
-    """What is known of the reference's depth, and of how the last pairs' depth changed."""
+    """What is known of the reference's depth, and of how depth changed over the last pairs."""
 
     inverse: Float64[np.ndarray, "rows columns"]
-    """1/depth of the reference on a grid, 1/m; 0 without a reading."""
+    """Inverse depth of the reference on a grid, 1/m; 0 without a reading."""
     delay: float
-    """From its image to its depth, seconds."""
+    """Time from the reference's colour image to its depth image, seconds."""
     velocity: tuple[float, ...] = ()
-    """Velocity of the last motion that was found, a twist per second; empty before the first."""
+    """Velocity of the last motion found, a twist per second; empty before the first."""
     left: tuple[float, ...] = ()
-    """Part of what rest would leave unexplained that the motion leaves, of each of the last pairs."""
+    """Error of depth that the motion leaves over that which rest would leave, for each of the last pairs."""
 
     @property
     def usually_left(self) -> float:
-        """Median of `left`, of two the lower one: half of the pairs may show a body. Not-a-number if too few tell."""
+        """Lower median of `left`, as half of the pairs may show a body; NaN if there are too few."""
         return float(np.quantile(self.left, 0.5, method="lower")) if len(self.left) >= MIN_REMEMBERED else np.nan
 
     @property
@@ -63,8 +67,9 @@ class DepthChange(NamedTuple):
         return self.usually_left > MOST_LEFT
 
     def pairs_covered(self, pairs: int) -> int:
-        """Return how many of the last pairs its figures speak against, of so many so far: all, until one was forgotten,
-        but for those before depth became wrong.
+        """Return how many of the last `pairs` pairs the figures speak against.
+
+        These are all pairs until the first was forgotten, but for those before depth became wrong.
         """
         covered = len(self.left) if len(self.left) == REMEMBERED else pairs
         more_explained = np.cumsum(np.where(np.array(self.left) > MOST_LEFT, -1, 1))
@@ -76,21 +81,21 @@ class DepthChange(NamedTuple):
     ) -> "DepthChange":
         """Add one more pair, of the same reference.
 
-        Depth that is one number in both frames is that of a wall, along which the camera slides. Turns then come out as
-        slides, and depth agrees. So the image has to be that of a wall.
+        Depth of a single value in both frames fits a wall along which the camera translates. Rotations are then found
+        as translations, and depth agrees. So the image has to fit a wall as well.
 
         Args:
             frame: The target, without what moves on its own.
-            elapsed: Between the two images, seconds.
+            elapsed: Time between the two images, seconds.
             target_T_reference: Motion between the two images.
             explained: Share of the grey residuals that are not large.
-            camera: Of both.
+            camera: Camera of both frames.
         """
         twist = log(np.asarray(target_T_reference, np.float64)) / elapsed
         earlier = np.array(self.velocity or twist)
 
         def moved_by(seconds: float) -> Float64[np.ndarray, "4 4"]:
-            """Return the motion from the reference's image on; before it, as the camera came there."""
+            """Return the motion from the reference's image on; times before it use the earlier velocity."""
             return exp(seconds * (twist if seconds > 0 else earlier))
 
         motion = moved_by(elapsed + frame.depth_delay) @ inverse(moved_by(self.delay))
@@ -101,12 +106,12 @@ class DepthChange(NamedTuple):
         return self._replace(velocity=tuple(twist.tolist()), left=figures)
 
     def seen_from(self, frame: Frame, camera: Camera) -> "DepthChange":
-        """Go on with another reference."""
+        """Continue with another reference."""
         return self._replace(inverse=depth_on_grid(frame, camera), delay=frame.depth_delay)
 
 
 def depth_on_grid(frame: Frame, camera: Camera) -> Float64[np.ndarray, "rows columns"]:
-    """1/depth of a frame on the grid, 1/m; 0 without a reading."""
+    """Inverse depth of a frame on the grid, 1/m; 0 without a reading."""
     rows, columns = _grid(camera)
     return inverse_depth(np.asarray(frame.depth)[rows, columns], camera)
 
@@ -114,16 +119,16 @@ def depth_on_grid(frame: Frame, camera: Camera) -> Float64[np.ndarray, "rows col
 def left_unexplained(
     reference: Float64[np.ndarray, "rows columns"], depth: np.ndarray, target_T_reference: np.ndarray, camera: Camera
 ) -> float:
-    """Median difference of 1/depth at a motion over that at rest, where the two say the most different things.
+    """Median error of inverse depth under a motion over that at rest, at the points where the two differ most.
 
     Args:
-        reference: 1/depth of the reference on the grid, 1/m.
-        depth: The target's, raw, [H, W].
-        target_T_reference: Between the moments of both.
-        camera: Of both.
+        reference: Inverse depth of the reference on the grid, 1/m.
+        depth: Raw depth of the target, [H, W].
+        target_T_reference: Motion between the moments of both depth images.
+        camera: Camera of both frames.
 
     Returns:
-        0 where the motion explains all, 1 where rest explains as much; not-a-number where too little changes.
+        0 where the motion explains all, 1 where rest explains as much; NaN where too little changes.
     """
     row, column = _grid(camera)
     x, y = to_ray(camera, column, row)
@@ -149,20 +154,20 @@ def left_unexplained(
 
 
 def _is_one_number(inverse: Float64[np.ndarray, "rows columns"]) -> bool:
-    """Whether all readings on the grid are."""
+    """Whether all readings on the grid are one number."""
     readings = inverse[inverse > 0]
     return readings.size >= LEAST_POINTS and is_one_number(readings)
 
 
 def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [R, 1] and columns [1, C] of the points."""
+    """Rows [R, 1] and columns [1, C] of the grid."""
     step = max(camera.width // COLUMNS, 1)
     row, column = np.ogrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     return row, column
 
 
 def _sampled(depth: np.ndarray, u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
-    """1/depth between pixels, 1/m; 0 where one of the four around has no reading, or an edge lies between them."""
+    """Inverse depth between pixels, 1/m; 0 where one of the four neighbours has no reading, or an edge lies between."""
     left, above = np.minimum(u.astype(int), camera.width - 2), np.minimum(v.astype(int), camera.height - 2)
     down_by, along_by = np.array([[0], [0], [1], [1]]), np.array([[0], [1], [0], [1]])
     around = inverse_depth(depth[above + down_by, left + along_by], camera)

@@ -1,4 +1,4 @@
-"""What speaks against a run's depth as a whole, from its first frame on: how it changes, and where it lies."""
+"""Evidence against a run's depth as a whole, from its first frame on: how it changes, and where its edges lie."""
 
 from typing import NamedTuple
 
@@ -21,17 +21,17 @@ class DepthWatch(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether one of the two speaks against it."""
+        """Whether its change or its edges speak against it."""
         return self.change.is_unexplained or bool(self.edges.fault)
 
     def pairs_covered(self, pairs: int) -> int:
-        """Return how many of the last pairs are spoken against, of so many so far."""
+        """Return how many of the last `pairs` pairs are spoken against."""
         by_change = self.change.pairs_covered(pairs) if self.change.is_unexplained else 0
         return max(by_change, self.edges.pairs_covered(pairs) if self.edges.fault else 0)
 
 
 def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
-    """Watch with another reference, or a run's first one."""
+    """Continue with another reference, or start with a run's first one."""
     if before is None:
         change = DepthChange(depth_on_grid(frame, camera), frame.depth_delay)
         return DepthWatch(change, DepthEdges.none().after(frame, camera))
@@ -41,17 +41,17 @@ def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> Depth
 def judge_by_depth(
     watch: DepthWatch, frame: Frame, bodies: tuple[Body, ...], elapsed: float, result: Alignment, camera: Camera
 ) -> tuple[Alignment, DepthWatch]:
-    """A pair's result, with wrong depth among its findings where that is known, and what is known then.
+    """A pair's result, with `DEPTH_MISMATCH` among its findings if the run's depth is wrong, and the updated watch.
 
-    A pair whose depth is in doubt by itself says nothing of the run's: it became wrong, and that was told.
+    A pair whose own depth is in doubt tells nothing of the run's: its depth became wrong, which is already reported.
 
     Args:
         watch: What was known before.
         frame: The target.
-        bodies: What moves on its own in it.
-        elapsed: Between the two images, seconds.
-        result: Of the pair.
-        camera: Of both.
+        bodies: Bodies that move on their own in it.
+        elapsed: Time between the two images, seconds.
+        result: Result of the pair.
+        camera: Camera of both frames.
     """
     if AlignmentStatus.DEPTH_MISMATCH in result.statuses:
         return result, watch

@@ -1,7 +1,7 @@
-"""What is drawn into every image of a run: a clock, a name, a frame around it. It stays put as the scene moves, and
-would hold the camera where it is.
+"""Overlays that are drawn into every image of a run: a clock, a name, a frame around it.
 
-No sensor gives a pixel the same level twice for long: it has noise. What is drawn has none.
+An overlay stays put as the scene moves, and would hold the camera where it is. It is told by its lack of noise: no
+sensor gives a pixel the same level for long.
 """
 
 import contextlib
@@ -16,38 +16,38 @@ from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified_at
 
 STEP = 2
-"""Pixels, down and to the right, of which one is looked at."""
+"""Spacing of the sampled pixels, down and to the right."""
 STEEP = 10
-"""Grey levels between the lowest and the highest of 3 x 3 such pixels, from which on there is something to see."""
+"""Range of grey levels within 3 x 3 sampled pixels above which there is something to see."""
 CHANGED, MOVED = 2, 0.5
-"""Of the pixels where there is, the share that changes by more than so many grey levels as the camera moves."""
+"""Change in grey levels, and the share of pixels with something to see that has to exceed it: then the camera moves."""
 FRAMES = 8
-"""Images of a camera that moves, one after the other, in which what is drawn keeps its level to the digit."""
+"""Consecutive images of a moving camera in which an overlay keeps its exact level."""
 LEAST = 5e-3
-"""Share of the pixels that has to be drawn and steep. Clean clips of the TUM benchmark have 0.002 at most."""
+"""Share of the pixels that has to be overlay and steep. Clean clips of the TUM benchmark have 0.002 at most."""
 REACH = 5
-"""Such pixels around, which coding and the search's interpolation mix with what is drawn."""
+"""Sampled pixels around an overlay that coding and the search's interpolation mix with it."""
 AROUND = 21
-"""Such pixels across the surroundings of which the mean takes the place of what is drawn."""
+"""Sampled pixels across the surroundings whose mean replaces an overlay."""
 LITTLE = 0.01
-"""Share of the surroundings that the mean of the whole image counts as, for where all around is drawn."""
+"""Weight of the whole image's mean, as a share of the surroundings, for where everything around is overlay."""
 
 
 class Drawn(NamedTuple):
-    """What is known of what is drawn, on every `STEP`th pixel."""
+    """What is known of overlays, on every `STEP`th pixel."""
 
     last: Num[np.ndarray, "h w"] | None = None
     """The last image; None before the first."""
     counts: UInt8[np.ndarray, "h w"] = np.zeros((0, 0), np.uint8)
-    """In so many images of a camera that moved each pixel kept its level, up to the last one."""
+    """Number of images of a moving camera, up to the last one, in which each pixel kept its level."""
 
     @property
     def is_any(self) -> bool:
-        """Whether enough of the image keeps its level for something to be drawn there."""
+        """Whether enough of the image keeps its level for an overlay to be there."""
         return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= LEAST)
 
     def after(self, grey: np.ndarray) -> Self:
-        """Look at one more image."""
+        """Update with one more image."""
         some = np.ascontiguousarray(np.asarray(grey)[::STEP, ::STEP])
         if some.dtype != np.uint8:
             some = np.clip(np.nan_to_num(some.astype(np.float64)), 0.0, 255.0).astype(np.float32)
@@ -61,7 +61,7 @@ class Drawn(NamedTuple):
         return self._replace(last=some, counts=counts)
 
     def without(self, frame: Frame) -> Frame:
-        """The last frame with the mean of its surroundings, and no depth, where something is drawn."""
+        """The last frame with overlays replaced by the mean of their surroundings, and without depth there."""
         if self.last is None or not self.is_any:
             return frame
         edges = (self.counts >= FRAMES) & _is_steep(self.last)
@@ -80,9 +80,9 @@ class Drawn(NamedTuple):
 
 
 class AsTracked:
-    """Frames of a run as they were tracked, read once more from the first one on.
+    """Frames of a run as they were tracked, read again from the first one on.
 
-    Without `is_drawn_on` nothing is drawn into them, and only those are decoded that are asked for.
+    Without `is_drawn_on` there are no overlays, and only the frames that are asked for are decoded.
     """
 
     def __init__(self, sequence: Sequence, is_drawn_on: bool = True) -> None:
@@ -90,7 +90,7 @@ class AsTracked:
         self._drawn, self._next = Drawn(), 0
 
     def __getitem__(self, index: int) -> Frame:
-        """A frame behind those that were asked for before: without distortion, and without what is drawn into it.
+        """A frame after those that were asked for before, without distortion and overlays.
 
         Raises:
             FrameError: It cannot be read.

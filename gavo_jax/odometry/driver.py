@@ -1,6 +1,6 @@
-"""The thin driver: frames in, chained poses out.
+"""The driver: frames in, chained poses out.
 
-It checks each frame, has an aligner find its motion, decides what becomes of it, and chains the poses.
+It checks each frame, has an aligner find its motion, decides what becomes of the frame, and chains the poses.
 """
 
 import warnings
@@ -46,43 +46,46 @@ from gavo_jax.trajectory import inverse
 
 @dataclass(frozen=True)
 class Step:
-    """What the driver says of one new frame."""
+    """The driver's record of one new frame."""
 
     index: int
-    """Index of the frame in the sequence; the first frame, 0, makes no step."""
+    """Index of the frame in the sequence; the first frame, 0, has no step."""
     reference_timestamp: float
-    """Colour stamp of the frame that this one was aligned with, seconds."""
+    """Colour timestamp of the frame that this one was aligned with, seconds."""
     timestamp: float
     alignment: Alignment
-    """On the host; of a lost pair its `target_T_reference` is what was found, not what was recorded. Its status may be
-    a warning about the frame (a gap before it, depth in part missing) that had a usable motion all the same."""
+    """The alignment, on the host. For a lost pair its `target_T_reference` is what was found, not what was recorded.
+    Its status may be a warning about the frame (a gap before it, partly missing depth) although the motion is usable.
+    """
     world_T_camera: Float64[np.ndarray, "4 4"]
-    """Recorded; the world is the first camera."""
+    """Recorded pose; the world is the first camera."""
     milliseconds: float
-    """From the decoded images to the result on the host."""
+    """Time from the decoded images to the result on the host, milliseconds."""
     lost: bool
     """Whether there is no usable motion."""
     policy: Literal["", "hold", "predict", "stop"] = ""
     """What was recorded for a lost pair; see `OdometryOptions.on_lost`."""
     segment: int = 0
-    """Stretch of the trajectory that the frame belongs to; between two stretches the motion is unknown."""
+    """Segment of the trajectory that the frame belongs to; between two segments the motion is unknown."""
     origin: Literal["tracked", "relocalised", "guessed"] = "tracked"
-    """Where the pose comes from: the reference, a keyframe of the map (then that is the pair's reference), or nothing
-    (a lost pair, or a motion that is taken to have gone on behind a body)."""
+    """Where the pose comes from: the reference, a keyframe of the map (then that is the pair's reference), or a guess.
+    Guessed are lost pairs, and motions that are taken to have gone on behind a body.
+    """
     bodies: tuple[Body, ...] = ()
-    """What moves on its own, where the settings ask for that; see docs/bodies.md."""
+    """Bodies that move on their own, where the settings ask for them; see docs/bodies.md."""
     revises: int = 0
-    """So many of the pairs before are wrong, as is seen now: they followed a body, or led to an image that is
-    not of its stamp's moment; see `odometry.hindsight`."""
+    """Number of pairs before this one that turn out to be wrong. They followed a body, had wrong depth, or led to an
+    image of another moment than its timestamp; see `odometry.hindsight`.
+    """
 
     @property
     def depth_is_trusted(self) -> bool:
-        """Whether nothing speaks against the frame's own depth: maps are made of such frames."""
+        """Whether nothing speaks against the frame's own depth; maps are made of such frames only."""
         return DOUBTED_DEPTH.isdisjoint(self.alignment.statuses)
 
     @property
     def moving(self) -> Bool[np.ndarray, "height width"] | None:
-        """Pixels of the image, without distortion, that move on their own; None where nothing is known to."""
+        """Pixels of the undistorted image that move on their own; None where none are known to."""
         return covered(self.bodies)
 
 
@@ -90,9 +93,9 @@ class Found(NamedTuple):
     """Where a frame was found in a map."""
 
     alignment: Alignment
-    """With a keyframe as the reference."""
+    """Alignment with a keyframe as the reference."""
     timestamp: float
-    """Colour stamp of the keyframe, seconds."""
+    """Colour timestamp of the keyframe, seconds."""
     world_T_camera: Float64[np.ndarray, "4 4"]
     """Pose of the frame, in the world of the odometry's segment that the keyframe belongs to."""
     segment: int
@@ -102,34 +105,36 @@ class Relocaliser(Protocol):
     """Finds frames in a map of the run so far."""
 
     def find(self, frame: Frame, segment: int) -> Found | None:
-        """Return where a frame was taken, seen from another segment than its own; None where the map does not say."""
+        """Return where a frame was taken, relative to another segment than its own; None where the map does not say."""
         ...
 
 
 MAX_HELD = 3
-"""Frames without a new reference after which the newest usable one becomes it: the old one is out of reach."""
+"""Frames without a new reference after which the newest usable one becomes it, as the old one is out of reach."""
 MAX_DOUBTED = 15
-"""The same where depth alone keeps frames from becoming it; then it may be the reference's depth that is wrong."""
+"""Frames after which one becomes the reference that only its depth kept from it: the reference's depth may be wrong."""
 POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
-"""Statuses of frames that have a motion, but become the reference only where the old one is out of reach."""
+"""Statuses of frames that have a motion, but become the reference only when the old one is out of reach."""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
 """Statuses of frames that have a motion, but never become the reference."""
 DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
-"""Statuses of frames that have a motion, but no depth of their own that could be trusted."""
+"""Statuses of frames that have a motion, but no trustworthy depth of their own."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
-"""Frames of a segment that is adrift of which each is looked for in the map; after them, every so many."""
+"""Number of first frames of a segment adrift that are all looked for in the map, and interval of those looked for
+later.
+"""
 
 Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
-"""Says which pixels move in a step's frame: `Step.moving`, or the masks of the run's folder."""
+"""Function that gives the pixels that move in a step's frame: `Step.moving`, or the masks of the run's folder."""
 
 
 def seen_moving(step: Step) -> Bool[np.ndarray, "height width"] | None:
-    """`Step.moving`."""
+    """Return `Step.moving`."""
     return step.moving
 
 
 class FrameOutcome(NamedTuple):
-    """What became of a frame, before a map is asked."""
+    """What became of a frame, before the map is asked."""
 
     after: Progress
     result: Alignment
@@ -141,25 +146,25 @@ class FrameOutcome(NamedTuple):
 
 
 class Odometry:
-    """Frame-by-frame tracking: it holds an aligner, and between two frames all it knows is its `progress`.
+    """Frame-by-frame tracking with an aligner; all that it knows between two frames is its `progress`.
 
     Args:
-        camera: Camera of the frames; where it has lens distortion, that is taken out of every frame.
-        settings: What searches, what is minimised, how it is used; the `default` preset's if left out.
+        camera: Camera of the frames; lens distortion is removed from every frame.
+        settings: Settings of the solver, the objective and the odometry; the `default` preset's if left out.
         seed: Every random number follows from it and the frames' indices.
-        record: Whether every frame's candidates are kept until the next frame, for people to look at.
-        solver: Takes the place of the settings' solver.
-        aligner: Takes the place of the search that the settings describe.
-        relocaliser: Is asked where a frame is that nothing ties to the frames before.
+        record: Whether every frame's candidates are kept until the next frame, for display.
+        solver: Replaces the settings' solver.
+        aligner: Replaces the search that the settings describe.
+        relocaliser: Finds the place of frames that nothing ties to the frames before.
 
     Attributes:
-        camera: Without distortion: that of the frames as they are aligned.
+        camera: Camera of the frames as they are aligned, without distortion.
         progress: Where it stands; a driver of the same settings that is given it goes on from there.
-        candidates: Of the last frame's search, an entry per level, coarsest first; empty unless they are recorded.
-        frame: The last frame as it was tracked: without what is drawn into the images. None where it could not be read.
+        candidates: Candidates of the last frame's search, one entry per level, coarsest first; empty unless recorded.
+        frame: The last frame as it was tracked, without overlays. None where it could not be read.
 
     Raises:
-        GavoError: The camera's images are too small, or the seed is none.
+        GavoError: The camera's images are too small, or the seed is invalid.
     """
 
     @in_32_bits
@@ -187,10 +192,10 @@ class Odometry:
 
     @in_32_bits
     def warm_up(self, wholly: bool = False) -> float:
-        """Compile the program for a frame (or load it from the cache); returns the seconds this took.
+        """Compile the program for a frame, or load it from the cache; return the seconds this took.
 
         Args:
-            wholly: Also what only a doubtful pair needs: a camera would not wait while that is compiled.
+            wholly: Whether to compile also what only a doubtful pair needs: a live camera would not wait for that.
         """
         return warm_up_wholly(self.aligner) if wholly else self.aligner.warm_up()
 
@@ -198,20 +203,20 @@ class Odometry:
     def register(self, frame: Frame | FrameError | None, timestamp: float) -> Step | None:
         """Track one more frame.
 
-        A frame that is not fit for it (`frame_checks`) is flagged and never becomes a reference.
+        A frame that is not fit to be tracked (`frame_checks`) is flagged and never becomes a reference.
 
         Args:
-            frame: The next frame; for one that could not be read the error, or None: it is lost, and the run goes on.
-            timestamp: Its colour stamp, seconds; later than the last one's, or the frame is lost. The frame's own
-                stamp gives way to it.
+            frame: The next frame; the error or None for one that could not be read: it is lost, and the run goes on.
+            timestamp: Its colour timestamp, seconds; it overrides the frame's own. If it is not later than the last
+                one, the frame is lost.
 
         Returns:
             The step, or None for the first frame, which is the world's origin.
 
         Raises:
             FrameError: There is no first frame to start from.
-            GavoError: What is given is no frame, its images are not of the camera's size or no grey and depth, or a
-                stamp is no number, or the first one is not in seconds.
+            GavoError: The input is no frame, or its images are not grey and depth of the camera's size. Or a
+                timestamp is no number, or the first one is not in seconds.
         """
         timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
@@ -244,7 +249,7 @@ class Odometry:
                 beginning=None,
             )
             new_T_old = found.world_T_camera @ inverse(outcome.after.world_T_camera)
-            # what a lost search took for a body did not fit a motion that was wrong
+            # a lost search takes for bodies what does not fit its wrong motion
             bodies = () if lost else tuple(body.moved(new_T_old) for body in bodies)
             result, lost, origin = with_finding(found.alignment, finding.status), False, "relocalised"
         elif after.adrift:
@@ -270,7 +275,7 @@ class Odometry:
         )
 
     def _accepted(self, frame: Frame | FrameError | None, timestamp: float) -> Frame | FrameError | None:
-        """What is given, if it may be: a frame without distortion and at its stamp, or why there is none."""
+        """The input, checked: a frame without distortion and at its timestamp, or the reason why there is none."""
         is_first = self.progress.last_index < 0
         if not (frame is None or isinstance(frame, FrameError)):
             frame = rectified(frame, self.recorded)
@@ -285,19 +290,19 @@ class Odometry:
         return frame
 
     def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
-        """Pass over a frame of which nothing can be used."""
+        """Pass over an unusable frame."""
         revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
         after = self._lose(before, None, timestamp)
         return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
 
     def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
-        """Begin with a frame before which nothing could be a reference: it is the first one if it is fit for that."""
+        """Begin with a frame where there is no reference yet; it becomes the first one if it is fit for that."""
         if frame is None or finding.use is not Use.ALL:
             return FrameOutcome(before, no_alignment(finding.status), lost=True)
         return FrameOutcome(self._restart(before, frame), no_alignment(AlignmentStatus.NO_REFERENCE), lost=True)
 
     def _align(self, before: Progress, frame: Frame, finding: Finding) -> FrameOutcome:
-        """Align a frame and judge what comes of it."""
+        """Align a frame and judge the outcome."""
         clock = before.clock(frame)
         state = before.tracker_at(frame.timestamp)
         attempt, leap = align_leaping(self.aligner, state, frame, clock, before.leap)
@@ -322,7 +327,7 @@ class Odometry:
         return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
-        """Look for a frame in the map, where it is the reference of a segment that is adrift."""
+        """Look for a frame in the map if it has become the reference of a segment that is adrift."""
         if self.relocaliser is None or frame is None or not after.adrift or after.held:
             return None
         if after.adrift > SOUGHT_AT_ONCE and after.adrift % SOUGHT_EVERY:
@@ -330,8 +335,8 @@ class Odometry:
         return self.relocaliser.find(frame, after.segment)
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
-        """Make a frame the only reference, standing where the camera is recorded to be; after others it starts a new
-        segment.
+        """Make a frame the only reference, at the camera's recorded pose; this starts a new segment unless it is the
+        first.
         """
         here = before if before.last_index == 0 else before.in_new_segment()
         return here._replace(
@@ -348,15 +353,16 @@ class Odometry:
     def _advance(
         self, before: Progress, frame: Frame, finding: Finding, attempt: Attempt
     ) -> tuple[Progress, Alignment, bool]:
-        """What becomes of an attempt: where its motion is usable and the frame fit for it, that is the new reference.
+        """Apply an attempt: where its motion is usable and the frame is fit for it, the frame becomes the new
+        reference.
 
         Returns:
-            Where the driver stands now, the result, and whether the pair is lost.
+            Where the driver stands after it, the result, and whether the pair is lost.
         """
         result = attempt.result
         doubted = AlignmentStatus.DEPTH_MISMATCH in result.statuses
         if not attempt.usable:
-            # of another scene, image and depth are unlike: only depth that was wrong before, or alone is, is in doubt
+            # in another scene both image and depth differ: depth is in doubt only if it was before, or differs alone
             doubted &= before.doubted or result.status is AlignmentStatus.DEPTH_MISMATCH
             fit = frame if finding.use is Use.ALL and not (doubted and before.held + 1 < MAX_DOUBTED) else None
             after = self._lose(before._replace(doubted=doubted), fit, frame.timestamp)
@@ -368,7 +374,7 @@ class Odometry:
             after = after._replace(unknown=before.unknown + attempt.unknown)
         elif before.unknown:
             after = after._replace(unknown=0)
-            if before.unknown >= MAX_HELD:  # too many to go on in the same world
+            if before.unknown >= MAX_HELD:  # too many guesses to go on in the same world
                 after = after.in_new_segment()
         may_be = not POOR.isdisjoint(result.statuses) and DEPTHLESS.isdisjoint(result.statuses)
         overdue = after.held >= MAX_HELD and may_be and (attempt.fit or not doubted)
@@ -380,18 +386,18 @@ class Odometry:
                 held=0,
                 way=Way(),
             )
-        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # whose place is a rough one
+        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # that pose is a rough one
             since = frame.timestamp - before.reference_timestamp
             after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False
 
     def _lose(self, before: Progress, frame: Frame | None, timestamp: float) -> Progress:
-        """Record a lost pair by the policy, and give the old reference up once it is out of reach.
+        """Record a lost pair by the policy, and give up the old reference once it is out of reach.
 
         Args:
             before: Where the driver stood.
             frame: The new frame if it is fit to be a reference.
-            timestamp: Its stamp.
+            timestamp: Timestamp of the new frame.
         """
         after = before._replace(held=before.held + 1)
         if self.settings.odometry.on_lost == "predict" and timestamp > before.reference_timestamp:

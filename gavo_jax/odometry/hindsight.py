@@ -1,6 +1,4 @@
-"""What is known of earlier pairs only later: that they followed a body, led to an image of another moment, or had depth
-that did not change as they say.
-"""
+"""Hindsight on earlier pairs: they followed a body, led to an image of another moment, or had wrong depth."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -19,17 +17,17 @@ from gavo_jax.trajectory import inverse
 
 
 def revised(steps: Iterable[Step]) -> list[Step]:
-    """The steps of a run, those that a later one revises as `moving_body`, `implausible_motion` or
-    `depth_mismatch`, as its own statuses say, with the covariance of what is unknown.
+    """The steps of a run, with those that later steps revise flagged and given an unknown covariance.
 
-    Their poses stay as they are: how the camera moved meanwhile, nobody saw. Lost pairs stay as they are as well.
+    They become `moving_body`, `implausible_motion` or `depth_mismatch`, by the statuses of the step that revises them.
+    Their poses stay, as nobody saw how the camera really moved. Lost pairs stay as they are as well.
 
     Args:
-        steps: As the driver made them, one after the other; revising them again changes nothing.
+        steps: The driver's steps, in order; revising them again changes nothing.
     """
     whole = list(steps)
     for place, status in taken_back(whole).items():
-        if is_unknown(whole[place].alignment):  # and says why
+        if is_unknown(whole[place].alignment):  # its status says why
             continue
         result = with_finding(whole[place].alignment, status)
         whole[place] = replace(whole[place], alignment=result._replace(covariance=UNKNOWN))
@@ -37,10 +35,10 @@ def revised(steps: Iterable[Step]) -> list[Step]:
 
 
 def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
-    """Places, in a list of steps, of those that are wrong as is known later, and what they are.
+    """Indices of the steps that turn out to be wrong, with the status that each one gets.
 
-    A step revises so many frames that became the reference. Frames between them that did not, as their images were
-    doubted, do not count, and are revised as well where they are not lost.
+    `Step.revises` counts frames that became the reference. Frames in between that did not, as their images were
+    doubted, are not counted. They are revised as well unless they are lost.
     """
     places = dict.fromkeys(sorted(of_other_moments(steps)), AlignmentStatus.IMPLAUSIBLE_MOTION)
     for last, step in enumerate(steps):
@@ -61,10 +59,9 @@ def taken_back(steps: Sequence[Step]) -> dict[int, AlignmentStatus]:
 
 
 def _said_of_others(step: Step) -> AlignmentStatus:
-    """What a step finds of those that it revises: that an image is not of its stamp's moment, that depth has not
-    changed as the motions say, or else a body.
+    """The fault that a step finds in those that it revises: timestamps, depth, or else a body.
 
-    What was found of the step first counts: more may have been found since, of its image or by a later step.
+    The step's first status has precedence: more may have been found since, in its image or by a later step.
     """
     telling = (AlignmentStatus.MOVING_BODY, *BY_TIME, AlignmentStatus.DEPTH_MISMATCH)
     first, found = step.alignment.status, step.alignment.statuses
@@ -74,20 +71,22 @@ def _said_of_others(step: Step) -> AlignmentStatus:
 
 
 BY_TIME = (AlignmentStatus.IMPLAUSIBLE_MOTION, AlignmentStatus.BAD_TIMESTAMP)
-"""What a step says where it revises others for the sake of their stamps."""
+"""Statuses of a step that revises others because of their timestamps."""
 
 
 MUCH_SMOOTHER, MIN_JERKS = 5.0, 0.1
-"""An image is of another moment if the path is so many times smoother without it, or where it has changed places with
-one of the next two, and its changes of motion moved the image by more than so many radians in sum. Even a camera that
-turns round at every frame has a path that is smoother by a factor of three at most."""
+"""An image is of another moment if the path is this many times smoother without it, or with it and one of the next two
+swapped. Its changes of motion must also move the image by more than this many radians in sum. Even the path of a camera
+that turns round at every frame gets smoother by a factor of three at most.
+"""
 BEFORE, AFTER = 2, 3
-"""Poses of a path before and after such an image that tell."""
+"""Numbers of poses before and after such an image that are used."""
 
 
 def of_other_moments(steps: Sequence[Step]) -> set[int]:
-    """Places of the motions to and from images that break a path which is smooth without them: the path of the
-    motions as they were found, whatever loops have corrected since. Frames that were lost are not on it.
+    """Indices of the motions to and from images that break an otherwise smooth path.
+
+    The path is that of the motions as they were found, before any correction by loops. Lost frames are not on it.
     """
     places: set[int] = set()
     for chain in _chains(steps):
@@ -104,7 +103,7 @@ def of_other_moments(steps: Sequence[Step]) -> set[int]:
 
 
 def _chains(steps: Sequence[Step]) -> Iterator[list[int]]:
-    """Places of steps that are not lost, of which each begins where the one before has ended."""
+    """Indices of steps that are not lost, in chains in which each step begins where the one before ended."""
     chain: list[int] = []
     for place, step in enumerate(steps):
         if step.lost:
@@ -118,7 +117,7 @@ def _chains(steps: Sequence[Step]) -> Iterator[list[int]]:
 
 
 def _misplaced(poses: Sequence[np.ndarray], stamps: Float64[np.ndarray, " n"]) -> tuple[int, ...]:
-    """Which of some poses, the third among them, are of other moments than their stamps say, if any."""
+    """Which of some poses, the third among them, are of other moments than their timestamps say, if any."""
     here, later = BEFORE, BEFORE + 1
     share = float((stamps[here] - stamps[here - 1]) / (stamps[later] - stamps[here - 1]))
     changed = [{here: interpolate(poses[here - 1], poses[later], share)}]

@@ -1,10 +1,11 @@
-"""Frames that went missing although the stamps go on: the camera seems to leap.
+"""Frames that are missing although the timestamps go on: the camera seems to leap.
 
-A motion that no camera makes in the time between two stamps has one of two causes. The image belongs to another moment:
-then the next frame is where the camera was expected. Or frames are missing, and those that are left were stamped anew:
-then the next frame is one ordinary step further. Which one it is shows at that next frame; until then the leap is kept
-in mind. The shutter's part of a motion hangs on the time it took, so a leap is searched for as a motion of the time in
-which the camera, as fast as it was, would have made it.
+A motion that no camera makes between two timestamps has one of two causes. The image may be of another moment: then the
+next frame is where the camera was expected. Or frames are missing, and the others were given new timestamps: then the
+next frame is one ordinary step further. The next frame tells which it is; until then the leap is remembered.
+
+The effect of a rolling shutter depends on the time that a motion took. So a leap is searched for as if it took as long
+as the camera, at its last speed, needs for it.
 """
 
 from typing import NamedTuple
@@ -22,17 +23,17 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 LONGEST = 1.0
-"""Seconds that a leap is taken for, at most."""
+"""Longest time that a leap is taken to last, seconds."""
 
 
 class Leap(NamedTuple):
-    """A motion from the reference that no camera makes in the time that the stamps say."""
+    """A motion from the reference that no camera makes in the time between the timestamps."""
 
     target_T_reference: Float64[np.ndarray, "4 4"]
     seconds: float
-    """Seconds in which a camera would have made it."""
+    """Seconds in which a camera would have made the motion."""
     timestamp: float
-    """Stamp of the frame that it leads to, seconds."""
+    """Timestamp of the frame that the motion leads to, seconds."""
 
 
 def align_leaping(
@@ -41,14 +42,15 @@ def align_leaping(
     """An attempt at a frame, and the leap that it may be.
 
     Args:
-        aligner: Who aligns.
+        aligner: The aligner.
         state: The aligner's state before the frame.
         frame: The new frame.
         clock: When it was taken.
-        leap: What the frame before may have been.
+        leap: The leap that the last frame may have been.
 
     Returns:
-        The attempt; of a leap that the new frame confirms it is usable and has the finding `IMPLAUSIBLE_MOTION`.
+        The attempt and the leap. An attempt that confirms the last leap is usable, with the finding
+            `IMPLAUSIBLE_MOTION`.
     """
     attempt = aligner.align(state, frame, clock)
     leaps = not attempt.usable and AlignmentStatus.IMPLAUSIBLE_MOTION in attempt.result.statuses
@@ -77,7 +79,7 @@ def _goes_on(aligner: Aligner, state: object, clock: Clock, leap: Leap, since: f
 
 
 def _seconds(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) -> float:
-    """The time in which the camera, as fast as it was, makes a motion."""
+    """Seconds in which the camera, at its last speed, would make an attempt's motion."""
     elapsed = float(clock.elapsed)
     found = image_shift(*length_and_angle(np.asarray(attempt.result.target_T_reference, np.float64)))
     expected = image_shift(*length_and_angle(aligner.predict(state, elapsed)))

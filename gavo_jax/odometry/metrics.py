@@ -15,45 +15,45 @@ from gavo_jax.trajectory import Trajectory
 
 
 class Metrics(TypedDict):
-    """The figures of a run by their names; None where there is no, or too little, ground truth."""
+    """The figures of a run, by name; None without ground truth, or with too little of it."""
 
     device: str
     frames: int
     pairs: int
     lost_pairs: int
     guessed_pairs: int
-    """Pairs that are not lost and whose motion the images do not tell: the last one, gone on with behind a body."""
+    """Pairs that are not lost but whose motion is a guess: the last one, continued behind a body."""
     statuses: dict[str, int]
     """Pairs of each status."""
     segments: int
     """Stretches of the trajectory between which the motion is unknown; every error is computed within them."""
     unknown_motions: int
-    """Places where one ends and another begins, or goes on."""
+    """Places where the trajectory passes from one segment to another."""
     rpe_translation_rmse_m_per_s: float | None
-    """Drift, as by TUM's tool: relative pose error over 1 s."""
+    """Drift as TUM's tool computes it: relative pose error over 1 s."""
     rpe_rotation_rmse_deg_per_s: float | None
     rpe_translation_rmse_m_per_frame: float | None
     ate_translation_rmse_m: float | None
-    """After alignment."""
+    """Absolute trajectory error, after alignment."""
     distance_error_final_m: float | None
-    """At the end, from the first pose on; None where the motion between is unknown somewhere."""
+    """Distance error at the end, from the first pose on; None where the motion in between is unknown."""
     compile_seconds: float
     milliseconds_per_pair_median: float | None
     frames_per_second: float | None
-    """From files to poses, after compilation, decoding included."""
+    """Frames per second from files to poses, decoding included, compilation excluded."""
 
 
 class RunMetrics(Metrics):
-    """The same, and what was run, as in metrics.json."""
+    """The metrics of a run, and what was run, as in metrics.json."""
 
     sequence: str
     method: str | None
-    """None for a solver of one's own that has no name; see `register`."""
+    """Name of the method; None for a solver of one's own that has no name, see `register`."""
     preset: str | None
-    """None for settings that are no preset's."""
+    """Name of the preset; None for settings that are no preset's."""
     seed: int
     complete: bool
-    """Whether every frame was tracked: not where `on_lost` ended the run."""
+    """Whether every frame was tracked: False if `on_lost` ended the run."""
 
 
 DRIFT: Final = "rpe_translation_rmse_m_per_s"
@@ -70,12 +70,12 @@ ERRORS: Final = (DRIFT, ROTATION_DRIFT, DRIFT_PER_FRAME, ABSOLUTE_ERROR, FINAL_D
 
 
 def run_identity(sequence: str, method: str | None, preset: str | None, seed: int | None) -> dict[str, Any]:
-    """Name the run that metrics are of: what they begin with."""
+    """The entries that identify a run, with which its metrics begin."""
     return {"sequence": sequence, "method": method, "preset": preset, "seed": seed}
 
 
 def errors_before(causal: Mapping[str, Any]) -> dict[str, Any]:
-    """The errors of a trajectory that loops have corrected since, under names of their own."""
+    """Errors of a trajectory before its correction by loops, under names of their own."""
     return {f"odometry_{name}": causal[name] for name in ERRORS}
 
 
@@ -86,11 +86,11 @@ def compute_metrics(
     seconds: float,
     compile_seconds: float,
 ) -> Metrics:
-    """The figures of `metrics.json` that follow from a run; None where there is no, or too little, ground truth.
+    """The figures of `metrics.json` that follow from a run; None without ground truth, or with too little of it.
 
     Args:
-        trajectory: The estimate.
-        ground_truth: The truth, or None.
+        trajectory: The estimated trajectory.
+        ground_truth: The true trajectory, or None.
         steps: The run's steps.
         seconds: Wall time of the run after compilation, decoding included.
         compile_seconds: Time of the compilation.
@@ -127,7 +127,7 @@ def compute_metrics(
 
 
 def _unbroken(trajectory: Trajectory) -> Trajectory:
-    """The trajectory; raises GavoError where the way from its first pose to its last is not known."""
+    """The trajectory; raises GavoError where the motion from its first pose to its last is unknown."""
     if trajectory.segments[0] != trajectory.segments[-1]:
         raise GavoError("the first pose and the last are of different segments")
     return trajectory

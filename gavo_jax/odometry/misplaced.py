@@ -1,8 +1,8 @@
-"""References whose image turns out to be of another moment than their stamp says.
+"""References whose image turns out to be of another moment than their timestamp.
 
-A stamp may be off, so a motion that is longer than a camera can make it in the time passes (`plausibility`). So does
-the motion to a frame that has changed places with the next one. But then the next motion goes back as no camera does,
-and past both of them the camera went on as it did before.
+A timestamp may be off, so a motion that is too long for its time may pass (`plausibility`). So may the motion to a
+frame that was swapped with the next one. But then the next motion goes back as no camera does, and past both of them
+the camera goes on as before.
 """
 
 from typing import NamedTuple
@@ -20,26 +20,27 @@ from gavo_jax.trajectory import inverse
 
 
 class Arrival(NamedTuple):
-    """A motion to the reference that no camera makes, save that its stamp may be off."""
+    """A motion to the reference that no camera makes, unless the timestamp is off."""
 
     target_T_reference: Float64[np.ndarray, "4 4"]
     expected: Float64[np.ndarray, "4 4"]
-    """The same, had the camera gone on as before."""
+    """The motion expected if the camera had kept its velocity."""
     seconds: float
-    """From the reference before to this one."""
+    """Seconds from the last reference to this one."""
     suspect: bool = False
     """Whether a motion from this reference was implausible, too."""
 
 
 def arrival_of(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) -> Arrival | None:
-    """What to remember of the motion to a new reference: nothing where a camera can have made it in the time, or
-    where nothing is known of the motion before.
+    """What to remember of the motion to a new reference.
+
+    This is None where a camera can have made the motion in its time, or where the motion before is unknown.
 
     Args:
-        aligner: Who aligned.
-        state: What it knew before.
+        aligner: The aligner.
+        state: Its state before the frame.
         clock: When the frame was taken.
-        attempt: What it made of the frame.
+        attempt: Its attempt at the frame.
     """
     seconds = float(clock.elapsed)
     expected = aligner.predict(state, seconds)
@@ -50,8 +51,10 @@ def arrival_of(aligner: Aligner, state: object, clock: Clock, attempt: Attempt) 
 
 
 def doubt_reference(came: Arrival | None, clock: Clock, attempt: Attempt) -> tuple[Attempt, Arrival | None]:
-    """An attempt that says so where its reference turns out to be misplaced, and what to remember of the reference,
-    should it stay.
+    """Flag an attempt whose reference turns out to be misplaced.
+
+    Returns:
+        The attempt, and what to remember of the reference if it stays.
     """
     if came is None:
         return attempt, None
@@ -70,7 +73,7 @@ def is_misplaced(came: Arrival, onward: Float64[np.ndarray, "4 4"], seconds: flo
     Args:
         came: How the reference was reached.
         onward: target_T_reference from there to the new frame.
-        seconds: The time that this took.
+        seconds: Time that this motion took, seconds.
     """
     whole = came.seconds + seconds
     past, expected = onward @ came.target_T_reference, exp(log(came.expected) * (whole / came.seconds))
@@ -79,11 +82,11 @@ def is_misplaced(came: Arrival, onward: Float64[np.ndarray, "4 4"], seconds: flo
 
 
 def _is_possible(motion: np.ndarray, expected: np.ndarray, seconds: float) -> bool:
-    """Whether a camera can have left its way that far by then."""
+    """Whether a camera can deviate that far from the expected motion in the time."""
     off = np.array(length_and_angle(motion @ inverse(expected)))
     return bool(np.all(off <= possible_change(seconds, seconds) + np.array(TOLERANCE)))
 
 
 def _off(motion: np.ndarray, expected: np.ndarray) -> float:
-    """Return by how much a motion moves the image otherwise than expected, about, in radians."""
+    """Return about how far a motion moves the image away from where it was expected, radians."""
     return float(image_shift(*length_and_angle(motion @ inverse(expected))))

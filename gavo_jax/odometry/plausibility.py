@@ -1,8 +1,8 @@
-"""Whether a motion fits the run so far: what a camera can do, and how well its frames matched until now.
+"""Whether a motion fits the run so far: what a camera can do, and how well frames matched until now.
 
-A frame that doesn't belong to its time stamp can match its reference perfectly. What gives it away is the motion: it
-starts and stops as no camera does. And a match that is far worse than the run's usual one is wrong, or its depth is,
-even where it would pass for a pair by itself.
+A frame that doesn't belong to its timestamp can match its reference perfectly. Its motion gives it away: it starts and
+stops like no camera's. And a match far worse than usual in the run is wrong, or its depth is, even if it would pass for
+a pair by itself.
 """
 
 from typing import Any, NamedTuple
@@ -17,55 +17,56 @@ from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, as_findings, gravest
 
 REMEMBERED = 15
-"""Pairs whose median says what is usual."""
+"""Number of pairs whose median is the usual value."""
 MIN_REMEMBERED = 3
 """Pairs that have to be known before one can be unusual."""
 MAX_ACCELERATION = (15.0, 28.0)
-"""m/s² and rad/s²: over two frames of a hand-held camera the truth of the TUM clips reaches 3 and 21
-(`benchmarks/acceleration.py`); a car brakes by 10.
+"""m/s² and rad/s². Over two frames of a hand-held camera the ground truth of the TUM clips reaches 3 and 21
+(`benchmarks/acceleration.py`); a braking car reaches 10.
 """
 MAX_SPEED = (5.0, 12.0)
-"""m/s and rad/s: images of a faster camera are smeared."""
+"""m/s and rad/s: images of a faster camera are blurred."""
 STAMP_JITTER = 0.02
-"""Seconds that two stamps may be off against each other; a moving camera then seems faster or slower, on its way."""
+"""Error in seconds of the time between two timestamps; a moving camera then seems faster or slower, on its path."""
 UNKNOWN_SECONDS = 1.0
-"""Seconds that stand for those of a motion that is not known: whatever comes next is possible after so many."""
+"""Seconds assumed for a motion that is unknown: after that long any motion is possible."""
 TOLERANCE = (0.015, 0.01)
-"""Metres and radians that an estimate may be off by itself."""
+"""Errors of an estimate by itself, metres and radians."""
 MAX_ERROR_RATIO = 6.0
-"""E over its usual value, above which a pair is `HIGH_ERROR`; a motion larger than usual may have
-as much larger an error."""
+"""E over its usual value above which a pair is `HIGH_ERROR`; for a motion larger than usual, the limit is larger in
+proportion.
+"""
 SCENE_DISTANCE = 1.5
-"""Metres at which a translation moves the image as a rotation by so many radians does."""
+"""Distance assumed for the scene, metres: it converts a translation to a shift of the image."""
 SMALLEST_SHIFT = 0.005
-"""Radians that the image moves by at least: the error of a camera at rest is the sensor's noise alone."""
+"""Smallest usual shift of the image, radians: the error of a camera at rest is the sensor's noise alone."""
 MIN_DEPTH_RATIO = 0.65
 """Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`."""
 MOST_HIDDEN = 1.5
-"""Largest factor by which a motion above the usual lets less depth agree. Where up to twelve frames are dropped from
-the TUM clips, the share stays at 0.54 of the usual one and more; of a depth of other units it is 0.1 and less.
+"""Largest factor by which a motion above the usual lowers the depth that has to agree. With up to twelve frames dropped
+from the TUM clips, the share stays at 0.54 of the usual one or more. With depth in other units it is 0.1 or less.
 """
 MAX_DEPTH_SCALE_RATIO = 6.0
-"""Scale of the depth residuals over its usual value, above which a pair is `DEPTH_MISMATCH`: in a scene of about one
-depth a wrong one lies near the right one. Clean pairs reach 4.6, and 5.5 after five dropped frames; shifted, old,
+"""Scale of the depth residuals over its usual value above which a pair is `DEPTH_MISMATCH`: where all depths are
+similar, wrong depth lies near the right one. Clean pairs reach 4.6, and 5.5 after five dropped frames; shifted, old,
 permuted or upside-down depth mostly has 7 to 16.
 """
 MUCH_DEPTH, SHOWN = 0.3, 0.25
-"""Share of the depth that disagrees with a motion, from which on depth itself is wrong if the image disagrees with less
-than this part of that. Of 255 first pairs of the TUM clips, up to ten frames apart, none is like that; with depth
-upside down 74 of 85 are.
+"""Share of depth that has to disagree with a motion for depth itself to be wrong, and the part of it below which the
+image's own disagreement has to stay. Of 255 first pairs of the TUM clips, up to ten frames apart, none is like that;
+with depth upside down 74 of 85 are.
 """
 LEAST_DEPTH_SCALE, STEADY_SHIFT = 0.022, 0.02
-"""1/m, up to which nothing is said; more where the image usually moved by less than so many radians, as a camera at
-rest has much less than one that starts to move.
+"""Scale of the depth residuals, 1/m, up to which nothing is said, and usual shift of the image, radians, below which
+that limit grows. A camera at rest has much smaller residuals than one that starts to move.
 """
 
 
 class Usual(NamedTuple):
-    """Figures of the last good pairs; not-a-number where there were none yet."""
+    """Figures of the last good pairs; NaN where there are none yet."""
 
     errors: Float[Array, " n"]
-    """E over the image's squared contrast, as it grows with the camera's gain."""
+    """E over the image's squared contrast, as E grows with the camera's gain."""
     shifts: Float[Array, " n"]
     """How far the image moved, radians."""
     explained_depths: Float[Array, " n"]
@@ -74,7 +75,7 @@ class Usual(NamedTuple):
 
     @classmethod
     def unknown(cls) -> "Usual":
-        """Before the first pair."""
+        """The figures before the first pair."""
         nothing: Any = np.full(REMEMBERED, np.nan, np.float32)
         return cls(*(nothing for _ in cls._fields))
 
@@ -92,15 +93,15 @@ def judge_by_history(
     elapsed: Float[Array, ""],
     last_elapsed: Float[Array, ""],
 ) -> Alignment:
-    """The result with what the run so far says against it among its findings.
+    """Add to a result's findings what the run so far says against it.
 
     Args:
-        result: Of the new frame.
-        usual: Of the pairs before.
-        contrast: Of the new image, grey levels.
-        predicted: Twist of the motion if the camera had gone on as before.
-        elapsed: Since the reference, seconds.
-        last_elapsed: The time that the motion before took; `UNKNOWN_SECONDS` where there was none.
+        result: Result of the new frame.
+        usual: Figures of the pairs before.
+        contrast: Contrast of the new image, grey levels.
+        predicted: Twist of the motion if the camera had kept its velocity.
+        elapsed: Time since the reference, seconds.
+        last_elapsed: Duration of the last motion, seconds; `UNKNOWN_SECONDS` where there was none.
     """
     motion = result.target_T_reference
     change = _change(log(motion), predicted, STAMP_JITTER / elapsed)
@@ -127,25 +128,26 @@ def judge_by_history(
 
 
 def depth_alone_disagrees(explained: ExplainedShare) -> Bool[Array, ""]:
-    """Whether depth speaks against a motion and the image does not: what moves, or hides the scene, shows in both."""
+    """Whether depth contradicts a motion and the image does not: what moves, or occludes the scene, shows in both."""
     unlike = 1.0 - explained.depth
     return (unlike > MUCH_DEPTH) & (1.0 - explained.grey < SHOWN * unlike)
 
 
 def possible_change(elapsed: Any, last_elapsed: Any) -> Any:
-    """How far a camera's translation and rotation can be from what was predicted, metres and radians."""
+    """How far a camera's translation and rotation can be from the prediction, metres and radians."""
     return np.array(MAX_ACCELERATION, np.float32) * elapsed * 0.5 * (elapsed + last_elapsed)
 
 
 def image_shift(translation: Any, rotation: Any) -> Any:
-    """How far a motion of this length and angle moves the image, about, in radians."""
+    """About how far a motion of this length and angle moves the image, radians."""
     return rotation + translation / SCENE_DISTANCE
 
 
 def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, " 2"]:
-    """How far translation and rotation are from what was predicted, which may take that share more or less of time.
+    """How far translation and rotation are from the prediction, which may last longer or shorter by a share of its
+    time.
 
-    It is never turned round.
+    The prediction is never reversed.
     """
     moved, expected = twist.reshape(2, 3), predicted.reshape(2, 3)
     along = jnp.sum(moved * expected, axis=1) / jnp.maximum(jnp.sum(expected**2, axis=1), 1e-12)
@@ -154,7 +156,7 @@ def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Flo
 
 
 def _shift(result: Alignment) -> Float[Array, ""]:
-    """How far a motion moves the image, about, in radians."""
+    """About how far a result's motion moves the image, radians."""
     return image_shift(*_lengths(log(result.target_T_reference)))
 
 
@@ -164,5 +166,5 @@ def _lengths(twist: Float[Array, " 6"]) -> Float[Array, " 2"]:
 
 
 def _usual(values: Float[Array, " n"]) -> Float[Array, ""]:
-    """Median of what is remembered; not-a-number, of which no comparison holds, where that is too little."""
+    """Median of the remembered values; NaN, for which every comparison is false, where there are too few."""
     return jnp.where(jnp.sum(jnp.isfinite(values)) >= MIN_REMEMBERED, jnp.nanmedian(values), jnp.nan)

@@ -1,4 +1,4 @@
-"""Where a driver stands between two frames."""
+"""The state of a driver between two frames."""
 
 from typing import Any, NamedTuple, Self
 
@@ -19,33 +19,33 @@ from gavo_jax.odometry.way import Way
 
 
 class Progress(NamedTuple):
-    """Where a driver stands between two frames: all that decides what it makes of the next ones."""
+    """State of a driver between two frames: all that decides what it makes of the next ones."""
 
     tracker: Any = None
-    """The aligner's state; None while no usable frame was seen."""
+    """The aligner's state; None until a usable frame was seen."""
     last_index: int = -1
     """Index of the last frame in the sequence."""
     reference_timestamp: float = 0.0
     world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
     world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
-    """Pose of the last frame, as it was recorded."""
+    """Recorded pose of the last frame."""
     held: int = 0
     """Frames since the reference was renewed."""
     way: Way = Way()
-    """Where the camera was found since then."""
+    """Where the camera was found since the reference was renewed."""
     history: History = History()
     segment: int = 0
     """Number of the segment that the reference belongs to."""
     last_segment: int = 0
     """Largest number given to a segment so far."""
     adrift: int = 0
-    """Frames since a segment began that nothing ties to those before; 0 in one that is tied."""
+    """Frames since the start of a segment that nothing ties to earlier ones; 0 in one that is tied."""
     doubted: bool = False
-    """Whether the last frame's depth did not agree with its image."""
+    """Whether the last frame's depth disagreed with its image."""
     unknown: int = 0
-    """So many of the last motions are guesses that frames have been chained by."""
+    """Number of the last motions in the chain of poses that are guesses."""
     leap: Leap | None = None
-    """What the last frame may have been; it is lost until the next one confirms that."""
+    """The leap that the last frame may have made; that frame is lost until the next one confirms it."""
     arrival: Arrival | None = None
     """How the reference was reached, where its image may be of another moment."""
     beginning: Beginning | None = None
@@ -53,22 +53,25 @@ class Progress(NamedTuple):
     depth: DepthWatch | None = None
     """What is known of the reference's depth, and how depth has changed; None before the first reference."""
     drawn: Drawn = Drawn()
-    """What is drawn into every image."""
+    """Overlays drawn into every image."""
 
     def tracker_at(self, timestamp: float) -> Any:
-        """The aligner's state for a frame of that stamp, with the motion that the way since the reference foretells."""
+        """The aligner's state for a frame at a timestamp, expecting the motion that the way since the reference
+        predicts.
+        """
         seconds = timestamp - self.reference_timestamp
         xi = self.way.at(seconds)
         return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
 
     def in_new_segment(self) -> Self:
-        """Begin a segment that nothing ties to those before; its number was given to no other one."""
+        """Begin a segment that nothing ties to earlier ones, under a number of its own."""
         number = self.last_segment + 1
         return self._replace(segment=number, last_segment=number, adrift=1)
 
     def clock(self, frame: Frame) -> Clock:
-        """When a frame was taken, which is counted as the last one already; of a clock that was set back since the
-        reference, it is not known how long that took.
+        """When a frame was taken that is already counted as the last one.
+
+        If the clock was set back since the reference, the elapsed time is unknown.
         """
         elapsed = frame.timestamp - self.reference_timestamp
         elapsed = max(elapsed, 1e-3) if elapsed > 0 else UNKNOWN_SECONDS

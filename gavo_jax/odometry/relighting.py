@@ -1,7 +1,7 @@
-"""Light that changed from place to place is put into the references, and the frame is searched for once more.
+"""Local changes of light are put into the references, and the frame is searched for again.
 
-A search knows one gain and bias of each reference. Where a lamp flickers while rows are exposed, goes on, or throws a
-shadow, neither fits, and the motion is drawn to one that explains the light.
+A search estimates one gain and bias per reference. Where a lamp flickers while rows are exposed, is switched on, or
+throws a shadow, neither fits. The motion is then drawn to one that explains the light.
 """
 
 from dataclasses import dataclass
@@ -28,51 +28,52 @@ from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed, readout_
 from gavo_jax.settings import Settings
 
 UNEXPLAINED = 0.7
-"""Share of the grey residuals that are not large, below which light is looked at: most clips lie above."""
+"""Share of small grey residuals below which the light is examined: most clips lie above."""
 EXPLAINED = 0.5
 """Part of the large residuals, over the whole image, that a change of light has to explain for another search. Flicker,
-lamps and shadows explain 0.6 to 1 of them; bodies, which are textured, up to 0.3: a search that takes them for light
-would follow them."""
+lamps and shadows explain 0.6 to 1 of them. Bodies, which are textured, explain up to 0.3: a search that takes them for
+light would follow them.
+"""
 
 
 @dataclass(frozen=True)
 class Relighting(SecondThought):
-    """An aligner that searches once more where light changed from place to place.
+    """An aligner that searches again where light changed locally.
 
     Attributes:
-        first: What is asked first.
-        search: What searches then.
+        first: The aligner that is tried first.
+        search: The search that is repeated.
     """
 
     search: FrameSearch
 
     @property
     def camera(self) -> Camera:
-        """The search's."""
+        """Camera of the search."""
         return self.search.camera
 
     @property
     def settings(self) -> Settings:
-        """The search's."""
+        """Settings of the search."""
         return self.search.settings
 
     @property
     def plain(self) -> FrameSearch:
-        """The search."""
+        """The search without second thoughts."""
         return self.search.plain
 
     def blank_state(self) -> TrackerState:
-        """The search's."""
+        """The search's state before the first frame."""
         return self.search.blank_state()
 
     def warm_up_second(self) -> None:
-        """Compile the look at the light."""
+        """Compile the estimate of the light."""
         state = self.blank_state()
         new = NewFrame(state.previous_image, state.instant_motion, state.seconds)
         jax.block_until_ready(self._in_light_of(new, state, np.eye(4, dtype=np.float32)))
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The first attempt, or one with references in the frame's own light if that can be used, or explains more."""
+        """The first attempt, or one with references in the frame's own light if that is usable or explains more."""
         attempt = self.first.align(state, frame, clock)
         result = attempt.result
         explained = float(result.explained.grey)
@@ -97,11 +98,11 @@ class Relighting(SecondThought):
 
 
 class NewFrame(NamedTuple):
-    """A frame as its first attempt has it."""
+    """A frame as its first attempt sees it."""
 
     image: Target
     instant_motion: Float[Array, " 6"]
-    """Twist of the motion, had the camera moved all the time as it did at the frame's own moment."""
+    """Twist of the motion, had the camera always moved as it did at the frame's own moment."""
     elapsed: Float[Array, ""]
     """Seconds since the reference."""
 
@@ -110,10 +111,12 @@ class NewFrame(NamedTuple):
 def _with_light(
     state: TrackerState, new: NewFrame, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
 ) -> tuple[TrackerState, Float[Array, ""]]:
-    """The state with references in the light of a new frame, by the motion to it; and what part of the large residuals
-    that light leaves.
+    """Put the light of a new frame, by the motion to it, into a state's references.
+
+    Returns:
+        The state, and the part of the large residuals that the light leaves.
     """
-    is_moving = jnp.any(state.motion != 0.0)  # as far as is known: rows of a first frame are as they were exposed
+    is_moving = jnp.any(state.motion != 0.0)  # as far as is known: a first frame's rolling shutter is not undone
     sweep = jnp.where(is_moving, state.instant_motion * readout_share(camera, state.seconds), jnp.nan)
     here = view_of(state.previous_image, levels, sweep)
     there = view_of(new.image, levels, new.instant_motion * readout_share(camera, new.elapsed))
@@ -125,7 +128,7 @@ def _with_light(
     planes = jax.tree.map(lambda leaf: leaf[:, None], levels.planes(camera))
 
     def in_new_light(reference: Reference) -> Reference:
-        """Points by the light of the nearest pixel of the level that is looked at."""
+        """Adjust points by the light of the nearest pixel of the level that is examined."""
         x, y, _ = reference.points
         u, v = to_pixels(planes, x, y)
         column = _index_at((u + 0.5) / planes.width, level.width)
@@ -137,5 +140,5 @@ def _with_light(
 
 
 def _index_at(share: Float[Array, "*n"], size: int) -> Integer[Array, "*n"]:
-    """Index, along a side of so many pixels, of the one that lies at a share of its length."""
+    """Index, along a side of `size` pixels, of the one that lies at a share of its length."""
     return jnp.clip(share * size, 0, size - 1).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""A whole sequence at once: its trajectory, its steps and its figures."""
+"""The odometry of a whole sequence: its trajectory, its steps and its figures."""
 
 import time
 from collections.abc import Callable
@@ -39,11 +39,11 @@ class OdometryRun:
     steps: list[Step]
     metrics: RunMetrics
     sequence: Sequence | None = field(default=None, repr=False)
-    """The frames that were run over; None where they are not kept."""
+    """The frames of the run; None where they are not kept."""
     odometry: Trajectory | None = None
-    """With loops, the trajectory before they corrected it."""
+    """The trajectory before its correction by loops; None without loops."""
     loops: Loops | None = None
-    """With loops, the map of keyframes."""
+    """The map of keyframes; None without loops."""
 
     @property
     def alignments(self) -> list[Alignment]:
@@ -51,16 +51,17 @@ class OdometryRun:
         return [step.alignment for step in self.steps]
 
     def map(self, shape: Literal["cloud", "mesh"] = "cloud", voxel: float = 0.01) -> "SceneMap":
-        """What was seen, as a cloud or a mesh in the run's world; the frames are read once more.
+        """The scene that was seen, as a cloud or a mesh in the run's world; the frames are read once more.
 
         With `gavo.Reading(color=True)` it has colours, else it is grey. Needs the extra `[map]`.
 
         Args:
             shape: cloud or mesh.
-            voxel: side, metres.
+            voxel: Side of a voxel, metres.
 
         Raises:
-            GavoError: Open3D cannot be imported, another shape, an absurd voxel, or the run does not hold its sequence.
+            GavoError: Open3D cannot be imported, the shape is unknown, the voxel is absurd, or the run does not hold
+                its sequence.
         """
         from gavo_jax.scene_map import build_map
 
@@ -84,16 +85,16 @@ def run_odometry(
 
     Args:
         sequence: At least two frames.
-        settings: What searches, what is minimised, how it is used; `presets.preset` has named ones, a solver stands for
-            the default ones with that solver.
+        settings: Settings of the solver, the objective and the odometry; `presets.preset` has named ones. A solver
+            stands for the default settings with that solver.
         seed: The same seed, machine and version give the same trajectory, bit for bit.
         on_step: Called with every step as it is done.
-        solver: Takes the place of the settings' solver.
+        solver: Replaces the settings' solver.
         alignment: Deprecated: a part of the settings.
         options: Deprecated: a part of the settings.
 
     Raises:
-        GavoError: It is no sequence, has fewer than two frames, or its own check refuses it.
+        GavoError: The input is no sequence, has fewer than two frames, or its own check refuses it.
     """
     require_sequence(sequence, RUN)
     if len(sequence) < 2:
@@ -124,15 +125,15 @@ def run_odometry(
 
 
 class RunOutcome(NamedTuple):
-    """What a run comes to."""
+    """The outcome of a run."""
 
     trajectory: Trajectory
     steps: list[Step]
-    """As later frames have shown them to be."""
+    """The steps, revised by what later frames have shown."""
     figures: dict[str, Any]
-    """As metrics.json names them: `Metrics`, and with loops the errors before them and what the map holds."""
+    """Entries of metrics.json: `Metrics`, and with loops the errors before them and the figures of the map."""
     odometry: Trajectory | None = None
-    """With loops, the trajectory before they corrected it; else None."""
+    """The trajectory before its correction by loops; None without loops."""
     loops: Loops | None = None
 
 
@@ -145,16 +146,17 @@ def finish_run(
     compile_seconds: float,
     pairs: int | None = None,
 ) -> RunOutcome:
-    """Look back on a run whose last frame was tracked: hindsight, then loops, then figures.
+    """Finish a run whose last frame was tracked: hindsight, then loops, then figures.
 
     Args:
-        first_timestamp: Of the first frame, seconds.
-        steps: Of the run, as they came.
-        ground_truth: The truth, or None.
-        mapper: What kept the run's map: it is finished here.
-        seconds: Wall time of the tracking, decoding included, compilation left out.
+        first_timestamp: Timestamp of the first frame, seconds.
+        steps: The run's steps, as they were made.
+        ground_truth: The true trajectory, or None.
+        mapper: The run's map, which is finished here; None without loops.
+        seconds: Wall time of the tracking, decoding included, compilation excluded.
         compile_seconds: Time of the compilation.
-        pairs: How many were tracked in that time, where it was not all: the run was resumed. Of none no speed is known.
+        pairs: Number of pairs tracked in that time, if not all of them: the run was resumed. If 0, the speed is
+            unknown.
     """
     start = time.perf_counter()
     steps = revised(steps)
@@ -176,7 +178,7 @@ def finish_run(
 
 
 def doubts_of(steps: list[Step]) -> Doubts:
-    """Which poses of `trajectory_of` are guesses. A lost frame that others were aligned with is known by these."""
+    """Which poses of `trajectory_of` are guesses. A lost frame that others were aligned with is located by these."""
     kept = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     references = {step.reference_timestamp for step in kept if not step.lost}
     guessed = [step.origin == "guessed" for step in kept]
@@ -185,7 +187,7 @@ def doubts_of(steps: list[Step]) -> Doubts:
 
 
 def trajectory_of(first_timestamp: float, steps: list[Step]) -> Trajectory:
-    """Trajectory of a run: the first camera at the origin, then a pose a step; none where the stamp is in doubt."""
+    """The trajectory of a run: the first camera at the origin, then a pose per step with a trusted timestamp."""
     steps = [step for step in steps if step.alignment.status != AlignmentStatus.BAD_TIMESTAMP]
     stamps = np.array([first_timestamp] + [step.timestamp for step in steps])
     poses = np.stack([np.eye(4)] + [step.world_T_camera for step in steps])

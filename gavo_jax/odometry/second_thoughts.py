@@ -1,6 +1,6 @@
-"""Second thoughts about a frame: the wide search behind the first one, an image without its depth.
+"""Second thoughts about a frame: the wide search as a fallback, or the image without its depth.
 
-Each is an aligner around another one; `composition` puts them together as settings ask for it.
+Each is an aligner that wraps another one; `composition` combines them as the settings ask.
 """
 
 from dataclasses import dataclass, replace
@@ -19,36 +19,36 @@ from gavo_jax.status import AlignmentStatus, bit
 
 @dataclass(frozen=True)
 class SecondThought:
-    """An aligner around another one, which differs in what it makes of a frame.
+    """An aligner that wraps another one, and differs from it in how it aligns a frame.
 
     Attributes:
-        first: What is asked first.
+        first: The aligner that is tried first.
     """
 
     first: Aligner
 
     def warm_up(self) -> float:
-        """Warm up the first one; what else is asked serves every frame, or compiles when it is needed."""
+        """Warm up the first aligner; what else is used serves every frame, or compiles when it is needed."""
         return self.first.warm_up()
 
     def start(self, frame: Frame) -> Any:
-        """Start the first one."""
+        """Start the first aligner."""
         return self.first.start(frame)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Predict by the first one."""
+        """Predict with the first aligner."""
         return self.first.predict(state, elapsed)
 
 
 @dataclass(frozen=True)
 class Recovering(SecondThought):
-    """An aligner whose unusable results are tried again by another one, from the same state.
+    """An aligner that retries unusable results with another aligner, from the same state.
 
     Attributes:
-        first: What is asked first.
-        second: What is asked where that is unusable; it compiles when it is asked.
-        wide: What the second one searches with.
-        is_loaded: Whether `warm_up` loads the wide search's program where it was compiled before.
+        first: The aligner that is tried first.
+        second: The aligner that is tried if the first result is unusable; it compiles when it is needed.
+        wide: The search of the second aligner.
+        is_loaded: Whether `warm_up` loads the wide search's program if it was compiled before.
     """
 
     second: Aligner
@@ -56,20 +56,20 @@ class Recovering(SecondThought):
     is_loaded: bool = False
 
     def warm_up(self) -> float:
-        """Warm up the first one; the second compiles when it is needed."""
+        """Warm up the first aligner; the second one is only loaded here, or compiles when it is needed."""
         seconds = self.first.warm_up()
         return seconds + self.wide.warm_up() if self.is_loaded and self.wide and self.wide.is_kept() else seconds
 
     def warm_up_second(self) -> None:
-        """Compile what the second one needs."""
+        """Compile what the second aligner needs."""
         if self.wide is not None:
             self.wide.warm_up()
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
         """The first attempt if it is usable, else the second one if that is.
 
-        If neither is, the first one's motion can be used all the same where a high error is all that speaks against it
-        and the second ends at the same motion (blur, or something that moves). A reference should be better explained.
+        If neither is, the first motion is used all the same if a high error is the only finding of both and their
+        motions agree (blur, or something that moves). Such a frame does not become the reference.
         """
         attempt = self.first.align(state, frame, clock)
         if attempt.usable:
@@ -82,25 +82,26 @@ class Recovering(SecondThought):
 
 
 POLISHED = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR)
-"""What a finer search may say of a motion that another one has found."""
+"""Statuses that a finer search may give to a motion that another one has found."""
 SAME_BASIN = (0.05, 0.05)
-"""Metres and radians within which it ends in the same minimum."""
+"""Metres and radians within which a finer search ends in the same minimum."""
 
 
 @dataclass(frozen=True)
 class Polished(SecondThought):
-    """A search from whose motion another one begins, which sees it more exactly: it has the keyframe as well.
+    """A search whose motion is refined by another one, which also uses the keyframe.
 
     Attributes:
-        first: Finds the motion, and says whether the images match.
-        fine: Begins there.
+        first: Finds the motion, and tells whether the images match.
+        fine: Starts from that motion.
     """
 
     fine: Search
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The first one's attempt, with the finer motion if that ends in the same minimum; where the image disagrees
-        with that one, it says so.
+        """The first attempt, with the finer motion if that ends in the same minimum.
+
+        If too little of the image agrees with the finer motion, `HIGH_ERROR` is added to the findings.
         """
         attempt = self.first.align(state, frame, clock)
         if not attempt.usable:
@@ -119,18 +120,18 @@ class Polished(SecondThought):
 class DoubtingDepth(SecondThought):
     """An aligner that doubts a frame's depth before it doubts the motion.
 
-    Where depth does not agree with the image, the frame is aligned once more by its image alone; the motion can be used
-    then, but a frame of such depth is no reference.
+    Where depth disagrees with the image, the frame is aligned again by its image alone. The motion can then be used,
+    but a frame with such depth does not become the reference.
 
     Attributes:
-        first: What aligns.
-        alone: What aligns an image alone.
+        first: Aligns with depth.
+        alone: Aligns by the image alone.
     """
 
     alone: Aligner
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        """Align with depth, or without where it does not agree."""
+        """Align with depth, or without it where it disagrees."""
         attempt = self.first.align(state, frame, clock)
         if AlignmentStatus.DEPTH_MISMATCH not in attempt.result.statuses:
             return attempt
@@ -142,5 +143,5 @@ class DoubtingDepth(SecondThought):
 
 
 def without_depth(frame: Frame) -> Frame:
-    """A frame of which only the image counts."""
+    """A frame with all of its depth removed."""
     return replace(frame, depth=np.zeros_like(frame.depth))

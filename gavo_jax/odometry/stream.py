@@ -1,4 +1,4 @@
-"""A sequence through the driver, frame after frame; a thread decodes the next one meanwhile."""
+"""A sequence streamed through the driver, frame by frame; a thread decodes the next frame meanwhile."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +12,7 @@ from gavo_jax.solvers.base import Solver
 
 
 def unwatched(frame: Frame | None, step: Step | None) -> None:
-    """Nobody looks."""
+    """Ignore a frame and its step."""
 
 
 def track(
@@ -23,20 +23,20 @@ def track(
     odometry: Odometry | None = None,
     watch: Callable[[Frame | None, Step | None], None] = unwatched,
 ) -> Iterator[Step]:
-    """Stream a sequence: a step for every frame after the first, as it is done.
+    """Stream a sequence: yield a step for every frame after the first, as it is done.
 
     The next frame is decoded in a thread while one is aligned; memory does not grow with the sequence. A frame that
-    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost one.
+    cannot be read makes a lost step. With `on_lost="stop"` the stream ends after the first lost step.
 
     Args:
         sequence: The frames.
-        settings: As of `Odometry`.
-        seed: As of `Odometry`.
+        settings: See `Odometry`.
+        seed: See `Odometry`.
         odometry: A driver to use instead of a new one; if it has seen frames already it goes on with the next one.
-        watch: Is shown every `Odometry.frame` with its step (None: it is the first).
+        watch: Called with every `Odometry.frame` and its step, which is None for the first frame.
 
     Raises:
-        GavoError: It is no sequence or gives what is no frame, or the driver is none.
+        GavoError: The input is no sequence or yields something that is no frame, or `odometry` is no driver.
         FrameError: The first frame cannot be read.
     """
     require_sequence(sequence)
@@ -56,7 +56,7 @@ def track(
 
 
 def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
-    """Frame after frame, at the sequence's stamps, or why there is none; a thread decodes the next one meanwhile."""
+    """Yield frames at the sequence's timestamps, or errors in their place; a thread decodes the next one meanwhile."""
 
     def read(index: int) -> Frame | FrameError:
         try:

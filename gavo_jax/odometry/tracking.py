@@ -1,4 +1,4 @@
-"""The program for a frame: its pyramid, its motion from the last frame and the keyframe at once, the next reference.
+"""The program for a frame: its pyramid, its motion from the last frame and the keyframe at once, the next references.
 
 One compiled program does all of it, and what it needs of earlier frames stays on the device.
 """
@@ -33,39 +33,39 @@ from gavo_jax.solvers.base import Solver
 
 
 class TrackerState(NamedTuple):
-    """What stays on the device from frame to frame."""
+    """State that stays on the device from frame to frame."""
 
     previous: Reference
     keyframe: Reference
     """Points of earlier frames in the previous frame's camera; see `renew_keyframe`."""
     previous_image: Target
-    """The previous frame, packed for sampling: what the symmetric error needs of it."""
+    """The previous frame, packed for sampling, as the symmetric error needs it."""
     motion: Float[Array, " 6"]
     """Twist of the last motion, from the frame before the previous one to the previous one."""
     guess: Float[Array, " 6"]
-    """Twist expected of the next motion, if it took as long: the last one again, unless somebody knows better."""
+    """Twist expected of the next motion if it takes as long: the last one, unless something better is known."""
     instant_motion: Float[Array, " 6"]
-    """The same twist, had the camera moved all the time as it did at the previous frame's own moment."""
+    """Twist that the last motion would be, had the camera always moved as it did at the previous frame's own moment."""
     velocity_change: VelocityChange
     """How the velocity changes from frame to frame."""
     seconds: Float[Array, ""]
-    """Time that the last motion took, seconds; `UNKNOWN_SECONDS` where it is not known."""
+    """Duration of the last motion, seconds; `UNKNOWN_SECONDS` where it is unknown."""
     part: Part
-    """Of the image, whose points take part in the next search."""
+    """The part of the image whose points take part in the next search."""
     exposure: Exposure
-    """Exposure of the previous frame; the keyframe's points are as if taken with it."""
+    """Exposure of the previous frame; the keyframe's points are adjusted to it."""
     usual: Usual
 
 
 class Clock(NamedTuple):
-    """When a new frame was taken, as numbers of the program."""
+    """Times of a new frame, as inputs of the program."""
 
     elapsed: Any
     """Time since the reference's colour image, seconds."""
     depth_delay: Any
     """Time from the new colour image to the new depth image, seconds."""
     index: Any
-    """Index in the sequence; with the run's key it makes the frame's random numbers."""
+    """Index in the sequence; with the run's key it determines the frame's random numbers."""
 
 
 @partial(jax.jit, static_argnames="finest")
@@ -83,26 +83,26 @@ def _synchronised(pyramid: Pyramid, camera: Camera, twist: Float[Array, " 6"], f
 KEYFRAME_SHARES = 16
 """Number of shares that a keyframe's points are dealt into, each renewed on its own."""
 LEFT = 0.5
-"""Points of a share, over those that a new one would have, below which those that bodies took count as out of view."""
+"""Ratio of a share's points to those of a new share below which points lost to bodies count as out of view."""
 KEYFRAME_SPREAD = 0.2
-"""Width of the range over which the overlaps at which they are renewed are evenly spread."""
+"""Width of the range over which the shares' thresholds for renewal are evenly spread."""
 
 
 def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overlap: Any) -> Reference:
-    """A keyframe with the points that are going out of view replaced by the newest frame's.
+    """Replace those points of a keyframe that are going out of view by the newest frame's.
 
-    A keyframe that is given up whole makes all that follows hang on which frame happens to be the first below a
-    threshold. Here the points are dealt into shares, each with its own threshold, so that the shares are soon of
-    different frames.
+    If a keyframe were replaced as a whole, all that follows would depend on which frame is the first below a threshold.
+    Instead the points are dealt into shares, each with its own threshold, so that the shares soon come from different
+    frames.
 
     Args:
         keyframe: Points of earlier frames in the newest frame's camera, [L, N].
-        newest: The newest frame's points, alike.
-        camera: Of the last, finest level.
-        overlap: Part of a share that is in view when it is given up, on average over the shares.
+        newest: The newest frame's points, likewise.
+        camera: Camera of the last, finest level.
+        overlap: Part of a share that is in view when it is replaced, on average over the shares.
     """
     places = np.arange(keyframe.grey.shape[-1])
-    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each all over the image
+    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each covers the image
     dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
     finest, newest_points = (jax.tree.map(lambda leaf: leaf[-1], view.points) for view in (keyframe, newest))
     inside = warp(finest, jnp.eye(4), camera).inside
@@ -114,38 +114,39 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
 
 
 class Moved(NamedTuple):
-    """The motion that the next frame's search goes by: none at a first frame."""
+    """The motion of a frame, from which the next search starts; none for a first frame."""
 
     is_first: Bool[Array, ""]
     target_T_reference: Float[Array, "4 4"]
     motion: Float[Array, " 6"]
-    """Its twist, ξ."""
+    """Twist ξ of the motion."""
     sway: Float[Array, " 6"]
     instant_motion: Float[Array, " 6"]
-    """Twist that ξ would be, had the camera moved as it did at the frame's own moment."""
+    """Twist that ξ would be, had the camera always moved as it did at the frame's own moment."""
 
     @classmethod
     def by(cls, result: Alignment, is_first: Bool[Array, ""]) -> "Moved":
-        """Take the motion that a result says."""
+        """Take the motion from a result."""
         motion, sway = jnp.where(is_first, 0.0, result.xi), jnp.where(is_first, 0.0, result.sway)
         return cls(is_first, jnp.where(is_first, jnp.eye(4), result.target_T_reference), motion, sway, motion + sway)
 
 
 def as_exposed(camera: Camera, options: OdometryOptions) -> Camera:
-    """The camera that is reckoned with: its rows are exposed at once where options leave the rolling shutter out."""
+    """The camera to compute with: its shutter is global where the options leave the rolling shutter out."""
     return camera if options.rolling_shutter else replace(camera, readout=0.0)
 
 
 def readout_share(camera: Camera, elapsed: Any) -> Any:
-    """A readout over the time between two frames; 0 where it is longer than that, as stamps may be off."""
+    """Readout over the time between two frames; 0 where it is much longer than that, as timestamps may be off."""
     return camera.readout / elapsed * (camera.readout <= 1.5 * elapsed)
 
 
 def _undo_rolling_shutter(
     newest: Reference, keyframe: Reference, moved: Moved, readout: Float[Array, ""]
 ) -> tuple[Reference, Reference]:
-    """Points of both references where they were at their image's moment, by the motion that is known now; those of a
-    first frame are still where their rows' moments left them.
+    """Undo the rolling shutter of both references by the motion that has been found.
+
+    It is not undone for a first frame, whose motion is unknown.
     """
     as_exposed = newest.row_time
     newest = undo_rolling_shutter(newest, moved.instant_motion * readout)
@@ -154,9 +155,9 @@ def _undo_rolling_shutter(
 
 
 def _velocity_change_after(state: TrackerState, moved: Moved, elapsed: Float[Array, ""]) -> VelocityChange:
-    """The velocity's changes with one more pair, so many seconds apart."""
+    """Statistics of the velocity's changes after one more pair, which is `elapsed` seconds apart."""
     change = moved.motion / elapsed - state.motion / state.seconds
-    was_second = ~jnp.any(state.motion != 0.0)  # nothing is known of the motion before
+    was_second = ~jnp.any(state.motion != 0.0)  # the motion before is unknown
     velocity_change = state.velocity_change.after(moved.sway / elapsed, change)
     return velocity_change._replace(
         changes=jnp.where(was_second, state.velocity_change.changes, velocity_change.changes)
@@ -164,7 +165,7 @@ def _velocity_change_after(state: TrackerState, moved: Moved, elapsed: Float[Arr
 
 
 def _usual_after(usual: Usual, result: Alignment, exposure: Exposure, is_first: Bool[Array, ""]) -> Usual:
-    """What is usual with one more result; a first frame has none."""
+    """The usual figures after one more result; a first frame adds none."""
     after = usual.after(result, exposure.spread)
     return jax.tree.map(lambda new, old: jnp.where(is_first, old, new), after, usual)
 
@@ -183,11 +184,10 @@ def track_frame(
     *,
     record: bool,
 ) -> tuple[TrackerState, Alignment, Population | None]:
-    """One frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's.
+    """Process one frame: pyramid, alignment with the references, and the state for the next frame; `key` is the run's.
 
-    Before the first frame the state holds no reading: that frame becomes both references, and nothing is known of the
-    motion, so that its points are still where their rows' moments left them. The same program serves, as another one
-    would have to be compiled too.
+    Before the first frame the state holds no readings. That frame becomes both references, and its rolling shutter is
+    not undone, as its motion is unknown. The same program serves it, as another one would have to be compiled too.
     """
     raw = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     exposure = Exposure.of(raw)
@@ -248,7 +248,7 @@ def track_frame(
 
 @jax.jit
 def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
-    """State after the first frame, by a program of its own."""
+    """State after the first frame, by a separate program."""
     pyramid = build_pyramid(grey, depth, camera.depth_scale, LEVELS)
     levels = levels_of(camera, solver, alignment)
     reference, packed = make_references(pyramid, camera, levels), prepare_target(pyramid, levels)
@@ -268,7 +268,7 @@ def first_state(grey: Array, depth: Array, camera: Camera, solver: Solver, align
 
 
 def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> TrackerState:
-    """The state before the first frame: nothing, in the shapes and types of every state."""
+    """The state before the first frame: blank, in the shapes and types of every state."""
     levels = levels_of(camera, solver, alignment)
     row: Any = np.zeros((len(levels.numbers), levels.most_points), np.float32)
     words: Any = np.zeros((levels.layout.height, levels.layout.width), np.uint32)

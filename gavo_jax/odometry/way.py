@@ -1,7 +1,7 @@
-"""The camera's way since the reference, where frames that were found did not become it: their depth was missing, say.
+"""The camera's way since the reference, over frames that did not become the reference, for lack of depth say.
 
-The motion to be expected grows with every frame that the reference is held. That it goes on as before the reference is
-soon far off; where it was last seen tells more.
+The expected motion grows with every frame for which the reference is held. Continuing the motion from before the
+reference is soon far off; where the camera was last found tells more.
 """
 
 from typing import NamedTuple, Self
@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float64
 
 REMEMBERED = 2
-"""Frames, of which the last velocity is made."""
+"""Number of frames that the last velocity is computed from."""
 
 
 class Fix(NamedTuple):
-    """Where the camera was found."""
+    """Where the camera was found at one time."""
 
     seconds: float
     """Seconds since the reference."""
@@ -23,19 +23,20 @@ class Fix(NamedTuple):
 
 
 class Way(NamedTuple):
-    """Where the camera was found since the reference, the last frames."""
+    """Where the camera was last found since the reference."""
 
     fixes: tuple[Fix, ...] = ()
 
     def after(self, seconds: float, xi: Float64[np.ndarray, " 6"]) -> Self:
-        """Add one more frame; of one before the reference, after which a clock was set back, nothing is foretold."""
+        """Add one more frame; one from before the reference, after a clock was set back, clears the way."""
         if not seconds > 0:
             return self._replace(fixes=())
         return self._replace(fixes=(*self.fixes, Fix(seconds, tuple(map(float, xi))))[-REMEMBERED:])
 
     def at(self, seconds: float) -> Float64[np.ndarray, " 6"] | None:
-        """The twist to be expected so many seconds after the reference, at the last velocity; None at the first frame,
-        or at a time before the last one.
+        """The twist to be expected `seconds` after the reference, at the last velocity.
+
+        This is None if no frame was found yet, or at a time that is not after the last one.
         """
         if not self.fixes or seconds <= self.fixes[-1].seconds:
             return None
