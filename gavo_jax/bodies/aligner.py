@@ -1,6 +1,6 @@
 """The camera's motion among moving bodies: several motions are kept, the image is shared out among them, one is chosen.
 
-`BodyAware` wraps a search. Where the search's motion explains the image, and nothing was known to move, it stands.
+`BodyAware` wraps a search. Where the search's motion explains the image, and nothing was known to move, it is kept.
 """
 
 from dataclasses import dataclass
@@ -36,8 +36,7 @@ MAJORITY = 0.5
 ROUNDS = 3
 """Maximum number of repeated searches, each without what moves according to the one before."""
 RELUCTANT = 2.0
-"""Ratio of a motion's dissent to that from the motion which the area asks for, above which another one is searched for.
-"""
+"""Ratio of a motion's dissent to the least dissent from any motion, above which another one is searched for."""
 BETTER = 1.2
 """Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
@@ -74,8 +73,8 @@ FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_M
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """Findings that a body may cause by occluding points."""
 MOST = 0.9
-"""Share of the image not covered or hidden by bodies whose depth has to agree with a motion for `DEPTH_MISMATCH` to be
-excused.
+"""Part of the image that neither moves nor is hidden whose depth has to agree with a motion for `DEPTH_MISMATCH` to
+be excused.
 """
 
 

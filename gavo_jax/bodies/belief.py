@@ -161,9 +161,7 @@ def _after(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, 
 
 
 def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Carry suspicions along with their surfaces, which may have moved, and spread them to newly visible parts of
-    these.
-    """
+    """Carry suspicions along with their surfaces, moved ones included, and spread them to newly visible parts."""
     same = _seen_before(e, 2.0 * FAR) & (e.measured[0] > 0)
     across, down = (tie > TIED for tie in _links(grey, e.inverse_depth))
 
@@ -191,8 +189,7 @@ DEPTH_EDGE = 0.015
 GREY_EDGE = 25.0
 """Step of grey, grey levels, across which neighbours are hardly tied where depth is missing."""
 ALIKE, HALF_KNOWN = 0.3, 0.03
-"""Ties of neighbours that both lack depth, and of neighbours of which one has depth: a body ends where its depth does.
-"""
+"""Ties of neighbours that both lack depth, and of neighbours of which one has it: a body ends where its depth does."""
 
 
 def share_out(

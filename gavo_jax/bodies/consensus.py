@@ -26,8 +26,7 @@ CELL = 4
 LEAST_GREY, LEAST_DEPTH = 1.0, 8e-4
 """Smallest standard deviations of a pixel's residuals: grey levels, 1/m."""
 BOUND = 6.0
-"""Standard deviations at which a residual's weight falls to a quarter, which limits the effect of occlusions and edges.
-"""
+"""Standard deviations at which a residual's weight falls to a quarter, to limit the effect of occlusions and edges."""
 FARTHER = 2.0
 """Largest depth, over the median depth, up to which a pixel's weight grows: it is the area of its surface, depth
 squared.
@@ -110,8 +109,7 @@ def ask_area(
 
 
 def gain_of_its_own(blocks: Blocks, delta: Float[Array, " 6"]) -> Float[Array, " b"]:
-    """Return by how much each block's squared residuals, in variances, would fall under a motion of its own instead of
-    δ.
+    """Return how far each block's squared residuals, in variances, would fall under a motion of its own instead of δ.
 
     This is pᵀH⁻¹p, where p = Hδ + g.
     """

@@ -122,7 +122,7 @@ class Duel:
         contradiction: Squared Mahalanobis distance of the two, including the covariance of the first one's last frame.
         deviation: Standard deviation of the rival's translation in its last frame, metres.
         age: Time since the anchor.
-        stands_before: Whether the surfaces that the rival leaves out stand before the rest of the image.
+        stands_before: Whether the surfaces that the rival leaves out are in front of the rest of the image.
         margin: Margin of the rival in the votes of the anchor's pixels; None without a vote.
         ahead: Consecutive frames, up to this one, with margins large enough.
     """
@@ -192,7 +192,7 @@ class Duel:
     def _contradicts(self) -> bool:
         """Whether the far part contradicts the first motion.
 
-        Without a vote it is enough that the surfaces which the rival leaves out stand before the rest.
+        Without a vote it is enough that the surfaces which the rival leaves out are in front of the rest.
         """
         says_so = self.stands_before if self.margin is None else self.far > 0.0
         return not self.is_vague and self.contradiction > CONTRADICTED and says_so and self.motions.have_parted()

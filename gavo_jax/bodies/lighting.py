@@ -17,8 +17,8 @@ explain texture. The gain is linear between the centres of cells.
 STRIP = 3.0
 """Height in pixels of the strips of rows that have a gain of their own where a lamp flickers."""
 FLICKER = 0.8
-"""Share of the residuals' power below which the strips' gains have to bring it for a lamp to count as flickering. Clips
-without such a lamp keep at least 0.91.
+"""Largest share of the residuals' power that the strips' gains leave where a lamp flickers. Clips without such a lamp
+keep at least 0.91.
 """
 UNCHANGED = 900.0
 """Mean squared grey of a cell, squared grey levels, at which its gain is half-way between 1 and the regression's."""

@@ -91,9 +91,7 @@ def _align(
 
 
 def _with_rolling_shutter(whole: Reference, tracker: TrackerState, segmenter: MotionSegmenter) -> Reference:
-    """Move a frame's points back to where their rows saw them: the shutter was undone for the camera's motion, not a
-    body's.
-    """
+    """Move a frame's points back to where their rows saw them: only the camera's motion undid the shutter."""
     twist = tracker.instant_motion * readout_share(segmenter.full, tracker.seconds)
     return apply_rolling_shutter(whole, twist, segmenter.planes)
 

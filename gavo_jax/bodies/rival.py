@@ -1,10 +1,10 @@
 """A second motion kept beside the first until it is clear which one is the camera's.
 
 Where a body covers much of the image from the start, a search may find the body's motion. It may also find a compromise
-that seems to explain both, as a rotation looks like a translation. One pair of frames can't tell. So surfaces that
-stand before others are set aside, the rest is tracked on its own, and the two motions are compared frame after frame.
-The far part's motion is the camera's if it is well determined and contradicts the other one: a body occludes the scene,
-not the other way round.
+that seems to explain both, as a rotation looks like a translation. One pair of frames can't tell. So surfaces in front
+of others are set aside, the rest is tracked on its own, and the two motions are compared frame after frame. The far
+part's motion is the camera's if it is well determined and contradicts the other one: a body occludes the scene, not the
+other way round.
 """
 
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class Rival(NamedTuple):
     near: Bool[np.ndarray, "h w"]
     """Pixels of the anchor on surfaces that are taken for bodies."""
     stands_before: Any
-    """Whether these surfaces stand before the rest: only then does agreement of both searches mean anything."""
+    """Whether these surfaces are in front of the rest: only then does agreement of both searches mean anything."""
     motions: Motions
     """Motions since the anchor, by the first search and by the rival's."""
     age: Span
@@ -138,7 +138,7 @@ class WithRival:
         """The rival, and how long the first motion has been in question.
 
         A new rival is made where there is none and the first motion is in doubt. It is also made where a surface comes
-        to stand before the rest while the question is open.
+        to be in front of the rest while the question is open.
         """
         rival, open_for, is_doubted = state.rival, state.open_for, bool(attempt.state.is_doubted)
         if rival.is_there or not attempt.usable or not (is_doubted or open_for.lasts):
@@ -208,7 +208,7 @@ class WithRival:
     def _rival_of(self, state: AwareState, standing_before: bool = False) -> Rival:
         """A new rival from the last frame on: the motion of all that lies behind the nearer surfaces.
 
-        There is none if nothing is nearer than the rest, or if `standing_before` and no surface stands before others.
+        There is none if nothing is nearer than the rest, or if `standing_before` and no surface is in front of others.
         """
         segmenter, anchor = self.first.segmenter, _view(state)
         near, stands_before = nearer_part(inverse_depth_of(anchor))

@@ -27,8 +27,8 @@ from gavo_jax.settings import Settings
 OLD = 0.22
 """Age in seconds at which the middle view replaces the older one."""
 FAR_OFF = 0.7
-"""Share of the static scene inside the older view below which it is replaced at once. Over a long way, pose errors and
-other light look like bodies.
+"""The older view is replaced at once if it sees less than this share of the static scene. Over a long way, pose errors
+and other light look like bodies.
 """
 
 

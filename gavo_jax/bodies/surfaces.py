@@ -1,7 +1,7 @@
-"""Surfaces that stand before others: what may be a body, according to one depth image.
+"""Surfaces in front of others: what may be a body, according to one depth image.
 
-A body occludes the scene, not the other way round. So surfaces that stand before their neighbours may move, whatever
-the motion.
+A body occludes the scene, not the other way round. So surfaces in front of their neighbours may move, whatever the
+motion.
 """
 
 from typing import NamedTuple
@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 FLAT, FLAT_NOISE = 0.02, 0.004
-"""Step of inverse depth, relative to the larger one plus 1/m, below which two neighbours lie on one surface."""
+"""Relative and absolute (1/m) part of the step in inverse depth below which two neighbours lie on one surface."""
 STEP, STEP_NOISE = 0.04, 0.01
-"""Step of inverse depth, relative to the larger one plus 1/m, above which one neighbour stands before the other."""
+"""Relative and absolute (1/m) part of the step in inverse depth above which one neighbour is in front of the other."""
 WIDEST_SHADOW = 6
 """Distance in pixels, across missing depth, up to which two surfaces are still neighbours."""
 BEFORE = 0.75
-"""Share of its border along which a surface has to stand before its neighbours to count as a candidate."""
+"""Share of its border along which a surface has to be in front of its neighbours to count as a candidate."""
 LEAST_BORDER = 8
-"""Fewest pixels of border along which a candidate stands before its neighbours."""
+"""Fewest pixels of border along which a candidate is in front of its neighbours."""
 LEAST_AREA = 0.015
 """Smallest share of the image that a candidate covers."""
 MOST_TOGETHER = 0.5
@@ -38,11 +38,11 @@ class NearerPart(NamedTuple):
 
     mask: Bool[np.ndarray, "h w"]
     stands_before: bool
-    """Whether these surfaces stand before others, and are not just the nearer part of the image."""
+    """Whether these surfaces are in front of others, and are not just the nearer part of the image."""
 
 
 def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
-    """Surfaces that stand before others, or else the nearer part of the image.
+    """Surfaces that are in front of others, or else the nearer part of the image.
 
     Args:
         inverse_depth: Inverse depth, 1/m; 0 where there is no reading.
@@ -55,14 +55,14 @@ def nearer_part(inverse_depth: Float[np.ndarray, "h w"]) -> NearerPart:
 
 
 def standing_before(inverse_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of surfaces that stand before their neighbours along most of their border."""
+    """Pixels of surfaces that are in front of their neighbours along most of their border."""
     return _standing_surfaces(inverse_depth) > 0
 
 
 def whole_surfaces(
     bodies: Integer[np.ndarray, "h w"], lately: Bool[np.ndarray, "h w"], inverse_depth: Float[np.ndarray, "h w"]
 ) -> Integer[np.ndarray, "h w"]:
-    """Extend each body to the whole of a surface that stands before others and of which a large part is the body's.
+    """Extend each body to the whole of a surface that is in front of others and of which a large part is the body's.
 
     A body that turns is nearly at rest about its axis. Where no body was recently seen on the rest of the surface, the
     two only seem to be one surface.
@@ -85,7 +85,7 @@ def whole_surfaces(
 
 
 def _standing_surfaces(inverse_depth: Float[np.ndarray, "h w"]) -> Integer[np.ndarray, "h w"]:
-    """Label each pixel of a surface that stands before its neighbours along most of its border; 0 elsewhere."""
+    """Label each pixel of a surface that is in front of its neighbours along most of its border; 0 elsewhere."""
     labels, count = _surfaces(inverse_depth)
     before, behind = np.zeros(count), np.zeros(count)
     for q, surface in ((inverse_depth, labels), (inverse_depth.T, labels.T)):

@@ -16,7 +16,7 @@ MOST = 4
 LOOKED_AT = 48
 """Maximum number of earlier keyframes compared with a new one, those that see most of the same; it bounds the work."""
 FEW_POINTS = 60
-"""Points of the new keyframe that are used to choose these."""
+"""About how many of the new keyframe's points are used to choose the earlier ones."""
 MIN_SECONDS = 0.2
 """Shortest time between the two keyframes, seconds: within it, the odometry's own keyframe saw both, and nothing is
 learnt.
@@ -24,7 +24,7 @@ learnt.
 MIN_OVERLAP = 0.5
 """Smallest predicted share of the points of either keyframe that the other one sees."""
 NEARLY = 0.8
-"""Part of `MIN_OVERLAP`, by few points, from which on a keyframe is examined more closely."""
+"""Part of `MIN_OVERLAP`, by `FEW_POINTS`, from which on a keyframe is examined more closely."""
 MIN_LIKENESS = 0.88
 """Smallest correlation of the grey of what both keyframes see."""
 APART = 2
@@ -39,7 +39,7 @@ class LoopCandidate(NamedTuple):
     earlier: Keyframe
     later: Keyframe
     later_T_earlier: Float64[np.ndarray, "4 4"]
-    """The motion between the two, as known at this time; it is the guess."""
+    """Current estimate of the motion between the two: the guess."""
     overlap: float
     """Predicted share of the points of either keyframe that the other one sees; the smaller one of the two."""
     likeness: float

@@ -71,7 +71,7 @@ def _placed(keyframes: list[Keyframe], odometry: Trajectory) -> list[tuple[Keyfr
     placed, start = [], 0
     for keyframe in keyframes:
         places = [i for i in places_of.get(stamp_name(keyframe.timestamp), ()) if i >= start]
-        if places:  # a stamp may come again in another segment
+        if places:  # a timestamp may recur in another segment
             place = next((i for i in places if odometry.segments[i] == keyframe.segment), places[0])
             placed.append((keyframe, place))
             start = place + 1

@@ -110,15 +110,15 @@ class Keyframe:
     Attributes:
         number: Its place among the keyframes.
         index: Index of the frame in the sequence.
-        timestamp: Colour stamp, seconds.
+        timestamp: Colour timestamp, seconds.
         segment: Segment of the odometry's trajectory that it belongs to.
         world_T_odometry: Its pose by the odometry alone.
-        world_T_camera: Its pose as it is known now.
+        world_T_camera: Its pose as the map has corrected it.
         step: Covariance of the odometry's motion from the keyframe before, of δ in a_T_b · exp(δ); None where that is
             unknown.
-        images: Grey and depth at half the size; None once they were given up.
-        thumbnail: What it looks like from afar; `NOTHING_SEEN` once the images were given up.
-        features: Its keypoints, once they were needed.
+        images: Grey and depth at half the size; None once they were dropped.
+        thumbnail: What it looks like from afar; `NOTHING_SEEN` once the images were dropped.
+        features: Its keypoints; None until they are needed.
     """
 
     number: int
@@ -211,9 +211,7 @@ class Keyframes:
         )
 
     def add(self, keyframe: Keyframe) -> None:
-        """Add a keyframe, corrected like the last one of its segment; if there are too many images, drop those of
-        another.
-        """
+        """Add a keyframe, corrected like the last one of its segment; drop another's images if there are too many."""
         before = next((other for other in reversed(self.all) if other.segment == keyframe.segment), None)
         if before is not None:
             correction = before.world_T_camera @ inverse(before.world_T_odometry)

@@ -212,7 +212,7 @@ class Mapper:
         return keyframe
 
     def _doubt(self, steps: Iterable[Step]) -> None:
-        """Mark the ways between keyframes as doubtful that contain motions which are in doubt in hindsight."""
+        """Mark the ways between keyframes as doubtful if they contain motions that are in doubt in hindsight."""
         tracked = {stamp_name(step.timestamp): step for step in steps if not step.lost}
         stamps = {stamp_name(keyframe.timestamp) for keyframe in self.keyframes.all}
         for keyframe in self.keyframes.all:
@@ -234,9 +234,7 @@ class Mapper:
                 self._known.popitem(last=False)
 
     def _look_back(self, step: Step) -> None:
-        """Keep the covariance of the motion from a new keyframe to its reference, as later frames may continue from
-        there.
-        """
+        """Keep the covariance from a new keyframe to its reference, from which later frames may continue."""
         covariance = _covariance(step)
         if np.isfinite(covariance).all():
             self._known[stamp_name(step.reference_timestamp)] = _Way(covariance, is_in_doubt(step))

@@ -95,8 +95,8 @@ def optimise(
     for number, pose in enumerate(poses):
         start.insert(number, _pose(gtsam, pose))
     trusted = len(odometry) + 1
-    # the search for false loops may lose its way among many wild ones, and odometry may drift further than it says:
-    # of both ways to begin the one that more loops agree with
+    # the search for false loops may fail among many wild ones, and odometry may drift further than it says:
+    # so try both starts, and take the one that more loops agree with
     plausible = _plausible(poses, odometry, loops)
     beginnings = [plausible] if plausible.all() else [plausible, np.ones(len(loops), bool)]
     found = []
@@ -185,7 +185,7 @@ def _without_false_loops(gtsam: Any, graph: Any, start: Any, trusted: int) -> tu
 
 
 def _surprise(graph: Any, values: Any, trusted: int) -> float:
-    """Variance factor of the odometry: its squared residuals over their redundancy (Förstner 1979).
+    """Variance factor of the odometry: its squared, whitened residuals over their redundancy (Förstner 1979).
 
     It is near 1 where the loops tell little of it.
     """
@@ -195,14 +195,14 @@ def _surprise(graph: Any, values: Any, trusted: int) -> float:
     rows, columns, numbers = graph.linearize(values).sparseJacobian_()
     matrix = csc_array((numbers, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=(6 * graph.size(), size + 1))
     jacobian, residual = matrix[:, :size], matrix[:, [size]].toarray()
-    # the leverages of all rows sum up to the number of unknowns: those of the few other rows tell the odometry's
+    # all leverages sum to the number of unknowns: those of the few other rows give the odometry's
     own, others = np.arange(6, 6 * trusted), np.r_[0:6, 6 * trusted : 6 * graph.size()]
     redundancy = len(own) - (size - _leverage(jacobian, others))
     return float(((residual[own] ** 2).sum() + BELIEF) / (redundancy + BELIEF))
 
 
 def _leverage(jacobian: Any, rows: Int[np.ndarray, " n"]) -> float:
-    """Sum of the leverages of some rows of a sparse Jacobian J, on the diagonal of J (JᵀJ)⁻¹ Jᵀ.
+    """Sum of some rows' leverages, the diagonal of J (JᵀJ)⁻¹ Jᵀ, for a sparse Jacobian J.
 
     For many rows it is estimated from their sums with random signs (Hutchinson 1989), to within a per cent: this bounds
     the work.
@@ -236,6 +236,6 @@ def _pose(gtsam: Any, transform: np.ndarray) -> Any:
 @cache
 def _chi_squared_below(probability: float) -> float:
     """Value that chi-squared with six degrees of freedom stays below with a given probability."""
-    from scipy.special import chdtri  # a sixth of the time in which the command starts, and most runs close no loops
+    from scipy.special import chdtri  # a sixth of the command's start, and most runs close no loops
 
     return float(chdtri(6, 1.0 - probability))

@@ -20,7 +20,7 @@ from gavo_jax.mapping.verification import Edge, Verifier
 LOOKED_AT = 8
 """Number of keyframes whose features are matched: those that look most like the frame."""
 ALIGNED = 4
-"""Number of these keyframes that are aligned: those with most matches."""
+"""Number of matched keyframes that are aligned: those with most matches."""
 MARGIN = 0.2
 """Share of a small image's width and height by which two images may be shifted and still look alike."""
 MIN_MATCHES = 15

@@ -1,5 +1,4 @@
-"""Verification of loops: whether two keyframes show the same place, and their relative pose, by aligning them both
-ways.
+"""Whether two keyframes show the same place, and their relative pose, by aligning them there and back.
 
 Before a repetitive wall both ways may agree on a motion that is off by a period; such a pair gives no edge.
 """

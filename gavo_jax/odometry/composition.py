@@ -66,7 +66,7 @@ def warm_up_wholly(aligner: Any) -> float:
 
 
 def blank_of(aligner: Any) -> Any:
-    """The state of an aligner, however it is wrapped, before the first frame; its shapes and types are final."""
+    """The blank state of an aligner, however it is wrapped, in the shapes and types of every state."""
     return next(layer for layer in _layers(aligner) if hasattr(layer, "blank_state")).blank_state()
 
 

@@ -112,7 +112,9 @@ class Relocaliser(Protocol):
 MAX_HELD = 3
 """Frames without a new reference after which the newest usable one becomes it, as the old one is out of reach."""
 MAX_DOUBTED = 15
-"""Frames after which one becomes the reference that only its depth kept from it: the reference's depth may be wrong."""
+"""Frames without a new reference, for doubts about depth alone, after which a frame becomes it all the same: the
+reference's own depth may be wrong.
+"""
 POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
 """Statuses of frames that have a motion, but become the reference only when the old one is out of reach."""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
@@ -120,9 +122,7 @@ DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
 DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
 """Statuses of frames that have a motion, but no trustworthy depth of their own."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
-"""Number of first frames of a segment adrift that are all looked for in the map, and interval of those looked for
-later.
-"""
+"""Frames at the start of a segment adrift that are all looked for in the map, and the interval of later ones."""
 
 Moving = Callable[[Step], Bool[np.ndarray, "height width"] | None]
 """Function that gives the pixels that move in a step's frame: `Step.moving`, or the masks of the run's folder."""
@@ -142,7 +142,7 @@ class FrameOutcome(NamedTuple):
     candidates: tuple[Population, ...] = ()
     bodies: tuple[Body, ...] = ()
     revises: int = 0
-    """See `Step`."""
+    """See `Step.revises`."""
 
 
 class Odometry:
@@ -335,9 +335,7 @@ class Odometry:
         return self.relocaliser.find(frame, after.segment)
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
-        """Make a frame the only reference, at the camera's recorded pose; this starts a new segment unless it is the
-        first.
-        """
+        """Make a frame the only reference, at the recorded pose; unless it is the first, this starts a new segment."""
         here = before if before.last_index == 0 else before.in_new_segment()
         return here._replace(
             tracker=self.aligner.start(frame),
@@ -353,8 +351,7 @@ class Odometry:
     def _advance(
         self, before: Progress, frame: Frame, finding: Finding, attempt: Attempt
     ) -> tuple[Progress, Alignment, bool]:
-        """Apply an attempt: where its motion is usable and the frame is fit for it, the frame becomes the new
-        reference.
+        """Apply an attempt: if its motion is usable and the frame is fit, the frame becomes the new reference.
 
         Returns:
             Where the driver stands after it, the result, and whether the pair is lost.
@@ -386,7 +383,7 @@ class Odometry:
                 held=0,
                 way=Way(),
             )
-        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # that pose is a rough one
+        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # else the pose is rough
             since = frame.timestamp - before.reference_timestamp
             after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False

@@ -29,7 +29,7 @@ MAX_SPEED = (5.0, 12.0)
 STAMP_JITTER = 0.02
 """Error in seconds of the time between two timestamps; a moving camera then seems faster or slower, on its path."""
 UNKNOWN_SECONDS = 1.0
-"""Seconds assumed for a motion that is unknown: after that long any motion is possible."""
+"""Seconds assumed for an unknown motion: after that long any motion is possible."""
 TOLERANCE = (0.015, 0.01)
 """Errors of an estimate by itself, metres and radians."""
 MAX_ERROR_RATIO = 6.0
@@ -144,8 +144,7 @@ def image_shift(translation: Any, rotation: Any) -> Any:
 
 
 def _change(twist: Float[Array, " 6"], predicted: Float[Array, " 6"], share: Float[Array, ""]) -> Float[Array, " 2"]:
-    """How far translation and rotation are from the prediction, which may last longer or shorter by a share of its
-    time.
+    """How far translation and rotation are from the prediction, whose duration may be off by a share of it.
 
     The prediction is never reversed.
     """

@@ -56,9 +56,7 @@ class Progress(NamedTuple):
     """Overlays drawn into every image."""
 
     def tracker_at(self, timestamp: float) -> Any:
-        """The aligner's state for a frame at a timestamp, expecting the motion that the way since the reference
-        predicts.
-        """
+        """The aligner's state for a frame at a timestamp, with the motion predicted from the way so far."""
         seconds = timestamp - self.reference_timestamp
         xi = self.way.at(seconds)
         return self.tracker if xi is None else expecting(self.tracker, xi, seconds)

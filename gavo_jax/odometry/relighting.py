@@ -1,4 +1,4 @@
-"""Local changes of light are put into the references, and the frame is searched for again.
+"""Searches repeated with local changes of light built into the references.
 
 A search estimates one gain and bias per reference. Where a lamp flickers while rows are exposed, is switched on, or
 throws a shadow, neither fits. The motion is then drawn to one that explains the light.
@@ -111,7 +111,7 @@ class NewFrame(NamedTuple):
 def _with_light(
     state: TrackerState, new: NewFrame, target_T_reference: Float[Array, "4 4"], camera: Camera, *, levels: Levels
 ) -> tuple[TrackerState, Float[Array, ""]]:
-    """Put the light of a new frame, by the motion to it, into a state's references.
+    """Relight a state's references as in a new frame, given the motion to it.
 
     Returns:
         The state, and the part of the large residuals that the light leaves.

@@ -112,7 +112,7 @@ def run_odometry(
     for step in track(sequence, odometry=odometry, watch=mapper.watch if mapper else unwatched):
         steps.append(step)
         if on_step is not None:
-            on_step(replace(step, world_T_camera=step.world_T_camera.copy()))  # the run's own stays as it is
+            on_step(replace(step, world_T_camera=step.world_T_camera.copy()))  # the run's own must not change
     seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     outcome = finish_run(float(sequence.timestamps[0]), steps, sequence.ground_truth, mapper, seconds, compile_seconds)
     method, preset = names_of(settings)

@@ -102,7 +102,7 @@ def renew_keyframe(keyframe: Reference, newest: Reference, camera: Camera, overl
         overlap: Part of a share that is in view when it is replaced, on average over the shares.
     """
     places = np.arange(keyframe.grey.shape[-1])
-    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each covers the image
+    share = np.floor(KEYFRAME_SHARES * (places * (np.sqrt(1.25) - 0.5) % 1.0)).astype(int)  # each spans the image
     dealt = jax.nn.one_hot(share, KEYFRAME_SHARES)
     finest, newest_points = (jax.tree.map(lambda leaf: leaf[-1], view.points) for view in (keyframe, newest))
     inside = warp(finest, jnp.eye(4), camera).inside

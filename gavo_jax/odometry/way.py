@@ -1,4 +1,4 @@
-"""The camera's way since the reference, over frames that did not become the reference, for lack of depth say.
+"""The camera's way since the reference, over frames that did not become it, for lack of depth for example.
 
 The expected motion grows with every frame for which the reference is held. Continuing the motion from before the
 reference is soon far off; where the camera was last found tells more.
