@@ -75,7 +75,7 @@ _RENAMED = {"get_preset": "preset", "Preset": "Settings"}
 
 
 def __getattr__(name: str) -> object:
-    """Names of version 0.1, for one version more."""
+    """Return a deprecated name of version 0.1, with a warning."""
     if name not in _RENAMED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     warnings.warn(f"gavo_jax.{name} is gavo_jax.{_RENAMED[name]} now", DeprecationWarning, stacklevel=2)

@@ -1,4 +1,4 @@
-"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion; cameras that go by a name."""
+"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion; named presets."""
 
 import re
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ MIN_SIDE, MAX_SIDE = 16, 8192
 """Smallest and largest image width or height accepted, in pixels: the coarsest of five levels is 16 times smaller."""
 
 RIM = 4
-"""Depth that comes from within this many pixels of the raw image's border is dropped by undistortion."""
+"""Undistortion drops depth readings within this many pixels of the raw image's border."""
 
 OFF_AXIS = 10.0, 10001
-"""Up to where, as x / z, a lens is looked at, 84 degrees; and at how many places."""
+"""Largest x / z at which a lens is examined (84° off axis), and the number of samples up to there."""
 
 
 @partial(
@@ -41,15 +41,15 @@ class Camera:
         cy: principal point, row, pixels.
         width: image width, pixels.
         height: image height, pixels.
-        distortion: of the images as recorded, in OpenCV's order: k1, k2, p1, p2, k3 and, of the rational model, k4, k5,
-            k6; of a fisheye k1, k2, k3, k4.
+        distortion: coefficients for the images as recorded, in OpenCV's order: k1, k2, p1, p2, k3 and, for the rational
+            model, k4, k5, k6; for a fisheye k1, k2, k3, k4.
         depth_scale: raw depth units per metre (metres = raw / depth_scale).
         readout: seconds from the exposure of the first row to that of the last (rolling shutter); 0 = all at once.
-        model: what the distortion's numbers are: "pinhole" (Brown-Conrady, also rational) or "fisheye" (equidistant).
+        model: distortion model: "pinhole" (Brown-Conrady, also rational) or "fisheye" (equidistant).
 
     Raises:
-        GavoError: a side is no whole number of pixels, or a length or scale is negative. What is being traced, and
-            whatever else stands for a number in a pytree, has no value to look at.
+        GavoError: a side is not a whole number of pixels, or a length or scale is negative. Traced values and other
+            pytree leaves that are not numbers go unchecked.
     """
 
     fx: float
@@ -75,10 +75,10 @@ class Camera:
 
     @staticmethod
     def preset(name: str) -> "Camera":
-        """Return a camera of a benchmark by name: fr1, fr2, fr3 (TUM RGB-D), bonn or icl (640×480, depth / 5000).
+        """Return the camera of a benchmark by name: fr1, fr2, fr3 (TUM RGB-D), bonn or icl (640×480, depth / 5000).
 
         Raises:
-            GavoError: the name is none of these.
+            GavoError: unknown name.
         """
         if not isinstance(name, str) or name not in PRESETS:
             raise GavoError(f"unknown camera {name!r}: not one of {', '.join(PRESETS)}")
@@ -86,7 +86,7 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the images as recorded carry lens distortion; a fisheye's do without any number, too."""
+        """Whether recorded images have lens distortion; a fisheye's do even if all coefficients are 0."""
         return self.model == "fisheye" or any(self.distortion)
 
     @property
@@ -95,13 +95,13 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def level(self, k: int) -> "Camera":
-        """Return the camera of pyramid level k, whose image is 2^k times smaller along each side: `binned`."""
+        """Return the camera of pyramid level k, whose image is 2^k times smaller along each side; see `binned`."""
         return self.binned(2**k)
 
     def binned(self, pixels: int) -> "Camera":
-        """Return the camera of an image of which each pixel averages n × n; columns and rows left over are cut off.
+        """Return the camera of an image whose pixels average n × n each; leftover columns and rows are cut off.
 
-        Centres map as c' = (c + 1/2) / n - 1/2. Distortion is kept as it is: it acts on normalised coordinates.
+        Centres map as c' = (c + 1/2) / n - 1/2. Distortion is unchanged: it acts on normalised coordinates.
         """
         fx, fy, cx, cy = self.scaled(1 / pixels)
         size = {"width": self.width // pixels, "height": self.height // pixels}
@@ -113,7 +113,7 @@ class Camera:
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     def scaled(self, scale: Any) -> tuple[Any, Any, Any, Any]:
-        """Intrinsics fx, fy, cx, cy of an image `scale` times as large, or of several; see `binned`."""
+        """Return fx, fy, cx, cy of an image `scale` times as large; `scale` may be an array. See `binned`."""
         return (
             self.fx * scale,
             self.fy * scale,
@@ -124,8 +124,8 @@ class Camera:
     def project(self, points: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array | np.ndarray, "*batch 2"]:
         """Project points of the camera frame (metres; x right, y down, z forward) to pixels: P. Equation (5).
 
-        No distortion is put on. Works on NumPy and JAX arrays alike. Points at z = 0 give infinities or NaN; masking
-        them, and those behind the camera, is the caller's part.
+        No distortion is applied. Works on NumPy and JAX arrays alike. Points at z = 0 give infinities or NaN; the
+        caller must mask them, and those behind the camera.
         """
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         return _stack(*to_pixels(self, x, y, 1 / z))
@@ -139,9 +139,9 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """How far off its axis, as x / z, the lens shows what it sees once; infinite where nothing ends that.
+        """Largest distance off the axis, as x / z, up to which the lens model is one-to-one; may be infinite.
 
-        Beyond, the polynomial turns back: rays from there have the pixels of others, within the image.
+        Beyond it the distortion polynomial folds back: rays from there land on pixels of other rays.
         """
         return _reach(self.distortion, self.model)
 
@@ -152,14 +152,16 @@ class Camera:
     def undistort(
         self, grey: UInt8[np.ndarray, "height width *channels"], depth: UInt16[np.ndarray, "height width"]
     ) -> tuple[UInt8[np.ndarray, "height width *channels"], UInt16[np.ndarray, "height width"]]:
-        """Take the lens distortion out of an image (grey or colour) and its depth; both go to `rectified()`.
+        """Remove the lens distortion from an image (grey or colour) and its depth; their camera is then `rectified()`.
 
-        The same objects come back where the camera has no distortion.
+        Returns the same objects if the camera has no distortion.
         """
         return self.undistort_image(grey), self.undistort_depth(depth)
 
     def undistort_image(self, image: UInt8[np.ndarray, "height width *channels"]) -> np.ndarray:
-        """Undistort grey or colour, bilinear; the border is replicated: a black rim would stay put as the scene moves.
+        """Undistort a grey or colour image, bilinearly, with a replicated border.
+
+        A black rim would stand still while the scene moves.
 
         Raises:
             ValueError: the image is not of the camera's size.
@@ -171,8 +173,9 @@ class Camera:
         return cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistort_depth(self, depth: UInt16[np.ndarray, "height width"]) -> np.ndarray:
-        """Undistort raw depth, nearest (never mixed across an edge); 0 where its source lies outside, within `RIM`,
-        or beyond the lens's `reach`.
+        """Undistort raw depth by nearest neighbour (never mixed across an edge).
+
+        It is 0 where the source pixel lies outside the image, within `RIM` of its border or beyond the lens's `reach`.
 
         Raises:
             ValueError: the depth is not of the camera's size.
@@ -185,7 +188,7 @@ class Camera:
         return cv2.remap(depth, nearest, none, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
     def _on_host(self) -> "Camera":
-        """The same of Python's numbers, which have a hash."""
+        """Return the same camera with Python floats, which are hashable."""
         values = {name: float(getattr(self, name)) for name in ("fx", "fy", "cx", "cy", "depth_scale", "readout")}
         return replace(self, **values)
 
@@ -195,32 +198,33 @@ class Camera:
 
 
 def to_pixels(camera: Any, x: Any, y: Any, per_depth: Any = 1.0) -> tuple[Any, Any]:
-    """Columns and rows at which points x, y (metres) at depth 1/`per_depth` are seen, by a `Camera` or whatever has its
-    fx, fy, cx and cy.
+    """Project points x, y (metres) at depth 1/`per_depth` to columns and rows.
+
+    The camera is a `Camera` or anything else with fx, fy, cx and cy.
     """
     return camera.fx * x * per_depth + camera.cx, camera.fy * y * per_depth + camera.cy
 
 
 def in_image(camera: Any, u: Any, v: Any) -> Any:
-    """Whether pixels lie between the centres of an image's first and last ones."""
+    """Whether pixel coordinates lie in the image, between the centres of its first and last pixels."""
     return (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
 
 
 def to_ray(camera: Any, u: Any, v: Any) -> tuple[Any, Any]:
-    """x/z and y/z of what is seen at columns and rows, the inverse of `to_pixels`."""
+    """Return x/z and y/z of the rays through columns and rows; the inverse of `to_pixels`."""
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
 def inverse_depth(depth: Any, camera: Any) -> np.ndarray:
-    """1/depth of raw readings, 1/m, in double precision on the host; 0 where there is none."""
+    """Return 1/depth of raw readings, 1/m, in double precision on the host; 0 where there is no reading."""
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = float(camera.depth_scale) / np.asarray(depth, np.float64)
     return np.where(np.isfinite(inverse) & (inverse > 0), inverse, 0.0)
 
 
 READOUT = 0.02
-"""Seconds, of freiburg1. The images alone (`benchmarks/shutter.py`) say 0.019 on two clips and less on a third; 0.02
-drifted a little less there. Taken over for the two others, which are of like make but were not at hand."""
+"""Readout of freiburg1's sensor, seconds. From the images alone (`benchmarks/shutter.py`) it is 0.019 on two clips and
+less on a third; 0.02 drifted slightly less. The other, similar sensors are assumed to share it."""
 
 PRESETS = {
     "fr1": Camera(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), readout=READOUT),
@@ -233,19 +237,19 @@ PRESETS = {
     ),
     "icl": Camera(481.2, 480.0, 319.5, 239.5, 640, 480),
 }
-"""Cameras of the TUM RGB-D benchmark (Sturm et al. 2012), as its page of file formats gives them; of the Bonn RGB-D
-Dynamic dataset (Palazzolo et al. 2019), like them; of the rendered ICL-NUIM (Handa et al. 2014)."""
+"""Cameras of the TUM RGB-D benchmark (Sturm et al. 2012; from its page on file formats), of the Bonn RGB-D Dynamic
+dataset (Palazzolo et al. 2019) and of the rendered ICL-NUIM (Handa et al. 2014)."""
 
 
 NUMBERS_OF_DISTORTION = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
-"""How many there may be, as OpenCV takes them."""
+"""Numbers of distortion coefficients that OpenCV accepts, by model."""
 
 
 def require_camera(camera: Camera) -> None:
-    """Refuse what is no camera, one whose values cannot be, and one whose images are too small for a pyramid.
+    """Check that a value is a camera with valid parameters and images large enough for a pyramid.
 
     Raises:
-        GavoError: A side has fewer than `MIN_SIDE` pixels, a focal length is not positive, say.
+        GavoError: It is not: a side has fewer than `MIN_SIDE` pixels or a focal length is not positive, say.
     """
     if not isinstance(camera, Camera):
         raise GavoError(f"a Camera is needed, not {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
@@ -267,13 +271,13 @@ def require_camera(camera: Camera) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a finite real number, of Python, NumPy or JAX."""
+    """Whether a value is a finite real number of Python, NumPy or JAX."""
     array = np.asarray(value)
     return array.ndim == 0 and array.dtype.kind in "iuf" and bool(np.isfinite(array))
 
 
 def _stack(*arrays: Any) -> Any:
-    """Stack along a new last axis; stays in NumPy where every array is NumPy's."""
+    """Stack along a new last axis; the result is NumPy's if every array is."""
     if all(isinstance(array, np.ndarray | np.generic) for array in arrays):
         return np.stack(arrays, axis=-1)
     return jnp.stack(arrays, axis=-1)
@@ -281,7 +285,7 @@ def _stack(*arrays: Any) -> Any:
 
 @lru_cache(maxsize=8)
 def _reach(distortion: tuple[float, ...], model: str) -> float:
-    """`Camera.reach`: where the radius in the image stops growing, of radial terms alone."""
+    """Compute `Camera.reach`: where the radius in the image stops growing, by the radial terms alone."""
     off = np.linspace(0, *OFF_AXIS)
     if model == "fisheye":
         angle = np.arctan(off)
@@ -316,14 +320,14 @@ NAMES_OF_SEQUENCES = {
     r"(?<![a-z])rgbd_bonn_": "bonn",
     r"(?<![a-z])(?:icl(?![a-z])|living_?room_?traj|office_?room_?traj|traj[0-3]_frei)": "icl",
 }
-"""Preset by a pattern in a folder's name."""
+"""Camera preset by a pattern in a sequence's name."""
 
 
 def preset_for_sequence(name: str) -> str:
-    """Return the name of the preset that a sequence's name speaks of: `…freiburg1…`, `fr1_xyz`, `rgbd_bonn_…`, ….
+    """Return the name of the camera preset for a sequence's name: `…freiburg1…`, `fr1_xyz`, `rgbd_bonn_…`, ….
 
     Raises:
-        GavoError: the name speaks of none; the message asks for a camera.
+        GavoError: no preset matches; the message asks for a camera.
     """
     for pattern, preset in NAMES_OF_SEQUENCES.items():
         if match := re.search(pattern, name.lower()):

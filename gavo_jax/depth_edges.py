@@ -1,8 +1,8 @@
-"""Whether depth lies on the image: where depth jumps, one thing ends before another, and most images have an edge.
+"""Whether depth is registered to the image: depth jumps at occlusion boundaries, where most images have an edge.
 
-No motion is needed to see that, so it tells where `depth_change` has nothing to go by. Depth is taken to lie elsewhere
-only where it lies clearly better there: mirrored, upside down, turned by both, larger or smaller, or shifted by more
-than two cameras beside each other would see.
+This needs no motion, so it works where `depth_change` has nothing to go by. Depth counts as misplaced only where
+another placement fits clearly better: mirrored, upside down, both, zoomed, or shifted beyond the parallax of adjacent
+cameras.
 """
 
 from typing import NamedTuple
@@ -15,54 +15,54 @@ from gavo_jax.camera import Camera, inverse_depth
 from gavo_jax.datasets.base import Frame
 
 WIDTH = 160
-"""Pixels across the images that are compared."""
+"""Width of the images that are compared, pixels."""
 REACH, NEAR = 24, 8
-"""Pixels of these by which depth may be shifted: those that are looked at, and those of depth that is not registered
-to the image (20 of 640 in 7-Scenes are 5)."""
+"""Largest shift of depth that is tried, and the largest that unregistered depth may have, in pixels of these images
+(7-Scenes: 20 of 640 pixels, which are 5)."""
 JUMP = 0.08
-"""1/m between neighbours of these pixels, from which on depth jumps."""
+"""Range of inverse depth around a pixel, 1/m, above which depth jumps."""
 FEWEST_JUMPS = 0.003
-"""Fewest jumps, as a share of all pixels, for a frame to tell anything."""
+"""Smallest share of pixels with a jump for a frame to be used."""
 CONTRAST = 21
-"""Pixels across the surroundings that an edge of the image is set against."""
+"""Width of the neighbourhood that an image edge is compared with, pixels."""
 ZOOMS = (1.5, 1.3, 0.77, 0.67)
-"""How many times as large depth may belong on the image: it is of another angle of view then. That of a depth camera
-that is not registered (1.11 in 7-Scenes) lies nearer to 1."""
+"""Zoom factors that are tried on depth, for another field of view. Those of depth cameras that are merely unregistered
+(1.11 in 7-Scenes) are nearer to 1."""
 FAULTS = ("shifted", "mirrored", "upside down", "turned by half", *("of another angle of view" for _ in ZOOMS))
-"""What depth is that would lie better elsewhere, or each other way."""
+"""Name of the fault by the placement that fits better: a shift, then each other way."""
 EVERY, SELDOM, EARLY = 3, 30, 24
-"""One in `EVERY` references is looked at among the first `EARLY`, one in `SELDOM` after them."""
+"""One in `EVERY` of the first `EARLY` references is examined, one in `SELDOM` after them."""
 KEPT = 0.95
-"""Factor at each reference on what the ones before said."""
+"""Decay of the earlier sums with each reference that is added."""
 MIN_SEEN = 5
-"""Frames that have to be seen before anything is said."""
+"""Number of frames that must be added before a fault is reported."""
 BETTER, CLEAR = 2.0, 5.0
-"""How many times as well, and how many standard deviations better than at other places, depth has to lie elsewhere."""
+"""Another placement must fit `BETTER` times as well, and `CLEAR` standard deviations better than its other shifts."""
 
 
 class DepthEdges(NamedTuple):
-    """How much of an edge the image has where depth jumps, summed over frames, for each way depth may lie."""
+    """Strength of the image's edges where depth jumps, summed over frames, for each placement of depth."""
 
     sums: Float32[np.ndarray, "ways n n"]
-    """For depth as it is, mirrored, upside down, both, and by each of `ZOOMS`: by the shift, down and to the right."""
+    """For depth as given, mirrored, upside down, both, and zoomed by each of `ZOOMS`: by the shift down and right."""
     references: int = 0
-    """So many there were."""
+    """Number of references so far."""
     seen: int = 0
-    """So many of them were looked at and had enough jumps."""
+    """Number of references that were examined and had enough jumps."""
     fault: str = ""
-    """How depth lies, where it would lie clearly better otherwise: one of `FAULTS`."""
+    """One of `FAULTS`; empty unless another placement fits clearly better."""
 
     @classmethod
     def none(cls) -> "DepthEdges":
-        """Before the first frame."""
+        """Return the state before the first frame."""
         return cls(np.zeros((len(FAULTS), 2 * REACH + 1, 2 * REACH + 1), np.float32))
 
     def pairs_covered(self, pairs: int) -> int:
-        """Return how many of the last pairs its figures speak of, of so many so far."""
+        """Return how many of the last pairs the figures describe, out of `pairs` so far."""
         return pairs if self.references <= EARLY + SELDOM else SELDOM
 
     def after(self, frame: Frame, camera: Camera) -> "DepthEdges":
-        """Take one more reference into account."""
+        """Return the state after one more reference."""
         number = self.references
         counted = self._replace(references=number + 1)
         if number % (EVERY if number < EARLY else SELDOM):
@@ -76,7 +76,7 @@ class DepthEdges(NamedTuple):
 
 
 def fault_by(sums: Float32[np.ndarray, "ways n n"]) -> str:
-    """How depth lies by `DepthEdges.sums`, or an empty string where no other way is clearly better."""
+    """Return the fault that `DepthEdges.sums` show; empty unless another placement is clearly better."""
     as_it_is = _near(sums[0]).max()
     shifted = sums[0].copy()
     _near(shifted)[:] = -np.inf
@@ -87,15 +87,15 @@ def fault_by(sums: Float32[np.ndarray, "ways n n"]) -> str:
 
 
 def edges(grey: np.ndarray) -> Float32[np.ndarray, "h w"]:
-    """How much more of an edge each pixel is on than its surroundings, in a small image."""
-    grey = grey if grey.dtype == np.uint8 else grey.astype(np.float32)  # quicker, and all that OpenCV needs to know
+    """Edge strength of each pixel of the reduced image, relative to its surroundings."""
+    grey = grey if grey.dtype == np.uint8 else grey.astype(np.float32)  # OpenCV resizes bytes faster
     small = cv2.resize(grey, _size(*grey.shape[::-1]), interpolation=cv2.INTER_AREA).astype(np.float32)
     slope = cv2.log(1.0 + cv2.magnitude(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)))
     return slope - cv2.blur(slope, (CONTRAST, CONTRAST))
 
 
 def depth_jumps(depth: np.ndarray, camera: Camera) -> Float32[np.ndarray, "h w"]:
-    """1 where the depths around a pixel are of two things, in a small image; 0 elsewhere and without readings."""
+    """Reduced image that is 1 where depth jumps around a pixel; 0 elsewhere and without a reading."""
     width, height = _size(*depth.shape[::-1])
     row, column = np.arange(height) * depth.shape[0] // height, np.arange(width) * depth.shape[1] // width
     small = depth[row[:, None], column]
@@ -107,8 +107,8 @@ def depth_jumps(depth: np.ndarray, camera: Camera) -> Float32[np.ndarray, "h w"]
 
 
 def likeness(edges: Float32[np.ndarray, "h w"], jumps: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "ways n n"]:
-    """Mean edge under the jumps of depth, for each way that it may lie and each shift within reach."""
-    size = [cv2.getOptimalDFTSize(length + REACH) for length in edges.shape]  # nothing comes round from the other side
+    """Mean edge strength at the jumps of depth, for each placement and each shift within `REACH`."""
+    size = [cv2.getOptimalDFTSize(length + REACH) for length in edges.shape]  # padded against wrap-around
     flipped = [jumps, jumps[:, ::-1], jumps[::-1], jumps[::-1, ::-1]]
     ways = np.stack([*flipped, *(_zoomed(jumps, factor) for factor in ZOOMS)])
     there, here = (np.fft.rfft2(images, size) for images in (edges, ways))
@@ -122,7 +122,7 @@ def _size(width: int, height: int) -> tuple[int, int]:
 
 
 def _zoomed(jumps: np.ndarray, factor: float) -> np.ndarray:
-    """Seen about the middle of the image, so many times as large."""
+    """Zoom about the image centre."""
     height, width = jumps.shape
     about = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), 0.0, factor)
     return cv2.warpAffine(jumps, about, (width, height), flags=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""Bad input as one kind of exception, lines about it, the text files that users hand in, and files written whole."""
+"""The exception for bad input, one-line messages, parsing of users' text files, and atomic writing."""
 
 import contextlib
 import json
@@ -23,7 +23,7 @@ PARTIAL = ".partial"
 """Suffix of a file that is being written."""
 
 OF_WINDOWS = re.compile(r"[-+]?1\.#[A-Z]{1,4}0*")
-"""What older programs of Windows write for infinity and for no number: -1.#INF, 1.#QNAN."""
+"""Infinity and NaN as older Windows programs write them: -1.#INF, 1.#QNAN."""
 
 
 class GavoError(ValueError):
@@ -34,30 +34,30 @@ class GavoError(ValueError):
 
 
 class GavoWarning(UserWarning):
-    """Something is not as it should be, and the work goes on without it."""
+    """Something is wrong or missing, and the work goes on without it."""
 
 
 def printable(text: str) -> str:
-    """Return a text without what would command a terminal: such characters are shown as code would write them.
+    """Return a text with its unprintable characters escaped, so that it cannot control a terminal.
 
-    Names of files, and of what is in archives and on servers, are other people's words.
+    Names of files, archive members and server entries are not trusted.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def tell(line: str) -> None:
-    """Print a line of the command's own on standard error: one, whatever the words are."""
+    """Print a message of the command on standard error, always as a single line."""
     print(f"gavo: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
 def line_of(error: BaseException) -> str:
-    """What another library's error says, in one line that is not too long; what it is where it says nothing."""
+    """Return an error's message as one line of limited length; the name of its type if it has none."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 @contextlib.contextmanager
 def blamed(whose: str, kind: Callable[[str], Exception] = GavoError) -> Iterator[None]:
-    """Turn whatever other people's code raises in the block into one line, which begins with whose fault it is."""
+    """Turn whatever third-party code raises in the block into a one-line error that begins with `whose`."""
     try:
         yield
     except GavoError:
@@ -67,20 +67,20 @@ def blamed(whose: str, kind: Callable[[str], Exception] = GavoError) -> Iterator
 
 
 def shown(value: Any) -> str:
-    """Return a value as code would write it, cut to what fits into a message."""
+    """Return the `repr` of a value, cut to fit into a message."""
     cutter = reprlib.Repr()
     cutter.maxstring = cutter.maxother = cutter.maxlong = MAX_SHOWN
     try:
         return cutter.repr(value)
-    except ValueError:  # Python writes no whole number of thousands of digits
+    except ValueError:  # Python refuses to print integers of thousands of digits
         return f"a {type(value).__name__} of too many digits"
 
 
 def number(text: str) -> float:
-    """Return the number that a field of a text file is, as people and programs write them; NaN for 1.#INF and its like.
+    """Parse a number in a field of a text file; NaN for 1.#INF and the like.
 
     Raises:
-        ValueError: it is none; Python alone would take 1_000, and the digits of other scripts.
+        ValueError: not a number; unlike `float`, this refuses 1_000 and digits of other scripts.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"not a number: {text[:MAX_SHOWN]!r}")
@@ -88,10 +88,10 @@ def number(text: str) -> float:
 
 
 def as_number(name: str, value: Any, needed: str = "a number is needed") -> float:
-    """A value as a number of Python's own.
+    """Return a value as a Python float.
 
     Raises:
-        GavoError: It is no single real number, but text, a list.
+        GavoError: It is not a single real number, but text or a list, say.
     """
     if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
         raise GavoError(f"{name}: {needed}, not {shown(value)}")
@@ -99,10 +99,10 @@ def as_number(name: str, value: Any, needed: str = "a number is needed") -> floa
 
 
 def as_whole(name: str, value: Any) -> int:
-    """A value as a whole number of Python's own.
+    """Return a value as a Python int.
 
     Raises:
-        GavoError: It is none; 2.0 is none either.
+        GavoError: It is not a whole number; nor is 2.0.
     """
     try:
         return operator.index(value)
@@ -114,7 +114,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return the text of a UTF-8 file.
 
     Raises:
-        GavoError: the file is missing, no regular file, unreadable, larger than `max_bytes` or not UTF-8.
+        GavoError: the file is missing, not a regular file, unreadable, larger than `max_bytes` or not UTF-8.
     """
     path = Path(path)
     try:
@@ -136,16 +136,16 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> Any:
-    """Return what a file of JSON holds.
+    """Return the contents of a JSON file.
 
     Raises:
-        GavoError: as `read_text`, or it is no JSON.
+        GavoError: as `read_text`, or it is not JSON.
     """
     return parse_json(path, read_text(path, max_bytes))
 
 
 def read_json_object(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, Any]:
-    """Return the names and values that a file of JSON holds.
+    """Return the object in a JSON file.
 
     Raises:
         GavoError: as `read_json`, or it holds something else.
@@ -157,10 +157,10 @@ def read_json_object(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[
 
 
 def parse_json(place: str | Path, text: str) -> Any:
-    """Return what a text of JSON holds.
+    """Parse a JSON text.
 
     Raises:
-        GavoError: it is none; the message begins with `place`.
+        GavoError: it is not JSON; the message begins with `place`.
     """
     try:
         return json.loads(text)
@@ -169,10 +169,10 @@ def parse_json(place: str | Path, text: str) -> Any:
 
 
 def parse_toml(place: str | Path, text: str) -> dict[str, Any]:
-    """Return the table that a text is in TOML.
+    """Parse a TOML text.
 
     Raises:
-        GavoError: it is none, or holds a number of thousands of digits; the message begins with `place`.
+        GavoError: it is not TOML, or holds a number of thousands of digits; the message begins with `place`.
     """
     try:
         return tomllib.loads(text)
@@ -190,17 +190,17 @@ def read_toml(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[str, An
 
 
 COLUMN = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-"""The name of a column; paths and numbers are none."""
+"""Name of a column; paths and numbers do not match."""
 
 TIME = re.compile(r"time|stamp|^t$", re.IGNORECASE)
-"""In the name of a column of times."""
+"""Part of the name of a timestamp column."""
 
 
 def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[str, list[str]]]:
     """Split a TUM text file into rows of fields; blank lines and `#` comments are skipped, commas count as blanks.
 
     Returns:
-        A list of (`file:line`, fields), so that whoever refuses a row can say where it stands.
+        A list of (`file:line`, fields), so that an error can say where its row is.
 
     Raises:
         GavoError: as `read_text`.
@@ -209,7 +209,7 @@ def data_rows(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> list[tuple[s
 
 
 def rows_of(text: str, path: str | Path) -> list[tuple[str, list[str]]]:
-    """Split the text of such a file; `path` is for the places."""
+    """Split a text as `data_rows` does; `path` is only used to name its lines."""
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
@@ -219,8 +219,10 @@ def rows_of(text: str, path: str | Path) -> list[tuple[str, list[str]]]:
 
 
 def without_heading(rows: list[tuple[str, list[str]]]) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """The names of the columns, of which the first is a time, where the first row is such, and the rows below; else no
-    names, and all rows.
+    """Split off a heading: a first row of column names, the first of which is a time.
+
+    Returns:
+        The column names, empty if there is no heading, and the remaining rows.
     """
     heading = rows[0][1] if rows else []
     if len(heading) < 2 or not (TIME.search(heading[0]) and all(map(COLUMN.fullmatch, heading))):
@@ -229,15 +231,15 @@ def without_heading(rows: list[tuple[str, list[str]]]) -> tuple[list[str], list[
 
 
 def partial_of(path: Path) -> Path:
-    """The file that this thread writes first, in place of a file; no other one does."""
+    """Return the temporary file, unique to this thread, that is written in place of a file."""
     return path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}{PARTIAL}")
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file whole or not at all: beside it first, then renamed into place.
+    """Write a file atomically: to a temporary file beside it, then renamed into place.
 
-    What lies where it is written first, left by a kill or planted by somebody, is removed and not followed. Several
-    writers of one file do not meet: the last one's is there in the end.
+    Whatever lies at the temporary path, left by a killed process or planted as a link, is removed and not followed.
+    Concurrent writers of one file do not interfere: the last one wins.
 
     Raises:
         GavoError: the file cannot be written.

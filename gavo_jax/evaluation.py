@@ -21,8 +21,8 @@ MAX_DIFFERENCE = 0.02
 """Stamps of estimate and truth at least this far apart, in seconds, are not associated."""
 
 REORDERED, LARGE = 0.25, 2.0
-"""Quaternions are in another order where that leaves less than this share of the median error of rotation over one
-second, and the error is larger than so many degrees."""
+"""Quaternions are taken to be w-first if that order leaves less than this share of the median rotation error over one
+second, and that error exceeds this many degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class ErrorSeries:
 
     Attributes:
         values: one error per pair of poses, or per pose.
-        timestamps: seconds; stamp of the estimate's pose, the first one of a pair.
+        timestamps: stamps of the estimate's poses (of each pair's first pose), seconds.
         unit: of the values: "m" or "deg".
         definition: what each value is, in a sentence.
     """
@@ -43,7 +43,7 @@ class ErrorSeries:
 
     @property
     def rmse(self) -> float:
-        """Root of the mean square; of the translational RPE over 1 s it is the drift in m/s. Equation (16)."""
+        """Root mean square; for the translational RPE over 1 s it is the drift in m/s. Equation (16)."""
         return float(np.sqrt(np.mean(np.square(self.values))))
 
     @property
@@ -101,11 +101,11 @@ def relative_pose_error(
 ) -> RelativePoseError:
     """Return how far the estimated motion over `delta` is from the true one. Equation (15).
 
-    Unit "s" is what TUM's `evaluate_rpe.py --fixed_delta --delta DELTA --delta_unit s` computes: each pose i is paired
-    with the pose j nearest to `delta` seconds later, save pairs that end at the last pose; the truth is taken at its
-    stamps nearest to those of i and j, where both lie within twice its median interval; the error is
+    Unit "s" is what TUM's `evaluate_rpe.py --fixed_delta --delta DELTA --delta_unit s` computes. Each pose i is paired
+    with the pose j nearest to `delta` seconds later, except pairs that end at the last pose. The truth is taken at its
+    stamps nearest to those of i and j, where both lie within twice its median interval. The error is
     `inv(est_j_T_i) @ true_j_T_i`. At delta = 1 the RMSE of its translation is the drift in m/s. TUM's tool draws
-    10,000 pairs at random where there are more; here all of them count.
+    10,000 pairs at random if there are more; here all of them count.
 
     Unit "frames" pairs pose i with pose i + delta of the associated poses (`associate`, 0.02 s), and the error is as
     printed in the paper: `inv(true_i_T_j) @ est_i_T_j`. The rotation angles of the two forms agree; their translations
@@ -113,8 +113,8 @@ def relative_pose_error(
     Poses that are not finite are left out.
 
     Args:
-        estimate: what was found, camera to world.
-        truth: what it is compared with; its world may be another one.
+        estimate: estimated trajectory, camera to world.
+        truth: ground truth; its world frame may differ.
         delta: how far apart the poses of a pair are, in `unit`.
         unit: seconds or frames.
 
@@ -123,7 +123,7 @@ def relative_pose_error(
 
     Raises:
         GavoError: nothing to compare: no two poses `delta` apart that the truth covers, or delta not positive
-            (for frames: not a whole number), or no number.
+            (for frames: not a whole number), or not a number.
     """
     estimate, truth = _known(estimate), _known(truth)
     delta = as_number("relative pose error: delta", delta)
@@ -144,11 +144,11 @@ def absolute_trajectory_error(
     """Return the distances between associated positions after the best rigid alignment of the estimate (no scale).
 
     Association is `associate` by time; the alignment minimises the sum of squared distances (Horn 1987, Umeyama 1991).
-    Each segment of the estimate is aligned by itself, as nothing is known of how they lie to each other; one of a
-    single pose says nothing and is left out. So are poses that are not finite.
+    Each segment of the estimate is aligned by itself, as the poses of segments relative to each other are unknown.
+    Segments of a single pose are left out, and so are poses that are not finite.
 
     Raises:
-        GavoError: fewer than two poses associate, or no two of one segment; an argument is of another kind.
+        GavoError: fewer than two poses associate, or no two of one segment; an argument is of the wrong type.
     """
     max_difference = as_number("absolute trajectory error: max_difference", max_difference)
     estimated, true = _associated(_known(estimate), _known(truth), max_difference, "absolute trajectory error")
@@ -174,12 +174,11 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
     """Return ‖p_est − p_true‖ of each pose, both seen from their own first pose: accumulated drift. Equation (17).
 
     The paper plots it, and cites its equation without printing it. The truth is interpolated (slerp) at the estimate's
-    stamps; poses it does not cover (outside it, or in a gap longer than `max_gap` seconds) are left out, and the first
-    covered one is the common origin; each segment of the estimate has one of its own. Poses that are not finite are
-    left out.
+    stamps. Poses it does not cover (outside it, or in a gap longer than `max_gap` seconds) are left out, and so are
+    poses that are not finite. The first covered pose of each segment is that segment's common origin.
 
     Raises:
-        GavoError: the truth covers no pose of the estimate; an argument is of another kind.
+        GavoError: the truth covers no pose of the estimate; an argument is of the wrong type.
     """
     max_gap = as_number("distance error: max_gap", max_gap)
     estimate, truth = _known(estimate), _known(truth)
@@ -199,10 +198,10 @@ def distance_error(estimate: Trajectory, truth: Trajectory, max_gap: float = MAX
 
 
 def _known(trajectory: Trajectory) -> Trajectory:
-    """The poses that are finite, and so are their stamps.
+    """Return the poses that are finite, with finite stamps.
 
     Raises:
-        GavoError: it is no trajectory, or a pose is no rigid transform.
+        GavoError: it is not a trajectory, or a pose is not a rigid transform.
     """
     require_trajectory(trajectory)
     trajectory.require_rigid()
@@ -211,11 +210,11 @@ def _known(trajectory: Trajectory) -> Trajectory:
 
 
 def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
-    """Whether the quaternions of a file stand as w x y z where x y z w belongs, as those of another one tell.
+    """Whether a file has its quaternions as w x y z instead of x y z w, judged by another trajectory.
 
-    The file alone does not tell: the wrong order leaves every motion as large and as smooth. But two that disagree, and
-    agree once this one is put in order, do. What is read so is the inverse rotation between two fixed ones, so a camera
-    that turns about one axis may look alike where a file has inverse poses; of that nothing is said.
+    The file alone does not show it: the wrong order leaves motions as large and as smooth. But two trajectories that
+    disagree, and agree once this one is reordered, do. Misread quaternions are the inverse rotations between two fixed
+    ones, so inverse poses of a camera that turns about one axis look alike; those are not reported.
     """
 
     def error(quaternions: Float[np.ndarray, "n 4"]) -> float:
@@ -300,7 +299,7 @@ def _relative_pose_error(
 
 
 def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle of rotation matrices in radians, 0 to π, exact for small ones too (where arccos is not)."""
+    """Return the angle of rotation matrices in radians, 0 to π, accurate for small angles too (arccos is not)."""
     skew = rotation - np.swapaxes(rotation, -1, -2)
     sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
     cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1
@@ -310,7 +309,7 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 def _associated(
     estimate: Trajectory, truth: Trajectory, max_difference: float, what: str
 ) -> tuple[Trajectory, Float[np.ndarray, "n 4 4"]]:
-    """Return the estimate's poses that associate, in the order of their stamps, and the true `world_T_camera`."""
+    """Return the estimate's associated poses, in the order of their stamps, and the true `world_T_camera`."""
     i, j = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(i) < 2:
         raise GavoError(f"{what}: only {len(i)} poses of estimate and ground truth within {max_difference:g} s")
@@ -318,7 +317,7 @@ def _associated(
 
 
 def _in_segments_of_both(estimate: Trajectory, others: Int[np.ndarray, " n"]) -> Trajectory:
-    """The estimate in as many segments as there are pairs of its own and of the truth's at its poses."""
+    """Split the estimate's segments where the truth's segment (`others`, at each pose) changes."""
     pairs = np.stack([estimate.segments, others], axis=1)
     return replace(estimate, segments=np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1))
 
@@ -330,7 +329,7 @@ def _sorted(trajectory: Trajectory) -> Trajectory:
 def _closest_index(sorted_stamps: Float[np.ndarray, " n"], queries: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
     """Return the index of the stamp nearest to each query.
 
-    Between two equally near ones it is the one that a bisection of [0, n) meets first, as in TUM's tool.
+    Of two equally near ones it is the one that a bisection of [0, n) meets first, as in TUM's tool.
     """
     low, high = np.zeros(len(queries), np.int64), np.full(len(queries), len(sorted_stamps))
     best = np.zeros(len(queries), np.int64)

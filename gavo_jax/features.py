@@ -1,8 +1,8 @@
-"""The motion between two frames by features: keypoints matched by their descriptors, and the pose that explains them.
+"""The motion between two frames from features: keypoints matched by their descriptors, and the pose that explains them.
 
-What one does with OpenCV in twenty lines: SIFT or ORB keypoints of both frames, the reference's depth at its own,
-matches that pass the ratio test, `solvePnPRansac`, Levenberg-Marquardt on what agrees. It needs no guess,
-only corners that both frames show. It is a rival of the wide search (`peers`), and a source of guesses for it.
+The usual OpenCV pipeline: SIFT or ORB keypoints of both frames, depth at the reference's, matches that pass the ratio
+test, `solvePnPRansac`, and Levenberg-Marquardt on the inliers. It needs no guess, only features that both frames show.
+It is a baseline for the wide search (`peers`), and a source of guesses for it.
 """
 
 from functools import cache
@@ -18,20 +18,20 @@ from gavo_jax.image.numbers import Depth, grey_bytes
 FeatureKind = Literal["sift", "orb"]
 
 KEYPOINTS = 2000
-"""Most keypoints of one image."""
+"""Largest number of keypoints of an image."""
 CONTRAST = 0.01
-"""SIFT's threshold (OpenCV's default: 0.04, at which a blurred image has a few hundred keypoints)."""
+"""SIFT's contrast threshold (at OpenCV's default, 0.04, a blurred image has a few hundred keypoints)."""
 RATIO = 0.8
-"""Largest distance of a match over that of the second-best one (Lowe 2004)."""
+"""Largest ratio of a match's distance to that of the second-best one (Lowe 2004)."""
 REPROJECTION = 2.0
-"""Pixels within which a match agrees with a motion."""
+"""Reprojection error below which a match is an inlier, pixels."""
 ROUNDS = 2000
-"""Largest number of RANSAC's samples; it ends sooner where it has, with `CONFIDENCE`, drawn one without outliers."""
+"""Largest number of RANSAC samples; it ends sooner once one is free of outliers with probability `CONFIDENCE`."""
 CONFIDENCE = 0.9999
 FEWEST = 6
-"""Matches that must agree with a motion: what four points give has two to spare."""
+"""Smallest number of inliers: two more than the four points that a motion is computed from."""
 REFINEMENTS = 3
-"""Rounds of refining the motion by the matches that agree, and choosing these anew."""
+"""Rounds of refining the motion on the inliers and choosing these anew."""
 
 
 class Features(NamedTuple):
@@ -42,7 +42,7 @@ class Features(NamedTuple):
     descriptors: np.ndarray
     """[N, D]: float32 of SIFT, bytes of ORB."""
     points: Float64[np.ndarray, "n 3"]
-    """In the frame's camera, metres; not-a-number where there is no reading."""
+    """In the frame's camera, metres; NaN where there is no reading."""
 
 
 class FeatureMotion(NamedTuple):
@@ -53,7 +53,7 @@ class FeatureMotion(NamedTuple):
     inliers: int
     """Number of matches that agree with the motion."""
     share: float
-    """Share of the matches with a reading in the reference that agree."""
+    """Share of inliers among the matches, all of which have a reading in the reference."""
 
 
 @cache
@@ -67,10 +67,10 @@ def detect(grey: UInt8[np.ndarray, "h w"], depth: Depth, camera: Camera, kind: F
     """Find the keypoints of a frame without lens distortion.
 
     Args:
-        grey: Image.
-        depth: Registered to it, in units of `camera.depth_scale` a metre, 0 = no reading.
-        camera: Of the image.
-        kind: What finds and describes them.
+        grey: Grey image.
+        depth: Depth registered to it, in units of `camera.depth_scale` a metre, 0 = no reading.
+        camera: Camera of the image.
+        kind: Detector and descriptor.
     """
     keypoints, descriptors = _detector(kind).detectAndCompute(grey_bytes(grey), None)
     if descriptors is None or not keypoints:
@@ -83,7 +83,7 @@ def detect(grey: UInt8[np.ndarray, "h w"], depth: Depth, camera: Camera, kind: F
 
 
 def match(reference: Features, target: Features) -> tuple[np.ndarray, np.ndarray]:
-    """Places in the reference and in the target of the keypoints that match and have a reading in the reference."""
+    """Return the indices, in the reference and in the target, of matches with a reading in the reference."""
     known = np.flatnonzero(np.isfinite(reference.points[:, 2]))
     if len(known) == 0 or len(target.pixels) < 2:
         return np.zeros(0, int), np.zeros(0, int)
@@ -94,7 +94,7 @@ def match(reference: Features, target: Features) -> tuple[np.ndarray, np.ndarray
 
 
 def solve_motion(reference: Features, target: Features, camera: Camera) -> FeatureMotion | None:
-    """The motion between two frames of which these are the keypoints; None where too few matches agree on one."""
+    """Return the motion between two frames from their keypoints; None if it has too few inliers."""
     before, after = match(reference, target)
     if len(before) < FEWEST:
         return None
@@ -110,7 +110,7 @@ def solve_motion(reference: Features, target: Features, camera: Camera) -> Featu
             confidence=CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
-    except cv2.error:  # of points that lie on a line
+    except cv2.error:  # collinear points
         return None
     if not found or inliers is None:
         return None
@@ -139,16 +139,16 @@ def feature_motion(
     camera: Camera,
     kind: FeatureKind = "sift",
 ) -> FeatureMotion | None:
-    """The motion between two frames by their features.
+    """Return the motion between two frames from their features.
 
     Args:
         reference: Grey and depth, uint8 and uint16 of [H, W], without lens distortion; depth in units of
             `camera.depth_scale` a metre, 0 = no reading.
-        target: The other frame, alike.
+        target: The other frame, likewise.
         camera: Their camera.
-        kind: What finds and describes the keypoints.
+        kind: Detector and descriptor.
 
     Returns:
-        The motion with what speaks for it; None where too few matches agree on one.
+        The motion with its inliers; None if these are too few.
     """
     return solve_motion(detect(*reference, camera, kind), detect(*target, camera, kind), camera)

@@ -1,8 +1,7 @@
-"""Whether a new frame can be trusted, before anything is aligned: from its own figures and those of the frames before.
+"""Whether a new frame can be trusted before it is aligned, by its own statistics and those of earlier frames.
 
-Each check costs a look at every fourth row, or at every seventh reading of depth, on the host; together they take well
-under a millisecond. A frame that fails one is told apart by its `AlignmentStatus`, and by what it may still be used for
-(`Use`).
+Each check reads every fourth row, or every seventh pixel of depth, on the host; together they take well under a
+millisecond. A failed check gives the frame an `AlignmentStatus` and says what it may still be used for (`Use`).
 """
 
 import enum
@@ -27,7 +26,7 @@ class Use(enum.Enum):
     TARGET = "target"
     """It can be aligned with a reference, but makes a poor one itself."""
     GREY = "grey"
-    """Its image can be aligned with a reference; its depth is worth nothing."""
+    """Its image can be aligned with a reference; its depth is unusable."""
     ALL = "all"
 
 
@@ -39,7 +38,7 @@ class Finding(NamedTuple):
 
 
 class History(NamedTuple):
-    """What the checks remember of the frames before."""
+    """What the checks remember of earlier frames."""
 
     timestamp: float | None = None
     """Latest stamp, seconds."""
@@ -51,85 +50,87 @@ class History(NamedTuple):
     """Checksum of the last depth image; `depth_timestamp` is the stamp that came with it."""
     depth_timestamp: float | None = None
     intervals: tuple[float, ...] = ()
-    """Between the last frames, seconds."""
+    """Intervals between the last frames, seconds."""
     clipped: tuple[float, ...] = ()
     """Shares of black or white pixels of the last good frames."""
     coverages: tuple[float, ...] = ()
     """Shares of pixels with depth of the last frames that had any."""
     ranges: tuple[float, ...] = ()
-    """Depth of the last good frame at the `RANGE_QUANTILES`, metres, and that frame's stamp."""
+    """Depth of the last good frame at the `RANGE_QUANTILES`, metres; `range_timestamp` is that frame's stamp."""
     range_timestamp: float = 0.0
     units_known: bool = False
-    """Whether a frame's depth was that of a camera; since then it has changed only as a scene can."""
+    """Whether some frame's depth was plausible; since then it has changed only as a scene's can."""
     has_relief: bool = False
-    """Whether a frame's readings have differed."""
+    """Whether some frame's readings were not all equal."""
     doubts: int = 0
-    """Frames in a row that were refused only for being unlike those before."""
+    """Consecutive frames that were refused only for being unlike those before."""
 
 
 MIN_DEPTH_SHARE = 0.05
-"""Share of an image, or of a reference's points, with a reading, below which there is no depth to align by."""
+"""Share of an image's pixels, or a reference's points, with a reading below which a frame has no usable depth."""
 FLAT = 1e-4
-"""Share of the largest reading by which readings differ at most that are one number."""
+"""Readings count as equal if they differ by at most this share of the largest."""
 REMEMBERED = 15
-"""Frames whose median says what is usual."""
+"""Number of last frames whose median defines what is usual."""
 MAX_DOUBTS = 3
-"""Frames in a row that may be refused for being unlike those before; then what was usual is forgotten."""
+"""Consecutive frames refused for being unlike those before after which what was usual is forgotten."""
 MIN_CONTRAST = 3.0
-"""Grey levels: an image of a smaller standard deviation is blank."""
+"""Standard deviation below which an image is blank, grey levels."""
 BLACK, WHITE = 5, 250
 """Grey levels up to and from which a pixel counts as clipped."""
 MAX_CLIPPED = 0.75
 """Share of clipped pixels above which an image is blank or saturated."""
 MAX_CLIPPED_JUMP = 0.3
-"""The same, above the usual share: twice what the TUM clips show within half a second (a lamp, a window)."""
+"""Rise of that share above the usual one which makes an image blank: twice what the TUM clips show within half a second
+(a lamp, a window)."""
 MIN_CORRELATION = 0.7
-"""Correlation of neighbouring pixels below which an image is noise. Scenes have 0.93 and more at 160 pixels across,
-noise has 0, and up to a half where undistortion interpolated it."""
+"""Correlation of neighbouring pixels below which an image is noise. Scenes have 0.93 and more at a width of 160 pixels;
+noise has 0, or up to 0.5 once undistortion has interpolated it."""
 MIN_COVERAGE_RATIO = 0.7
-"""Depth readings, against their usual number, below which depth is partial; the TUM clips stay above 0.92."""
+"""Ratio of depth readings to their usual number below which depth is partial; the TUM clips stay above 0.92."""
 RANGE_QUANTILES = (25.0, 50.0, 75.0)
-"""Per cent of the readings. Other units change all of them by one factor; a near body changes the lower ones alone.
-Higher ones would often be at the end of what the image's numbers can hold."""
+"""Percentiles of depth that are compared. Other units scale all of them; a near body changes the lower ones alone.
+Higher ones would often be at the end of the sensor's number range."""
 MAX_RANGE_RATIO = 2.5
-"""Factor by which depth at all those quantiles grows or shrinks from a frame to the next, above which it is in other
-units; handheld motion stays within 1.4 a frame."""
+"""Factor from a frame to the next, at all of these percentiles, above which depth is in other units; handheld motion
+stays within 1.4 a frame."""
 RANGE_AGE = 0.1
-"""Seconds between two frames beyond which that limit's logarithm grows with the time."""
+"""Seconds between two frames beyond which the logarithm of `MAX_RANGE_RATIO` grows with the time."""
 MAX_DUPLICATE_DIFFERENCE = 2
-"""Grey levels: two images that nowhere differ by more are one. A sensor's noise alone makes larger differences."""
+"""Images that nowhere differ by more grey levels are duplicates; sensor noise alone makes larger differences."""
 MIN_FROZEN_PART = 0.2
-"""Share of the pixels beside an edge that are to the digit what they were, as is all around them, while as many are
-not, from which on a part of the image stands still. Half of a real image has 0.26 and more, clean clips 0.01 at most,
-and 0.11 where they are rendered without noise."""
+"""Part of an image is frozen if more than this share of the pixels beside edges, with their surroundings, is exactly
+unchanged and as large a share has changed. Half-frozen real images have 0.26 and more, clean clips at most 0.01, or
+0.11 if rendered without noise."""
 MIN_SEEN = 40
-"""Such pixels, of some 1200, that are needed to tell."""
+"""Smallest number of pixels beside edges, out of some 1200, for that test."""
 MIN_FAR = 0.8
-"""Metres: the highest of the quantiles, for units to be known; read as fifths, millimetres are that from 4 m on."""
+"""Depth in metres that the highest percentile must exceed for the units to count as known. Millimetres misread as
+units of 1/5000 m exceed it only beyond 4 m."""
 MAX_INTERVAL_RATIO = 2.5
-"""An interval of more than so many usual ones is a gap. Recordings often lack a single frame."""
+"""An interval longer than this many usual ones is a gap. Recordings often lack a single frame."""
 MAX_USUAL_INTERVAL = 1.5
-"""Interval, over the usual one, above which it may be that of two frames."""
+"""Ratio of an interval to the usual one above which it may span two frames."""
 MIN_INTERVALS = 3
-"""Intervals that have to be known before one can be unusual."""
+"""Number of known intervals before one can be unusual."""
 ROW_STEP = 4
 THUMBNAIL = 5
-"""Pixels that a side of the thumbnail has at least, where the image has so many."""
+"""Smallest side of the thumbnail in pixels, if the image has as many."""
 DEPTH_STEP = 7
-"""Pixels of a depth image, row after row, of which one is looked at: some of every row and, as few widths are
-multiples of this, of every column. Every fourth row may be one of those that a spinning sensor leaves out."""
+"""Stride of the depth pixels that are read, row by row. Few widths are multiples of it, so all rows and columns are
+sampled. Every fourth row, say, may be one that a spinning sensor leaves out."""
 
 
 def check_frame(
     frame: Frame | FrameError | None, timestamp: float, camera: Camera, history: History
 ) -> tuple[Finding, History]:
-    """Say whether the next frame can be trusted.
+    """Check whether the next frame can be trusted.
 
     Args:
         frame: The frame, or why there is none.
         timestamp: Its colour stamp, seconds.
-        camera: Its size and depth units.
-        history: What is remembered of the frames before; `History()` at first.
+        camera: Gives the image size and the depth units.
+        history: What is remembered of earlier frames; `History()` at first.
 
     Returns:
         The finding, and what to remember from now on.
@@ -152,7 +153,7 @@ def check_frame(
     thumbnail = grey[::rows, ::columns].astype(int)
     before = np.array(history.thumbnail)
     near = before.size == thumbnail.size and np.abs(thumbnail.ravel() - before).max() <= MAX_DUPLICATE_DIFFERENCE
-    if checksum == repeated or near:  # the next one is compared with what this one repeats: small changes add up
+    if checksum == repeated or near:  # the thumbnail stays, so that small changes add up
         return _refused(AlignmentStatus.FROZEN), history
     history = history._replace(thumbnail=tuple(thumbnail.ravel().tolist()))
     if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
@@ -172,12 +173,13 @@ def check_frame(
 
 
 def doubts_last_stamp(timestamp: float, history: History) -> bool:
-    """Whether a stamp that comes too early says that the last one came too late: that is later than usual, and two
-    frames that changed their stamps would look so.
+    """Whether a stamp that is too early casts doubt on the last one, which came later than usual.
+
+    Two frames with exchanged stamps look like this.
 
     Args:
-        timestamp: Of the new frame, seconds.
-        history: Of the frames before.
+        timestamp: Stamp of the new frame, seconds.
+        history: History of the frames before.
     """
     *before, last = (0.0, 0.0) if len(history.intervals) <= MIN_INTERVALS else history.intervals
     early = history.timestamp is not None and history.timestamp - last < timestamp < history.timestamp
@@ -185,8 +187,9 @@ def doubts_last_stamp(timestamp: float, history: History) -> bool:
 
 
 def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:
-    """What speaks against an image [H, W] and its depth by themselves, without any frame before. A scene may be near
-    then: of a whole run a depth of less than `DEPTH_RANGE` is told as well.
+    """Return the faults of an image [H, W] and its depth by themselves, without earlier frames.
+
+    A single scene may be nearer than `DEPTH_RANGE`, which the checks of a run report.
     """
     depths = some_of(depth)
     status, _ = _check_image(np.asarray(grey)[::ROW_STEP])
@@ -248,13 +251,13 @@ def _check_image(grey: np.ndarray) -> tuple[AlignmentStatus, float]:
 
 
 def _steps(grey: np.ndarray) -> tuple[int, int]:
-    """Rows and columns between the pixels of a thumbnail, which of a small image are nearer to each other."""
+    """Row and column strides between the pixels of a thumbnail; smaller for small images."""
     height, width = grey.shape
     return max(1, min(ROW_STEP, height // THUMBNAIL)), max(1, min(ROW_STEP**2, width // THUMBNAIL))
 
 
 def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray) -> bool:
-    """Whether much of an image is to the digit what it was, where there is something to see, and much of it is not."""
+    """Whether much of an image, among pixels beside edges, is exactly unchanged while much has changed."""
     rows, step = _steps(grey)
     beside = grey[::rows, min(ROW_STEP // 2, step - 1) :: step]
     columns = beside.shape[1]
@@ -267,13 +270,14 @@ def _is_part_frozen(grey: np.ndarray, thumbnail: np.ndarray, before: np.ndarray)
 
 
 def is_one_number(readings: np.ndarray) -> bool:
-    """Whether some readings of depth, or of its inverse, are all the same."""
+    """Whether readings of depth, or of its inverse, are all equal."""
     return bool(np.ptp(readings) <= FLAT * readings.max())
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
-    """Whether depth is the last frame's once more, though it claims to be of another moment. None at all is not; nor is
-    a wall that is seen from straight before it by an exact sensor, and has been since the first frame.
+    """Whether depth repeats the last frame's, though it claims to be of another moment.
+
+    An empty depth image doesn't count, nor does a flat wall that an exact sensor has faced since the first frame.
     """
     some, stamp = some_of(frame.depth), frame.depth_timestamp
     checksum = zlib.crc32(some.tobytes())
@@ -285,7 +289,7 @@ def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
 
 
 def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tuple[Finding, History]:
-    """Coverage and range of depth against what was usual."""
+    """Check the coverage and range of depth against what was usual."""
     readings = _readings(depth)
     coverage = readings.size / depth.size
     if coverage < MIN_DEPTH_SHARE:
@@ -311,7 +315,7 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
 
 
 def some_of(depth: np.ndarray) -> np.ndarray:
-    """Pixels from all over a depth image, in one row."""
+    """Return a sample of pixels from all over a depth image, flattened."""
     return np.asarray(depth).ravel()[::DEPTH_STEP]
 
 
@@ -320,7 +324,7 @@ def _readings(depth: np.ndarray) -> np.ndarray:
 
 
 def _is_finite(image: np.ndarray) -> np.ndarray:
-    """`np.isfinite`, which turns integers into floats first."""
+    """`np.isfinite` that skips integers, which it would convert to floats first."""
     return np.isfinite(image) if image.dtype.kind == "f" else np.ones((), bool)
 
 

@@ -1,4 +1,4 @@
-"""What a source of frames is, found by looking at it: for `gavo inspect`, and a line of it for every run."""
+"""Facts about a source of frames: in full for `gavo inspect`, and in one line for every run."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from gavo_jax.status import AlignmentStatus
 Facts = dict[str, Any]
 
 MAX_REASONS = 5
-"""Frames that cannot be read of which it is said why."""
+"""Largest number of unreadable frames whose reason is listed."""
 
 
 def summary(sequence: Sequence) -> str:
-    """One line: what the source is, how many frames, which camera and where from, and what depth is counted in.
+    """Describe a source in one line: its kind, number of frames, camera and that one's origin, and unit of depth.
 
-    Of a recording it names the topics of colour and depth; where the rate of frames rests on a guess, it says so.
+    For a recording it names the topics of colour and depth; if the frame rate is a guess, it says so.
     """
     camera, source = sequence.camera, _source(sequence)
     guess = source["times_guessed"] and f" at {_times(np.asarray(sequence.timestamps))['rate_hz'] or 0:.4g} frames/s"
@@ -37,24 +37,24 @@ def summary(sequence: Sequence) -> str:
 
 
 def unit_of(source: Facts) -> str:
-    """The unit of depth in words, and that it is a guess where nothing says it."""
+    """Return the unit of depth in words, marked as a guess if nothing states it."""
     doubt = ", a guess: say --depth-scale if it is another" if source["depth_unit_assumed"] else ""
     return f"{name_of_unit(source['depth_units_per_metre'])}{doubt}"
 
 
 def left_out(sequence: Sequence) -> list[str]:
-    """What lies in the source and makes no frame, and why, a line each."""
+    """List what in the source makes no frame, and why, a line each."""
     return list(getattr(sequence, "left_out", ()))
 
 
 def left_out_in_short(sequence: Sequence) -> str | None:
-    """How much of the source makes no frame, in a line; None where all does."""
+    """Summarise in a line how much of the source makes no frame; None if everything does."""
     counts = ", ".join(line.partition(": ")[0] for line in left_out(sequence))
     return f"left out: {counts}" if counts else None
 
 
 def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: None) -> Facts:
-    """Look at every frame and return what there is to know, as JSON has it; see docs/sources.md for the names.
+    """Examine every frame and return the facts, ready for JSON; docs/sources.md explains their names.
 
     Args:
         sequence: at least two frames.
@@ -164,7 +164,7 @@ def _camera(camera: Camera) -> Facts:
 
 
 def _recorded(sequence: Sequence) -> Facts | None:
-    """The cameras as they record, where the sequence tells."""
+    """Return the cameras before rectification, if the sequence gives them."""
     calibration = getattr(sequence, "calibration", None)
     if calibration is None:
         return None

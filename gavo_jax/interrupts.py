@@ -1,10 +1,10 @@
-"""Ctrl-C, at any moment of the command: one line on standard error, and exit status 130.
+"""Ctrl-C at any moment of the command: one line on standard error, and exit status 130.
 
-While modules are imported the process ends where it stands (`early`). From then on Ctrl-C is a KeyboardInterrupt, as in
-any program, with two additions. Where Python would drop it (in a finaliser, or a callback of the garbage collector) it
-is raised once more, and a compiler that cannot be interrupted is not waited for.
+While modules are imported the process ends at once (`early`). After that Ctrl-C is a KeyboardInterrupt, as in any
+program, with two additions. Where Python would drop it (in a finaliser, or a callback of the garbage collector) it is
+raised again, and a compiler that cannot be interrupted is not waited for.
 
-Only the command does so: in other people's programs nothing here is called.
+This applies to the command only; other programs are unaffected.
 """
 
 import contextlib
@@ -21,15 +21,15 @@ from gavo_jax import early
 R = TypeVar("R")
 
 AGAIN_AFTER = 0.02
-"""Seconds after which a dropped interrupt is raised again: the callback that dropped it is over by then."""
+"""Seconds after which a dropped interrupt is raised again: the callback that dropped it has ended by then."""
 
 _came = False
-"""Whether Ctrl-C came."""
+"""Whether Ctrl-C was pressed."""
 
 
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
-    """Let Ctrl-C be a KeyboardInterrupt while the block runs; after it the command ends in peace."""
+    """Let Ctrl-C raise KeyboardInterrupt while the block runs; after it the command ignores Ctrl-C."""
     before = signal.getsignal(signal.SIGINT)
     is_ours = before is early.end
     if threading.current_thread() is not threading.main_thread() or not (
@@ -59,9 +59,9 @@ def raised() -> Iterator[None]:
 
 
 def leave(status: int) -> None:
-    """End the process if it is the command's and Ctrl-C came: at once, as threads of compilers may still be at work.
+    """End the command's process at once if Ctrl-C was pressed, as compiler threads may still be running.
 
-    The interpreter would wait for them, or take the ground from under their feet.
+    A normal exit would wait for them, or free what they still use.
     """
     if early.is_ours and _came:
         for stream in (sys.stdout, sys.stderr):
@@ -71,24 +71,24 @@ def leave(status: int) -> None:
 
 
 def came() -> bool:
-    """Whether Ctrl-C came in the last `raised` block."""
+    """Whether Ctrl-C was pressed in the last `raised` block."""
     return _came
 
 
 def ignore() -> None:
-    """Take no notice of Ctrl-C any more in a `raised` block: it came, and what is left to do is short."""
+    """Ignore further Ctrl-C in a `raised` block: it was pressed, and little is left to do."""
     if signal.getsignal(signal.SIGINT) is _raise:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def interruptible(work: Callable[[], R]) -> R:
-    """Return what a function returns that is busy in compiled code for long; Ctrl-C does not wait for its end.
+    """Call a function that spends long in compiled code, without making Ctrl-C wait for its end.
 
-    It runs in a thread of its own in a `raised` block, and as any call elsewhere.
+    In a `raised` block it runs in its own thread; elsewhere this is a plain call.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C. The function goes on as long as the process does: it must write nothing but what is
-            written whole.
+        KeyboardInterrupt: Ctrl-C was pressed. The function keeps running until the process ends, so it must write files
+            atomically only.
     """
     if signal.getsignal(signal.SIGINT) is not _raise or threading.current_thread() is not threading.main_thread():
         return work()
@@ -116,7 +116,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 
 def _send_again() -> None:
-    """Send the signal again, to the main thread, which it wakes where it waits."""
+    """Send the signal again, to the main thread, and wake it if it is waiting."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     else:

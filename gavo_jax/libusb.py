@@ -1,4 +1,4 @@
-"""Libraries that link to libusb, on systems that lack it: that of the package libusb-package is loaded first."""
+"""Import of libraries that link to libusb; on systems that lack it, that of the package libusb-package is loaded."""
 
 import ctypes
 import importlib
@@ -9,7 +9,7 @@ from gavo_jax.errors import GavoError
 
 
 def import_with_libusb(name: str) -> Any:
-    """Import a library, if need be with the package's libusb; its warnings are not shown.
+    """Import a library, if necessary with libusb-package's libusb; warnings of the import are suppressed.
 
     Raises:
         ImportError: it cannot be imported.
@@ -26,7 +26,7 @@ def import_with_libusb(name: str) -> Any:
 
 
 def import_open3d(extra: str) -> Any:
-    """Open3D, of one of this package's extras.
+    """Import Open3D, which is part of one of this package's extras.
 
     Raises:
         GavoError: it cannot be imported.
@@ -38,7 +38,7 @@ def import_open3d(extra: str) -> Any:
 
 
 def _load_libusb(error: ImportError) -> None:
-    """Load the package's library for all that come later; raise `error` where there is none."""
+    """Load libusb-package's library for all later imports; raise `error` if there is none."""
     try:
         path = importlib.import_module("libusb_package").get_library_path()
         if path is None:

@@ -1,7 +1,7 @@
-"""A folder that one process at a time writes to.
+"""A lock that lets one process at a time write to a folder.
 
-The lock is the operating system's, on a file in the folder. It ends with its process, however that ends, so that
-nothing is ever judged by its age or by a process number; over NFS other hosts heed it too.
+It is the operating system's lock on a file in the folder. It ends with its process, however that ends, so staleness is
+never guessed from age or process id. Over NFS other hosts respect it, too.
 """
 
 import contextlib
@@ -20,17 +20,17 @@ except ImportError:  # Windows
     fcntl = None
 
 LOCK = ".gavo.lock"
-"""In a folder that is written to. A process that is killed leaves it; it then holds nobody up."""
+"""Name of the locked file. A killed process leaves the file behind, which then blocks nobody."""
 MAX_HOLDER = 200
 
 
 @contextlib.contextmanager
 def hold(folder: str | Path, name: str = LOCK) -> Iterator[None]:
-    """Be the only process that writes to a folder while the block runs.
+    """Hold the lock of a folder while the block runs.
 
     Args:
-        folder: It exists. Where its file system has no locks, a warning says so and the block runs without.
-        name: Of the file that is locked; locks of different names do not know of each other.
+        folder: An existing folder. If its file system has no locks, a warning says so and the block runs unlocked.
+        name: Name of the locked file; locks of different names are independent.
 
     Raises:
         GavoError: another process (or another block of this one) holds the folder, or the file cannot be made.
@@ -52,7 +52,7 @@ def hold(folder: str | Path, name: str = LOCK) -> Iterator[None]:
 
 
 def _take(path: Path) -> int | None:
-    """Return the open file that is locked; None where somebody else has it."""
+    """Return the descriptor of the locked file; None if it is locked elsewhere."""
     while True:
         file = _open(path)
         try:
@@ -64,19 +64,19 @@ def _take(path: Path) -> int | None:
         except BaseException:
             os.close(file)
             raise
-        os.close(file)  # the one who had it has just removed it
-    with contextlib.suppress(OSError):  # only words: a full disk does not matter
+        os.close(file)  # its last holder has just removed it
+    with contextlib.suppress(OSError):  # for information only: a full disk does not matter
         os.ftruncate(file, 0)
         os.pwrite(file, f"process {os.getpid()} on {platform.node()}".encode(), 0)
     return file
 
 
 def _open(path: Path) -> int:
-    """Open the file, and make it where it is missing; no link is followed."""
+    """Open the file, creating it if missing; links are not followed."""
     careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | careful, 0o644)
-    except PermissionError:  # left by another user's process that was killed: reading is enough to lock it
+    except PermissionError:  # left by another user's killed process: reading is enough to lock it
         file = os.open(path, os.O_RDONLY | careful)
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
@@ -99,7 +99,7 @@ def _lock(path: Path, file: int) -> bool:
 
 
 def _is_still(path: Path, file: int) -> bool:
-    """Whether the open file is the one that others find under its name."""
+    """Whether the open file is still the one at its path."""
     try:
         return os.path.samestat(os.lstat(path), os.fstat(file))
     except FileNotFoundError:
@@ -107,7 +107,7 @@ def _is_still(path: Path, file: int) -> bool:
 
 
 def _holder(path: Path) -> str:
-    """Who wrote into the lock, in brackets."""
+    """Return the holder that the lock file names, in brackets."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             words = file.read(MAX_HOLDER).strip()

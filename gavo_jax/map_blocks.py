@@ -1,5 +1,7 @@
-"""Which blocks of voxels a frame touches, as Open3D finds them: it looks at one pixel of many, and a map has holes
-where these have no reading, or where several blocks lie between two of them.
+"""Depth images in which Open3D finds all the voxel blocks that a frame touches.
+
+It samples one pixel of many, which leaves holes in the map where a sampled pixel has no reading, or where several
+blocks lie between two samples.
 """
 
 from dataclasses import replace
@@ -13,11 +15,11 @@ from gavo_jax.camera import Camera
 BLOCK = 8
 """Voxels along the side of a block."""
 MOST_BLOCKS = 100_000
-"""Blocks that a map may have, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
+"""Largest number of blocks of a map, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
 LOOKED_AT = 4
-"""Pixels along either axis of which Open3D looks at one to find the blocks that a frame touches."""
+"""Stride, along either axis, of the pixels that Open3D samples to find a frame's blocks."""
 MOST_ENLARGED = 16
-"""Factor by which an image is enlarged for that, at most."""
+"""Largest factor by which an image is enlarged for that."""
 
 
 def image_for_blocks(
@@ -27,8 +29,8 @@ def image_for_blocks(
 
     Args:
         metres: The frame's depth, 0 = no reading.
-        camera: The frame's, without distortion.
-        voxel: Side, metres.
+        camera: The frame's camera, without distortion.
+        voxel: Side of a voxel, metres.
     """
     filled = with_looked_at_filled(metres)
     apart = LOOKED_AT * float(metres.max()) / min(float(camera.fx), float(camera.fy))
@@ -41,8 +43,9 @@ def image_for_blocks(
 
 
 def with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth with a reading in every pixel in which Open3D looks for blocks, each fourth of each fourth row, if there is
-    one near it: a sensor may leave out just those rows.
+    """Fill the pixels that Open3D samples, each fourth of each fourth row, from a reading near them.
+
+    A sensor may leave out exactly those rows.
     """
     filled, looked_at = metres.copy(), np.s_[::LOOKED_AT, ::LOOKED_AT]
     near = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[looked_at]

@@ -1,4 +1,4 @@
-"""Named settings: what `--method` and `--preset` stand for, and how a method of one's own gets a name."""
+"""Named settings: what `--method` and `--preset` stand for, and registration of custom methods."""
 
 import re
 from functools import cache
@@ -20,7 +20,7 @@ from gavo_jax.solvers.particle_swarm import ParticleSwarm
 METHODS = ("ga", "pso", "gauss-newton", "adam")
 PRESETS = ("default", "paper", "fast", "wide")
 PLUGINS = "gavo_jax.solvers"
-"""Group of entry points: a package's settings or solvers by the names of their methods."""
+"""Group of entry points through which packages provide settings or solvers, by method name."""
 
 
 PAPER_OBJECTIVE = AlignmentOptions(
@@ -35,16 +35,16 @@ PAPER_OBJECTIVE = AlignmentOptions(
     bounds=(0.06, 0.06),
     bounds_factor=0.5,
 )
-"""The paper's error on every pixel, ξ searched as it is. Left open there and fixed here: the bounds, ±6 cm and ±0.06
-rad (3.4°) a gene about the guess at level 4, halved from level to level about the last level's best; a candidate must
-keep half of the points in view."""
+"""The paper's error on every pixel, searched in ξ itself. The paper leaves open what is fixed here: a candidate must
+keep half of the points in view, and the bounds are ±6 cm and ±0.06 rad (3.4°) per gene. They hold about the guess at
+level 4, and are halved at each finer level about the last level's best."""
 
 
 def _paper_solver(method: str) -> Any:
-    """The paper's methods, pyramid levels 4 to 0.
+    """Return a method's solver as in the paper, on pyramid levels 4 to 0.
 
-    Left open there and fixed here: 40 chromosomes, 40 generations at level 4 falling to 8 at level 0, a level ends
-    after 8 generations without progress, half-width 0.25 of the crossover's extra range. The swarm gets as many
+    The paper leaves open what is fixed here: 40 chromosomes; 40 generations at level 4 falling to 8 at level 0; 8
+    generations without progress end a level; half-width 0.25 of the crossover's extra range. The swarm gets as many
     evaluations.
     """
     population, iterations, patience = (40,) * 5, (8, 12, 20, 30, 40), 8
@@ -82,7 +82,7 @@ _FAST = {
 }
 
 _FAST_POINTS = (4800, 4800, 1200, 1200, 1200)
-"""The finest level decides how far the result is off; on the coarser ones a quarter of its points do as well."""
+"""The finest level decides the accuracy; on the coarser ones a quarter of its points are enough."""
 
 _WIDE = {
     "ga": GeneticAlgorithm(
@@ -111,31 +111,29 @@ WIDE_OBJECTIVE = AlignmentOptions(
     outside_cost=1.0,
     bounds=(1.0, 1.7),
 )
-"""Motions of up to 1 m and 97° from the guess: thousands of scouts, then 96 populations at level 4, of which the 16
-that most speaks for go on to level 3 and 4 are refined; beside them what the features of a single pair ask for. A point
-out of view costs as much as a typical one in view, so that leaving the view neither pays nor is shunned. Exposure
-changes over such motions, so residuals are taken about their mean. Once a mode is refined, grey alone tells its
-neighbours apart badly and depth counts as much; at the finest levels, which decide how far the result is off, less.
-Over a wide baseline one frame may be blurred and each sees what the other does not, so both directions count, on more
-points than tracking takes."""
+"""For motions of up to 1 m and 97° from the guess. Thousands of scouts start 96 populations at level 4. The 16 with the
+most evidence go on to level 3 and 4 are refined, beside the motions that a single pair's features suggest. A point out
+of view costs as much as a typical one in view, so that leaving the view is neither rewarded nor punished. Exposure
+changes over such motions, so residuals are taken about their mean. Close to a mode grey alone separates motions badly,
+so depth counts as much; at the finest levels, which decide the accuracy, less. Over a wide baseline one frame may be
+blurred and each sees what the other doesn't, so both directions count, on more points than tracking takes."""
 
 
 _registered: dict[str, Settings] = {}
 
 
 def register(method: str, settings: Settings | Solver) -> None:
-    """Give a method of one's own a name: for `preset`, in experiment files and on the command line.
+    """Register a custom method by name, for `preset`, experiment files and the command line.
 
-    A package that is installed can do without a call: an entry point of the group `gavo_jax.solvers` has the method's
-    name and leads to its settings or solver.
+    An installed package needs no call: an entry point in the group `gavo_jax.solvers`, named after the method, leads to
+    its settings or solver.
 
     Args:
-        method: Small letters, digits and hyphens. A name that is registered again gets the new settings.
-        settings: Those of its preset `default`, the only one that it has; a solver stands for the default settings with
-            that solver.
+        method: Small letters, digits and hyphens. Registering a name again replaces its settings.
+        settings: Settings of its only preset, `default`; a solver stands for the default settings with that solver.
 
     Raises:
-        GavoError: The name is another's, or none.
+        GavoError: The name is a built-in method's or malformed, or `settings` is None.
     """
     if not isinstance(method, str) or method in METHODS or not re.fullmatch("[a-z][a-z0-9-]*", method):
         raise GavoError(f"{method!r} cannot be the name of a method of one's own")
@@ -145,25 +143,25 @@ def register(method: str, settings: Settings | Solver) -> None:
 
 
 def methods() -> tuple[str, ...]:
-    """All methods that go by a name: `METHODS`, those that were registered, those of packages that cannot be loaded."""
+    """Return the names of all methods: `METHODS`, registered ones, and those of packages that cannot be loaded."""
     known = usable_methods()
     return (*known, *(name for name in faulty_plugins() if name not in known))
 
 
 def usable_methods() -> tuple[str, ...]:
-    """The methods that have settings: `methods()` without those of packages that cannot be loaded."""
+    """Return the methods that have settings: `methods()` without those of packages that cannot be loaded."""
     faulty_plugins()
     return (*METHODS, *_registered)
 
 
 def plugin_names() -> tuple[str, ...]:
-    """Names of the methods that installed packages bring; their code is not loaded."""
+    """Return the names of the methods that installed packages provide, without loading their code."""
     return tuple(sorted(entry.name for entry in entry_points(group=PLUGINS)))
 
 
 @cache
 def faulty_plugins() -> dict[str, str]:
-    """Register what installed packages bring; what is wrong with those that cannot be loaded, by the method's name."""
+    """Register the methods of installed packages; return why some cannot be loaded, by the method's name."""
     faults = {}
     for entry in entry_points(group=PLUGINS):
         try:
@@ -175,11 +173,11 @@ def faulty_plugins() -> dict[str, str]:
 
 
 def preset(method: str = "ga", name: str = "default") -> Settings:
-    """The settings that a method and a preset name stand for.
+    """Return the settings of a method's preset.
 
     Args:
         method: One of `methods()`.
-        name: One of `PRESETS`; a method that was registered has `default` alone.
+        name: One of `PRESETS`; a registered method has `default` alone.
             `default`: preconditioned coordinates, robust grey and depth error, levels 4 to 1.
             `paper`: as printed, levels 4 to 0, frame to frame. `fast`: fewer pixels and candidates. `wide`: many
             independent populations at the coarsest level, for motions of tens of degrees.
@@ -201,10 +199,10 @@ def preset(method: str = "ga", name: str = "default") -> Settings:
 
 
 def names_of(settings: Settings) -> tuple[str | None, str | None]:
-    """The method and the preset that settings go by; `preset` the other way round.
+    """Return the method and the preset of settings; the inverse of `preset`.
 
-    Settings that differ from every preset have none, and the method of their solver. A solver of one's own that was not
-    registered is no method.
+    Settings that differ from every preset have no preset, and the method of their solver. A custom solver that was not
+    registered has no method either.
     """
     known = {(method, name): _own(method, name) for method in METHODS for name in PRESETS}
     known |= {(method, "default"): own for method, own in _registered.items()}
@@ -215,7 +213,7 @@ def names_of(settings: Settings) -> tuple[str | None, str | None]:
 
 
 def are_same(one: Settings, other: Settings) -> bool:
-    """Whether settings are the same, arrays among them included."""
+    """Whether settings are equal, including arrays in them."""
     leaves, others = jax.tree.leaves(one), jax.tree.leaves(other)
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, leaves, others))
 

@@ -1,4 +1,4 @@
-"""Rigid motions in double precision on the host, as chains and graphs of many need them; `se3` is for the device."""
+"""Rigid motions in double precision on the host, for long chains and pose graphs; `se3` is for the device."""
 
 import numpy as np
 from jaxtyping import Float64

@@ -1,7 +1,7 @@
-"""A map of what a run saw: depth and colour fused into a signed distance field, out of which come a cloud or a mesh.
+"""The scene map of a run: depth and colour fused into a signed distance field, extracted as a point cloud or a mesh.
 
-Open3D does the work (extra `[map]`): a sparse grid of voxels (Curless and Levoy 1996; blocks in a hash map, as of
-Nießner et al. 2013), into which frames go one by one, so that memory grows with the surface seen, not with the frames.
+Open3D does the work (extra `[map]`). Frames are fused one by one into a sparse voxel grid (Curless and Levoy 1996; with
+hashed blocks, as in Nießner et al. 2013). Memory grows with the surface seen, not with the number of frames.
 """
 
 import contextlib
@@ -33,23 +33,23 @@ from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 Shape = Literal["cloud", "mesh"]
 
 ENDINGS: dict[str, tuple[Shape, ...]] = {".ply": ("cloud", "mesh"), ".pcd": ("cloud",), ".obj": ("mesh",)}
-"""What a file of each ending can hold; the first is written where nothing is said."""
+"""Shapes that a file with each ending can hold; the first is the default."""
 
 LARGEST = {".ply": (51, 13), ".pcd": (28, 0), ".obj": (120, 70)}
-"""Bytes that a point or vertex, and a triangle, take at most in a file of each ending."""
+"""Largest size of a point or vertex, and of a triangle, in a file with each ending, bytes."""
 
 VOXEL = 0.01
-"""Metres."""
+"""Default side of a voxel, metres."""
 SMALLEST_VOXEL, LARGEST_VOXEL = 1e-3, 1.0
 
 TRUNCATION = 6.0
-"""Voxels before and behind a surface that know their distance from it."""
+"""Truncation distance of the field before and behind a surface, voxels."""
 
 FARTHEST = 4.0
-"""Metres: beyond, the noise of a structured-light or stereo camera exceeds several voxels."""
+"""Default range of depth, metres: beyond it the noise of a structured-light or stereo camera exceeds several voxels."""
 
 OFF_THE_GRID = 1.000001
-"""Factor on depth: a surface that lies exactly on voxels would have no side for Open3D."""
+"""Factor on depth that moves surfaces off the voxels: Open3D cannot tell the sides of one that lies exactly on them."""
 
 MIN_WEIGHT = 3.0
 """Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
@@ -57,15 +57,15 @@ MIN_WEIGHT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class SceneMap:
-    """What a run saw, in its world: that of the first camera of its segment, metres.
+    """Map of a segment of a run, in the frame of the segment's first camera, metres.
 
     Attributes:
-        points: of the cloud, or the vertices of the mesh.
+        points: points of the cloud, or vertices of the mesh.
         colors: RGB of each; grey where the sequence was opened without colour.
         normals: unit vectors, towards where the camera was.
-        triangles: three indices of vertices each; None of a cloud.
-        frames: that went into it.
-        left_out: why others did not, one line each.
+        triangles: three vertex indices each; None for a cloud.
+        frames: number of frames fused.
+        left_out: what was left out and why, one line each.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -77,14 +77,14 @@ class SceneMap:
 
     @property
     def shape(self) -> Shape:
-        """What it is."""
+        """Whether the map is a cloud or a mesh."""
         return "cloud" if self.triangles is None else "mesh"
 
     def write(self, path: str | Path) -> None:
-        """Write it, whole or not at all: a cloud as `.ply` or `.pcd`, a mesh as `.ply` or `.obj`.
+        """Write the map atomically: a cloud as `.ply` or `.pcd`, a mesh as `.ply` or `.obj`.
 
         Raises:
-            GavoError: another ending, there is nothing in it, or the file cannot be written.
+            GavoError: unsuitable ending, empty map, or the file cannot be written.
         """
         path = Path(path)
         check_map(path, self.shape)
@@ -92,7 +92,7 @@ class SceneMap:
             raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
         open3d = import_open3d("map")
         vector = open3d.utility.Vector3dVector
-        partial = path.with_name(partial_of(path).name + path.suffix.lower())  # which Open3D goes by
+        partial = path.with_name(partial_of(path).name + path.suffix.lower())  # Open3D goes by the suffix
         if self.triangles is None:
             cloud: Any = open3d.geometry.PointCloud(vector(self.points))
             cloud.colors, cloud.normals = vector(self.colors / 255.0), vector(self.normals)
@@ -116,10 +116,10 @@ class SceneMap:
 
 
 def _take_room(path: Path, points: int, triangles: int) -> None:
-    """Make a file that is as large as a map's, where the system can; Open3D does not notice a full disk.
+    """Reserve the disk space of a map's file, if the system can; Open3D does not notice a full disk.
 
     Raises:
-        OSError: there is no room.
+        OSError: there is not enough space.
     """
     of_point, of_triangle = LARGEST[path.suffix]
     with path.open("xb") as file:
@@ -128,18 +128,18 @@ def _take_room(path: Path, points: int, triangles: int) -> None:
 
 
 class MapBuilder:
-    """Takes frames with their poses, one by one; of those it keeps nothing but the field."""
+    """Fuses frames with their poses, one by one; it keeps only the field, not the frames."""
 
     def __init__(self, camera: Camera, voxel: float = VOXEL, farthest: float = FARTHEST) -> None:
         """Make an empty field.
 
         Args:
-            camera: of the frames; where it has lens distortion, that is taken out of every frame.
-            voxel: side, metres.
-            farthest: depth beyond is left out, metres.
+            camera: camera of the frames; any lens distortion is removed from every frame.
+            voxel: side of a voxel, metres.
+            farthest: depth beyond this is left out, metres.
 
         Raises:
-            GavoError: what is no camera, an absurd voxel, or Open3D cannot be imported.
+            GavoError: not a camera, voxel size out of range, or Open3D cannot be imported.
         """
         check_voxel(voxel)
         require_camera(camera)
@@ -158,12 +158,12 @@ class MapBuilder:
         """Fuse one more frame.
 
         Args:
-            frame: of the camera that the map was made for; its `color` is used where it has one.
+            frame: frame of the map's camera; its `color` is used if it has one.
             world_T_camera: its pose; the map is in that world, metres.
 
         Raises:
             FrameError: an image is not of the camera's size.
-            GavoError: the pose is no 4x4 matrix of a rigid motion.
+            GavoError: the pose is not a 4x4 matrix of a rigid motion.
         """
         image, core = self._open3d.t.geometry.Image, self._open3d.core
         world_T_camera = np.asarray(world_T_camera)
@@ -190,7 +190,7 @@ class MapBuilder:
             self._grid.integrate(blocks, depth, color, self._intrinsic, self._intrinsic, extrinsic, *reach)
 
     def _within_memory(self, blocks: Any, place: Float[np.ndarray, " 3"]) -> Any:
-        """Blocks that may be touched: beyond the largest number those that are there, and of the others the nearest."""
+        """Limit the blocks to touch to `MOST_BLOCKS` in all: existing ones, and the nearest new ones."""
         table = self._grid.hashmap()
         room = MOST_BLOCKS - table.size()
         if len(blocks) <= room:
@@ -205,10 +205,10 @@ class MapBuilder:
         return self._open3d.core.Tensor(np.concatenate([numbers[known], nearest]))
 
     def extract(self, shape: Shape = "cloud", left_out: Iterable[str] = ()) -> SceneMap:
-        """The surface as a cloud or a mesh; empty where nothing was seen often enough.
+        """Extract the surface as a cloud or a mesh; empty if nothing was seen often enough.
 
         Raises:
-            GavoError: another shape.
+            GavoError: unknown shape.
         """
         check_shape(shape)
         weight = min(MIN_WEIGHT, max(0.0, self.frames - 1))
@@ -231,23 +231,24 @@ class MapBuilder:
 
 
 class LiveMap:
-    """A map of frames that come once: those of a run's first segment are fused as they are tracked. It begins with the
-    first frame that the next one can be aligned with.
+    """A map built while tracking, from frames that are available only once: those of the run's first segment.
+
+    It begins with the first frame that the next one can be aligned with.
 
     Args:
-        builder: what fuses them.
+        builder: fuses the frames.
     """
 
     def __init__(self, builder: MapBuilder) -> None:
         self._builder = builder
         self._reasons: Counter[str] = Counter()
         self._first: tuple[Frame, np.ndarray, int] | None = None
-        """The first frame, until the next one tells whether it is any good, with its pose and segment."""
+        """The first frame, with its pose and segment, until the next one shows whether it is usable."""
         self._segment: int | None = None
-        """The map's; None before it has begun."""
+        """Segment of the map; None before it has begun."""
 
     def watch(self, frame: Frame, step: Step | None) -> None:
-        """Take one more frame; no step: it is the first."""
+        """Process one more frame; `step` is None for the first."""
         if step is None:
             self._first = frame, np.eye(4), 0
             return
@@ -271,7 +272,7 @@ class LiveMap:
             self._first = None
 
     def finish(self, shape: Shape) -> SceneMap:
-        """The map."""
+        """Return the map."""
         self._begin()
         return self._builder.extract(shape, _left_out(self._reasons))
 
@@ -281,7 +282,7 @@ ELSEWHERE, UNREADABLE = "of another segment", "unreadable"
 
 
 def _why_not(step: Step) -> str | None:
-    """Why a step's frame is no part of a map of its segment; None: it is."""
+    """Return why a step's frame is left out of its segment's map; None if it isn't."""
     if step.lost:
         return LOST
     return GUESSED if step.origin == "guessed" else None if step.depth_is_trusted else DOUBTED
@@ -301,24 +302,24 @@ def build_map(
     moving: Moving = seen_moving,
     on_frame: Callable[[], None] = lambda: None,
 ) -> SceneMap:
-    """Fuse the frames of a run, read once more, one at a time.
+    """Fuse the frames of a run into a map, reading them again one at a time.
 
-    Between two segments of a run the motion is unknown, so that they are no part of one map: that of most frames is
-    returned. A frame that was lost, whose pose is a guess, whose depth is in doubt, or that cannot be read, is left
-    out, and so is of each frame what moves on its own.
+    The motion between two segments of a run is unknown, so only the segment with the most frames is mapped. Frames that
+    were lost, have a guessed pose or doubtful depth, or cannot be read are left out. So are the moving bodies in each
+    frame.
 
     Args:
-        sequence: the run's; with `Reading(color=True)` the map has colours, else it is grey.
-        steps: the run's.
+        sequence: sequence of the run; with `Reading(color=True)` the map has colours, else it is grey.
+        steps: steps of the run.
         shape: cloud or mesh.
-        voxel: side, metres.
-        farthest: depth beyond is left out, metres.
-        trajectory: the poses where they are not the steps' own any more: loops have corrected them.
-        moving: where bodies are in the frame of a step.
+        voxel: side of a voxel, metres.
+        farthest: depth beyond this is left out, metres.
+        trajectory: poses to use instead of the steps' own, if loop closures have corrected them.
+        moving: gives the mask of moving bodies in a step's frame.
         on_frame: called for each frame.
 
     Raises:
-        GavoError: what is no sequence, another shape, an absurd voxel, or Open3D cannot be imported.
+        GavoError: not a sequence, unknown shape, voxel size out of range, or Open3D cannot be imported.
     """
     check_shape(shape)
     require_sequence(sequence)
@@ -328,7 +329,7 @@ def build_map(
     reasons: Counter[str] = Counter()
     for step in steps:
         world_T_camera, segment = corrected.of(step)
-        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were fit for nothing
+        if step.alignment.status is AlignmentStatus.NO_REFERENCE:  # the frames before were unusable
             reasons[LOST] += len(places)
             places.clear()
         if (why := _why_not(step)) is not None:
@@ -352,8 +353,9 @@ def build_map(
 
 
 class _PosesInOrder:
-    """The poses and segments of steps that a trajectory has, asked in the steps' order: a stamp may come again, once a
-    clock was set back.
+    """Looks up the poses and segments of steps in a trajectory, in the steps' order.
+
+    Stamps may repeat if a clock was set back.
     """
 
     def __init__(self, trajectory: Trajectory | None, first: float) -> None:
@@ -364,24 +366,24 @@ class _PosesInOrder:
             stamp, pose, segment = row
             self._left.setdefault(stamp_name(stamp), deque()).append((pose, int(segment)))
         if len(trajectory) and stamp_name(trajectory.timestamps[0]) == stamp_name(first):
-            self._left[stamp_name(first)].popleft()  # the first frame's, which no step has
+            self._left[stamp_name(first)].popleft()  # the first frame's, which has no step
 
     def of(self, step: Step) -> tuple[np.ndarray, int]:
-        """What the trajectory has for the next step, or the step itself."""
+        """Return the pose and segment of the next step: the trajectory's, or the step's own."""
         left = self._left.get(stamp_name(step.timestamp))
         has_pose = step.alignment.status is not AlignmentStatus.BAD_TIMESTAMP  # see `run.trajectory_of`
         return left.popleft() if left and has_pose else (step.world_T_camera, step.segment)
 
 
 def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
-    """What is to be written into a file, by its ending.
+    """Return the shape to write into a file, checked against its ending.
 
     Args:
-        path: of the file.
-        shape: what is wanted; None: what the ending stands for.
+        path: path of the file.
+        shape: the shape that is wanted; None for the ending's default.
 
     Raises:
-        GavoError: an unknown ending, or one that cannot hold that.
+        GavoError: unknown ending, or one that cannot hold the shape.
     """
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
@@ -395,13 +397,13 @@ def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
 
 
 def check_shape(shape: str) -> None:
-    """Raise GavoError for what a map cannot be."""
+    """Raise GavoError for an unknown shape."""
     if shape not in ("cloud", "mesh"):
         raise GavoError(f"shape: cloud or mesh, not {shape!r}")
 
 
 def check_voxel(voxel: float) -> None:
-    """Raise GavoError for a voxel that no map can have."""
+    """Raise GavoError for a voxel size that is not a number in the allowed range."""
     is_number = isinstance(voxel, int | float | np.integer | np.floating) and not isinstance(voxel, bool)
     if not is_number or not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
         raise GavoError(f"voxel: must be from {SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m, not {voxel!r}")

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float, Float64
 def exp(xi: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
     """g(ξ) = exp(ξ̂) of a twist ξ = (v, w), translation (m) first, rotation in radians. Equation (3).
 
-    With θ = |w| the series ends: I + ξ̂ + (1 − cos θ)/θ² ξ̂² + (θ − sin θ)/θ³ ξ̂³ (Murray, Li and Sastry 1994). A frame's
-    program needs it in many places, so it is written in few operations: each is a kernel to compile.
+    With θ = |w| it has the closed form I + ξ̂ + (1 − cos θ)/θ² ξ̂² + (θ − sin θ)/θ³ ξ̂³ (Murray, Li and Sastry 1994). The
+    compiled program uses it in many places, so it is written in few operations: each is a kernel to compile.
     """
     hat = jnp.sum(GENERATORS * xi[..., None, None, :], axis=-1)
     angle = jnp.sqrt(jnp.maximum(jnp.sum(xi[..., 3:] ** 2, axis=-1), SMALL_ANGLE**2))[..., None, None]
@@ -25,7 +25,7 @@ def _product(a: Float[Array, "*batch i j"], b: Float[Array, "*batch j k"]) -> Fl
 
 
 SMALL_ANGLE = 0.01
-"""Radians: below, the coefficients of `exp` are as good as constant."""
+"""Angle below which the coefficients of `exp` are treated as constant, radians."""
 
 
 def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
@@ -73,8 +73,10 @@ def _cross(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndarray, "*batch 4 4"]:
-    """A motion that was computed in float32, in double precision and with its rotation made orthonormal: the nearest
-    one (Kabsch 1976), so that chains of motions stay rigid. What is not finite stays as it is.
+    """Convert a motion from float32 to double precision, with its rotation made orthonormal.
+
+    The nearest rotation is taken (Kabsch 1976), so that chains of motions stay rigid. Motions that are not finite stay
+    as they are.
     """
     result = np.array(transform, np.float64)
     finite = np.isfinite(result).all(axis=(-2, -1), keepdims=True)
@@ -84,13 +86,13 @@ def rigid(transform: Float[Array | np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
 
 
 ROUNDED = 0.01
-"""Largest entry of RᵀR − I that rounded numbers leave."""
+"""Largest entry of RᵀR − I that is attributed to rounding."""
 
 
 def is_rigid(
     matrices: Float[np.ndarray, "*batch 4 4"], tolerance: float = ROUNDED
 ) -> Bool[np.ndarray, " *batch"] | np.bool_:
-    """Whether numbers, rounded as they may be, are those of a rotation and a translation, above 0 0 0 1, and finite."""
+    """Whether matrices are finite and, up to rounding, a rotation and a translation above 0 0 0 1."""
     matrices = np.asarray(matrices, np.float64)
     rotations, last = matrices[..., :3, :3], matrices[..., 3, :]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,6 +1,6 @@
-"""All that decides a result beside the frames, as one value: what searches, what is minimised, how it is used.
+"""Everything besides the frames that decides a result, as one value: solver, objective, and their use in odometry.
 
-A change is `dataclasses.replace`; `presets` has named ones, `settings_file` reads and writes them.
+Change settings with `dataclasses.replace`; `presets` has named ones, `settings_file` reads and writes them.
 """
 
 import warnings
@@ -28,14 +28,15 @@ class AlignmentOptions:
         centred: Whether, while the motion is undecided, each candidate's grey residuals are taken about their own mean
             (static); see `Objective`.
         symmetric: Whether the target's points, seen from the reference, count as much as the reference's (static).
-        refine: Whether candidates are chosen by the evidence for them instead of by E, and the best ones are taken
-            through all levels by Gauss-Newton, with the brightness and scales that are known only then (static). The
-            solver stops where islands no longer compete. See `alignment.contest`.
-        features: What finds the features of two images whose motion competes with what the search finds, where `refine`
-            is set (static). Of single pairs alone (`align`), not of a sequence's frames.
-        robust_scale: Whether the losses' scales come from the data; without it σ = 1 and depth has no say: the paper's
-            error (static).
-        precondition: Search in the coordinates of `objective.preconditioning.preconditioner` instead of in ξ (static).
+        refine: Whether candidates are chosen by the evidence for them instead of by E, and the best ones are refined
+            through all levels by Gauss-Newton, with brightness and scales estimated there (static). The solver stops
+            where islands no longer compete. See `alignment.contest`.
+        features: Features of two images whose motion competes with those found by the search, where `refine` is set
+            (static). For single pairs only (`align`), not for a sequence's frames.
+        robust_scale: Whether the losses' scales are estimated from the data; without it σ = 1 and depth has no weight:
+            the paper's error (static).
+        precondition: Whether to search in the coordinates of `objective.preconditioning.preconditioner` instead of in
+            ξ (static).
         points: Largest number of reference points per level, one per square block of pixels, or an entry per level
             (static); None takes every pixel.
         estimation_points: Largest number of points per view from which brightness, scales and curvature are estimated
@@ -45,12 +46,12 @@ class AlignmentOptions:
         islands: Independent populations, an entry per level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry per
             level.
-        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where its residuals
-            err by whole surfaces (static); see `objective.estimates.depth_trust`.
-        last_step: Whether the motion that the search ends with is taken one Newton step further, with the slope and the
-            curvature of E that its covariance is made of (static); Le Cam's one-step estimate. Candidates that are
-            only evaluated end scattered about the minimum; this centres them. Not where the error is `symmetric`: slope
-            and curvature are known of one direction alone.
+        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where whole surfaces
+            have wrong depth residuals (static); see `objective.estimates.depth_trust`.
+        last_step: Whether the motion that the search ends with takes one more Newton step, with the gradient and
+            Hessian of E that also give its covariance (static); Le Cam's one-step estimate. Sampled candidates end
+            scattered about the minimum; this centres them. Not done where the error is `symmetric`: the derivatives
+            cover one direction only.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             Where it is None, and on levels that refine a single motion, such a point does not count: the paper's error.
@@ -93,22 +94,22 @@ class OdometryOptions:
     Attributes:
         reference: What a new frame is aligned with: the previous frame alone, or the previous frame and a keyframe
             at once, their points scored together.
-        keyframe_overlap: Part of the keyframe's points that is still in view when they are replaced by a newer frame's;
-            the mean over its shares, see `odometry.tracking.renew_keyframe`.
+        keyframe_overlap: Share of the keyframe's points in view below which they are replaced by a newer frame's; the
+            mean over the keyframe's parts, see `odometry.tracking.renew_keyframe`.
         prior: Whether the last motion is offered as a second guess beside no motion; the better one leads.
-        synchronise: Whether depth is moved to the colour image's moment with the camera's own motion, where the
-            sequence tells both stamps.
-        rolling_shutter: Whether each row is taken as exposed at its own moment, where the camera's `readout` says so.
-        sway: Whether, under a rolling shutter, the camera's velocity at each frame's own moment is found with the
-            motion; else it is taken for the mean since the last frame. See `alignment.sway`.
-        relight: Whether a pair that is badly explained is searched for again in the new frame's light, where light
-            changed from place to place. See `odometry.relighting`.
+        synchronise: Whether depth is warped to the colour image's timestamp by the camera's motion, where the sequence
+            has both stamps.
+        rolling_shutter: Whether each row is taken as exposed at its own time, where the camera has a `readout`.
+        sway: Whether, under a rolling shutter, the camera's velocity at each frame's timestamp is estimated with the
+            motion; else it is assumed to be the mean since the last frame. See `alignment.sway`.
+        relight: Whether a badly explained pair is searched again with its references relit like the new frame, where
+            the light changed locally. See `odometry.relighting`.
         recover: Whether a pair that looks wrong is tried again by the wide search against the previous frame.
-        bodies: Whether what moves on its own is left out of the search: `off` no, `mask` yes; `track` finds each body's
-            own motion, too. See docs/bodies.md.
+        bodies: Whether independently moving bodies are left out of the search: `off` no, `mask` yes; `track` also
+            estimates each body's motion. See docs/bodies.md.
         on_lost: The motion recorded for a lost pair: `hold` none, `predict` the last one, `stop` ends the run.
-        loops: Whether `run_odometry` and the command keep a map of keyframes, which closes loops: the trajectory is
-            then corrected by them. Frames that are given to an `Odometry` one by one have no map.
+        loops: Whether `run_odometry` and the command keep a map of keyframes and correct the trajectory by loop
+            closures. Frames that are given to an `Odometry` one by one have no map.
     """
 
     reference: Literal["previous", "keyframe"] = static("keyframe")
@@ -127,12 +128,12 @@ class OdometryOptions:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Settings:
-    """A solver, what it minimises, and how the driver uses it; the preset `default` where nothing is said.
+    """A solver, what it minimises, and how the driver uses it; by default those of the preset `default`.
 
     Attributes:
-        solver: `GeneticAlgorithm`, `ParticleSwarm`, `GaussNewton`, `GradientDescent`, or one's own.
+        solver: `GeneticAlgorithm`, `ParticleSwarm`, `GaussNewton`, `GradientDescent`, or a custom one.
         alignment: What is minimised and where.
-        odometry: How a sequence is tracked; a single pair has no use for it.
+        odometry: How a sequence is tracked; not used for a single pair.
     """
 
     solver: Solver = field(default_factory=GeneticAlgorithm)
@@ -141,12 +142,12 @@ class Settings:
 
 
 def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None = None, **parts: Any) -> Settings:
-    """The settings that a caller means.
+    """Return the settings that a caller's arguments stand for.
 
     Args:
         value: Settings; a solver stands for the default settings with that solver, None for the default ones.
-        solver: Takes the place of their solver.
-        parts: `alignment` and `odometry`, likewise: what callers of version 0.1 hand over one by one.
+        solver: Replaces their solver.
+        parts: `alignment` and `odometry`, likewise; deprecated arguments of version 0.1.
 
     Raises:
         TypeError: `value` is neither.
@@ -163,7 +164,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
     given = {name: part for name, part in parts.items() if part is not None}
     if given:
         words = "options and alignment are parts of the settings now: dataclasses.replace(settings, alignment=…)"
-        warnings.warn(words, DeprecationWarning, stacklevel=4)  # the caller of what calls this, which is wrapped
+        warnings.warn(words, DeprecationWarning, stacklevel=4)  # the caller's caller, past a wrapper
     if solver is not None:
         given["solver"] = solver
     settings = replace(settings, **given)

@@ -1,4 +1,4 @@
-"""What settings may hold, wherever they come from: Python, a file or the command line."""
+"""Validation of settings from any source: Python, a file or the command line."""
 
 import dataclasses
 import operator
@@ -17,16 +17,16 @@ from gavo_jax.objective.losses import fault_of_loss
 from gavo_jax.solvers.base import Schedule
 
 MAX_WHOLE, MAX_REAL = 2**31 - 1, 3e38
-"""What the device's numbers hold."""
+"""Largest integer and float of the device."""
 MAX_SEED = 2**32 - 1
-"""JAX's keys take no larger one in 32 bits: of a larger one the rest would be lost, and two seeds be the same."""
+"""Largest seed of JAX's keys in 32 bits: larger ones would be truncated, so that two seeds could coincide."""
 
 
 def as_seed(seed: Any, name: str = "seed") -> int:
-    """A seed as a number of Python.
+    """Return a seed as a Python int.
 
     Raises:
-        GavoError: It is no whole number from 0 to `MAX_SEED`.
+        GavoError: It is not a whole number from 0 to `MAX_SEED`.
     """
     try:
         number = operator.index(seed)
@@ -38,10 +38,10 @@ def as_seed(seed: Any, name: str = "seed") -> int:
 
 
 def require_settings(settings: Any, place: str = "settings") -> None:
-    """Refuse settings that no search can run with.
+    """Check that settings are ones that a search can run with.
 
-    A field's annotation says of what kind its value is; `static` and `within` say in which range. Kinds that are not
-    known here are left alone: somebody else's solver may hold anything.
+    A field's annotation gives the type of its value; `static` and `within` give the range. Unknown types are not
+    checked: a custom solver may hold anything.
 
     Args:
         settings: `Settings`.
@@ -71,7 +71,7 @@ def require_settings(settings: Any, place: str = "settings") -> None:
 
 @cache
 def kind_of(owner: type, field: str) -> Any:
-    """What a field's annotation says; `object` where that cannot be found out."""
+    """Return the type in a field's annotation; `object` if that cannot be resolved."""
     try:
         return typing.get_type_hints(owner, include_extras=True)[field]
     except (NameError, KeyError):
@@ -79,12 +79,12 @@ def kind_of(owner: type, field: str) -> Any:
 
 
 def alternatives(kind: Any) -> tuple[Any, ...]:
-    """The kinds that a union allows for."""
+    """Return the members of a union, or the type itself."""
     return typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
 
 
 def is_whole(value: Any) -> bool:
-    """Whether a field whose default this is takes whole numbers."""
+    """Whether a field with this default takes whole numbers."""
     return all(isinstance(entry, int) for entry in (value if isinstance(value, tuple) else (value,)))
 
 
@@ -97,7 +97,7 @@ def _fields(settings: Any) -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
 
 
 def _searched(value: Any, levels: tuple[int, ...]) -> list[tuple[int | None, Any]]:
-    """The entries that count: those of the levels that are searched, where there is one per level."""
+    """Return the entries that count: if there is one per level, those of the levels that are searched."""
     if not isinstance(value, tuple):
         return [(None, value)]
     return [(level, value[level]) for level in levels] if len(value) == LEVELS else [(None, one) for one in value]
@@ -113,7 +113,7 @@ def _require_kind(where: str, value: Any, kind: Any, default: Any) -> None:
 
 
 def _kind(kind: Any, default: Any) -> tuple[str, Callable[[Any], bool]]:
-    """A kind in words, and what tells whether a value is of it."""
+    """Return a type in words, and a function that checks whether a value is of it."""
     origin, parts = typing.get_origin(kind), typing.get_args(kind)
     if kind is types.NoneType:
         return "none", lambda value: value is None
@@ -143,7 +143,7 @@ _NUMBER = ("a number", "a whole number")
 
 
 def _is_number(value: Any, whole: bool) -> bool:
-    """Whether a value is one number that the device can hold; what is being traced has no value yet."""
+    """Whether a value is a single number that the device can hold; a traced one has no value yet."""
     if isinstance(value, Tracer):
         return not whole
     if isinstance(value, bool | np.bool_ | list | tuple | dict) or np.ndim(value) != 0:

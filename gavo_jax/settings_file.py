@@ -1,7 +1,7 @@
 """Settings in files and by name: `solver.mutation_decay`, `alignment.loss`, `solver.population.4`.
 
-A settings file is TOML: `method` and `preset` at the top say what it starts from, the tables `solver`, `alignment` and
-`odometry` what differs from that. A run's config.json is one too.
+A settings file is TOML: `method` and `preset` at the top say what it is based on, the tables `solver`, `alignment` and
+`odometry` what differs from that. A run's config.json also serves as one.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from gavo_jax.settings import Settings
 from gavo_jax.settings_check import MAX_REAL, alternatives, is_whole, kind_of, require_settings
 
 ROOMS = tuple(field.name for field in dataclasses.fields(Settings))
-"""First part of a dotted name: the parts of the settings."""
+"""Parts of the settings: the first components of dotted names."""
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
     name: getattr(optax, name)
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
@@ -34,14 +34,14 @@ MAX_FILE_BYTES = 2**20
 
 
 class NamedSettings(NamedTuple):
-    """Settings with the names of what they started from."""
+    """Settings with the names of the method and preset they are based on."""
 
     method: str
-    """Name of the method that the solver is of."""
+    """Name of the solver's method."""
     preset: str
     """Name of the preset."""
     settings: Settings
-    """With what the file changes."""
+    """Settings of the preset with the file's changes."""
 
 
 def load_settings(path: str | Path, method: str = "ga", preset: str = "default") -> NamedSettings:
@@ -49,7 +49,8 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
 
     Args:
         path: The file.
-        method: What it starts from where it says nothing of that itself, and `preset` likewise.
+        method: Method that it is based on if it names none.
+        preset: Preset that it is based on if it names none.
 
     Raises:
         GavoError: It cannot be read, or holds an unknown name (with the nearest known one) or a wrong value.
@@ -74,16 +75,16 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
 
 
 def save_settings(path: str | Path, settings: Settings, method: str | None = None, preset: str = "default") -> None:
-    """Write a settings file that holds every setting, whole or not at all.
+    """Write every setting to a settings file, atomically.
 
     Args:
         path: The file, TOML.
-        settings: With a solver, a loss and an optimiser of this package: others have no name to be read by.
-        method: The method that reading starts from; by default the one that the solver is of.
-        preset: The preset that reading starts from.
+        settings: Settings with a solver, a loss and an optimiser of this package: others have no name to be read by.
+        method: Method that the file is based on; by default the solver's.
+        preset: Preset that the file is based on.
 
     Raises:
-        GavoError: It cannot be written, or holds somebody else's code.
+        GavoError: The file cannot be written, or the settings hold code of another package.
     """
     if not isinstance(settings, Settings):
         raise GavoError(f"{path}: Settings are needed, not {type(settings).__name__}")
@@ -102,10 +103,10 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
 
 
 def assignments(texts: Iterable[str]) -> dict[str, Any]:
-    """Values by dotted name from texts like `alignment.points=2400`; a value is TOML, or a word.
+    """Parse texts like `alignment.points=2400` into values by dotted name; a value is TOML, or a word.
 
     Raises:
-        GavoError: One is no assignment.
+        GavoError: A text is not an assignment.
     """
     values: dict[str, Any] = {}
     for text in texts:
@@ -120,7 +121,7 @@ def assignments(texts: Iterable[str]) -> dict[str, Any]:
 
 
 def _without_types(room: Any) -> Any:
-    """A room of config.json as a settings file has it: without the type's name, and with a word for null."""
+    """Convert a part of config.json to that of a settings file: without the type's name, and with a word for null."""
     if not isinstance(room, dict):
         return room
     return {name: "none" if value is None else value for name, value in room.items() if name != "type"}
@@ -142,12 +143,12 @@ def _as_toml(place: str, value: Any) -> Any:
 
 
 def name_of(function: Any) -> str | None:
-    """The name that a loss or an optimiser goes by; None for somebody else's."""
+    """Return the name of a loss or an optimiser; None for a custom one."""
     return next((name for name, known in (LOSSES | OPTIMIZERS).items() if known is function), None)
 
 
 def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str], what: str = "key") -> None:
-    """Raise GavoError for the first key (or `what` else they are) that is not known, and name the nearest that is."""
+    """Raise GavoError for the first unknown key (or `what` the keys are), suggesting the nearest known one."""
     known = tuple(known)
     for key in keys:
         if key not in known:
@@ -157,12 +158,12 @@ def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str], what: 
 
 
 def refuse_unknown_method(place: str, method: str, others: Iterable[str] = ()) -> None:
-    """Raise GavoError for a name that is no method's; the nearest that is suggested can be used.
+    """Raise GavoError for an unknown method, suggesting the nearest usable one.
 
     Args:
         place: Begins the message.
         method: The name.
-        others: Names that may stand in its place.
+        others: Other names that are allowed.
     """
     if method not in (others := tuple(others)) + presets.methods():
         refuse_unknown(place, [method], (*presets.usable_methods(), *others), "name")
@@ -172,7 +173,7 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
     """Return the settings with some hyperparameters replaced.
 
     Args:
-        settings: What the others are taken from.
+        settings: Settings to change.
         values: Value by dotted name. A list gives a schedule an entry per pyramid level (level 0 first); a single
             number stands for every level of a schedule of rates; `solver.population.4` names the entry of level 4. The
             word `none` switches an optional number off; losses and optax's optimisers go by their names.
@@ -205,9 +206,9 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
 
 
 def _refuse_without_effect(before: Settings, after: Settings, values: Mapping[str, Any], place: str) -> None:
-    """Raise GavoError for a new value that another one keeps from counting.
+    """Raise GavoError for a new value that has no effect because of another one.
 
-    A file that names every field is left alone: it holds those, too, that do not count (`save_settings`).
+    Files that name every field (`save_settings`) are exempt: they also hold values without effect.
     """
     for room in ROOMS:
         part, earlier = getattr(after, room), getattr(before, room)
@@ -233,7 +234,7 @@ def _takes_whole(owner: type, field: str, current: Any) -> bool:
 
 
 def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
-    """Raise GavoError for a name that begins with no part of the settings; a field of that name is of one of them."""
+    """Raise GavoError for a name that begins with no part of the settings, suggesting the nearest full name."""
     parts = {room: [field.name for field in dataclasses.fields(getattr(settings, room))] for room in ROOMS}
     whole = {field: f"{room}.{field}" for room, names in parts.items() for field in names} | {
         room: room for room in ROOMS
@@ -243,10 +244,10 @@ def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
 
 
 def flatten(place: str, table: Mapping[str, Any], is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
-    """Return nested tables as one, with dotted names.
+    """Flatten nested tables into one, with dotted names.
 
     Raises:
-        GavoError: `place` holds no table.
+        GavoError: What is at `place` is not a table.
     """
     if not isinstance(table, Mapping):
         raise GavoError(f"{place}: not a table")
@@ -268,7 +269,7 @@ def _with_level(where: str, current: Any, level: str, value: Any) -> tuple[Any, 
 
 
 def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> Any:
-    """A value of TOML as the field holds it: words and lists become functions, None and tuples."""
+    """Convert a TOML value to what the field holds: words become functions or None, lists become tuples."""
     kinds = alternatives(kind_of(owner, field))
     if value == "none":
         if type(None) not in kinds:
@@ -285,14 +286,14 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
 
 
 def _plain(value: Any, whole: bool) -> Any:
-    """A number as the field holds it; what is none is for `require_settings` to refuse."""
+    """Convert a number to the field's type; anything else is left for `require_settings` to refuse."""
     is_number = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_number and not whole and abs(value) <= MAX_REAL else value
 
 
 def _callable(where: str, field: str, current: Any, value: Any) -> Any:
     known = LOSSES if field == "loss" else OPTIMIZERS
-    if value == getattr(current, "__name__", None) and value not in known:  # of the method that was registered
+    if value == getattr(current, "__name__", None) and value not in known:  # the registered method's own
         return current
     if not isinstance(value, str):
         raise GavoError(f"{where}: must be a name, not {shown(value)}")

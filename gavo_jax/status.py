@@ -1,4 +1,4 @@
-"""What can be said of a frame or of a pair, each with a sentence for people."""
+"""Statuses of frames and pairs, each with a sentence for users."""
 
 import enum
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 class AlignmentStatus(enum.IntEnum):
-    """What is known of a pair's result; `sentence` says it for people, and docs/frames.md what becomes of the frame."""
+    """Status of a pair's result; `sentence` explains it, and docs/frames.md says what becomes of the frame."""
 
     OK = 0
     LOW_OVERLAP = 1
@@ -33,11 +33,11 @@ class AlignmentStatus(enum.IntEnum):
 
     @property
     def sentence(self) -> str:
-        """One sentence for people."""
+        """Explanation in one sentence."""
         return _SENTENCES[self]
 
     def __str__(self) -> str:
-        """The name as it stands in files."""
+        """Return the name used in files."""
         return self.name.lower()
 
 
@@ -76,16 +76,16 @@ GRAVITY = (
     AlignmentStatus.NO_DEPTH,
     AlignmentStatus.NOT_RIGID,
 )
-"""What can be found of a motion, the gravest last: of several that a search finds, that one is the status."""
+"""Findings about a motion, the gravest last: of several, that one becomes the status."""
 
 
 def bit(status: AlignmentStatus) -> int:
-    """A status as one of several findings: an integer of one bit."""
+    """Return the bit that stands for a status among findings."""
     return 1 << status
 
 
 def as_findings(criteria: Mapping[AlignmentStatus, Any]) -> Any:
-    """All statuses of which the criterion holds, as the bits of an integer; 0 where none does."""
+    """Return the statuses whose criterion holds, as the bits of an integer; 0 if none does."""
     found = jnp.int32(0)
     for status, holds in criteria.items():
         found |= jnp.where(holds, bit(status), 0)
@@ -93,7 +93,7 @@ def as_findings(criteria: Mapping[AlignmentStatus, Any]) -> Any:
 
 
 def gravest(findings: Any) -> Any:
-    """The status that several findings make, as an integer."""
+    """Return the gravest of several findings, as an integer."""
     status = jnp.int32(AlignmentStatus.OK)
     for candidate in GRAVITY:
         status = jnp.where(findings & bit(candidate), jnp.int32(candidate), status)

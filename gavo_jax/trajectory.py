@@ -33,14 +33,14 @@ MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
 MAX_STAMP = 1e19
-"""The same of a time stamp, which may count nanoseconds since 1970."""
+"""Largest absolute timestamp in a trajectory file, which may count nanoseconds since 1970."""
 
 
 SHORTEST_QUATERNION = 1e-6
-"""Length below which a quaternion is none."""
+"""Length below which a quaternion counts as zero."""
 
 NO_POSE = "numbers that are not finite, or a zero quaternion"
-"""What a row of a trajectory holds where a tracker saw nothing."""
+"""What a trajectory's row holds where the tracker lost its target."""
 
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
@@ -49,40 +49,40 @@ TRAJECTORY_HEADER = f"# {COLUMNS} (camera to world, seconds and metres)"
 
 
 SEGMENT_COMMENT = re.compile(r"# segment (\d{1,9})\b")
-"""Start of the comment line before a pose of another segment than the last one's, with that segment's number from 1."""
+"""Start of the comment line before a new segment's first pose, with the segment's number from 1."""
 
 
 _APART = r"[^\w\n]+"
 W_FIRST = re.compile(
     rf"^#.*\bq\w*w{_APART}q\w*x{_APART}q\w*y{_APART}q\w*z[^\w\n]*$", re.MULTILINE | re.IGNORECASE | re.ASCII
 )
-"""A comment that ends with the names of the last columns, as EuRoC's does: w before x."""
+"""Comment that ends with the names of the last columns, w before x, as EuRoC's does."""
 
 
 _TURN_FIRST = re.compile(
     rf"^#.*\bq\w*[wz]{_APART}(?!q)\w*x{_APART}(?!q)\w*y{_APART}(?!q)\w*z[^\w\n]*$",
     re.MULTILINE | re.IGNORECASE | re.ASCII,
 )
-"""A comment that ends with a position, after a quaternion."""
+"""Comment whose columns end with the position, after the quaternion."""
 
 
 W_FIRST_ORDER = "wxyz"
 
 
 def segment_comment(segment: int, before: float | None, after: float) -> str:
-    """The comment line before the first of some poses of a segment.
+    """Return the comment line before the poses of a segment.
 
     Args:
         segment: its number, from 0.
-        before: stamp of the last pose, which is of another segment, seconds; None where there is none.
-        after: stamp of the first of these poses.
+        before: stamp of the pose before, which is of another segment, seconds; None if there is none.
+        after: stamp of the first of its poses.
     """
     unknown = "" if before is None else f": the motion from {before:.6f} to {after:.6f} is unknown"
     return f"# segment {segment + 1}{unknown}"
 
 
 def _segments_of(text: str, lines: list[int]) -> Int[np.ndarray, " n"]:
-    """The segments of the poses in some lines of a trajectory file, the first line being 1."""
+    """Return the segments of the poses in the given lines of a trajectory file, counted from 1."""
     said = [(n, SEGMENT_COMMENT.match(line)) for n, line in enumerate(text.splitlines(), 1)]
     begun = [(n, int(match[1]) - 1) for n, match in said if match is not None and int(match[1]) > 0]
     numbers = np.array([0] + [segment for _, segment in begun])
@@ -91,13 +91,13 @@ def _segments_of(text: str, lines: list[int]) -> Int[np.ndarray, " n"]:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where a camera was, when.
+    """Timestamped poses of a camera.
 
     Attributes:
         timestamps: seconds.
         world_T_camera: rigid transforms from the camera's frame (x right, y down, z forward) into the world, metres.
-        segments: number of the stretch that each pose belongs to; between two stretches the motion is unknown, so that
-            their worlds are not one. All 0 where nothing is said.
+        segments: number of the segment of each pose; the motion between two segments is unknown, so they do not share a
+            world frame. All 0 by default.
     """
 
     timestamps: Float[np.ndarray, " n"]
@@ -105,7 +105,7 @@ class Trajectory:
     segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Hold all as arrays; raise ValueError where they hold no numbers, or their shapes do not belong together."""
+        """Convert all to arrays; raise ValueError if they are not numbers or their shapes do not match."""
         with blamed("Trajectory: numbers are needed"):
             timestamps = np.asarray(self.timestamps, np.float64)
             world_T_camera = np.asarray(self.world_T_camera, np.float64)
@@ -122,10 +122,10 @@ class Trajectory:
         object.__setattr__(self, "segments", segments)
 
     def require_rigid(self) -> None:
-        """Refuse poses that are no rigid transforms, save those that are not finite: nothing is said by them.
+        """Check that all finite poses are rigid transforms; poses that are not finite stand for unknown ones.
 
         Raises:
-            GavoError: names the first one.
+            GavoError: one is not; the message names the first.
         """
         broken = np.flatnonzero(np.isfinite(self.world_T_camera).all(axis=(1, 2)) & ~is_rigid(self.world_T_camera))
         if len(broken):
@@ -137,7 +137,7 @@ class Trajectory:
         return len(self.timestamps)
 
     def __getitem__(self, which: Any) -> "Trajectory":
-        """Return some of the poses: a slice, a mask or a list of places."""
+        """Return some of the poses, by a slice, a mask or a list of indices."""
         if np.ndim(which) == 0 and not isinstance(which, slice):
             needed = "a slice, a mask or a list of places is needed"
             raise TypeError(f"Trajectory: {needed}, not {shown(which)}; a single pose is world_T_camera[i]")
@@ -147,10 +147,10 @@ class Trajectory:
     def read_tum(path: str | Path) -> "Trajectory":
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
-        Where a comment, or a first row, names the columns with qw before qx, as EuRoC's does, quaternions are read so.
-        After a comment of `segment_comment` rows are of that segment. Rows come back in the order of their stamps; of
-        rows with equal stamps the first is kept. Quaternions are normalised. Rows of numbers that are not finite, or of
-        a zero quaternion, are left out: a tracker writes them where it lost its markers. A `GavoWarning` says how many.
+        If a comment or a first row names the columns with qw before qx, as EuRoC's does, quaternions are read in that
+        order. A comment of `segment_comment` begins a segment. Rows are sorted by their stamps; of rows with equal
+        stamps the first is kept. Quaternions are normalised. Rows with a zero quaternion or numbers that are not finite
+        are left out, as trackers write them where they lost their markers. A `GavoWarning` says how many.
 
         Raises:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed or absurdly large; no
@@ -183,10 +183,10 @@ class Trajectory:
         return Trajectory(table[:, 0], world_T_camera, segments[first])
 
     def write_tum(self, path: str | Path) -> None:
-        """Write rows of `timestamp tx ty tz qx qy qz qw` that read back to the last digit.
+        """Write rows of `timestamp tx ty tz qx qy qz qw` that read back exactly.
 
         Raises:
-            GavoError: a pose is no rigid transform, or the file cannot be written; nothing is left under its name then.
+            GavoError: a pose is not a rigid transform, or the file cannot be written; no partial file is left.
         """
         self.require_rigid()
         lines = [TRAJECTORY_HEADER]
@@ -202,7 +202,7 @@ class Trajectory:
         """Write the upper 3×4 of each matrix, row by row, twelve numbers per line (KITTI odometry format, no stamps).
 
         Raises:
-            GavoError: the file cannot be written; nothing is left under its name then.
+            GavoError: the file cannot be written; no partial file is left.
         """
         rows = self.world_T_camera[:, :3].reshape(len(self), 12)
         write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
@@ -210,10 +210,10 @@ class Trajectory:
     def interpolate(
         self, timestamps: float | Float[np.ndarray, "*m"], max_gap: float = MAX_GAP
     ) -> tuple[Float[np.ndarray, "*m 4 4"], Bool[np.ndarray, "*m"]]:
-        """Return `world_T_camera` at other stamps, between the samples around: translation linear, rotation by slerp.
+        """Interpolate `world_T_camera` at other stamps: the translation linearly, the rotation by slerp.
 
         Args:
-            timestamps: seconds, in any order; one number for one pose.
+            timestamps: seconds, in any order; a single number gives a single pose.
             max_gap: seconds; a stamp between two samples further apart than this is not valid.
 
         Returns:
@@ -221,7 +221,7 @@ class Trajectory:
             ones of one segment.
 
         Raises:
-            GavoError: an argument is no number.
+            GavoError: an argument is not a number.
         """
         max_gap, asked = as_number("interpolate: max_gap", max_gap), _as_stamps(timestamps)
         poses, valid = self._interpolate(asked.ravel(), max_gap)
@@ -256,10 +256,10 @@ class Trajectory:
 
 
 def require_trajectory(trajectory: Any) -> None:
-    """Refuse what is no trajectory.
+    """Check that a value is a `Trajectory`.
 
     Raises:
-        GavoError: It is a path, an array of poses.
+        GavoError: It is not, but a path or an array of poses, say.
     """
     if not isinstance(trajectory, Trajectory):
         hint = "gavo.Trajectory.read_tum(path) or gavo.Trajectory(timestamps, world_T_camera)"
@@ -277,7 +277,7 @@ def _as_stamps(stamps: Any) -> Float[np.ndarray, "*m"]:
 
 
 def stamp_name(timestamp: float) -> str:
-    """A stamp in seconds as a run's files name frames by it: to the microsecond."""
+    """Format a stamp in seconds as a run's files name frames: to the microsecond."""
     return f"{timestamp:.6f}"
 
 
@@ -400,7 +400,7 @@ def _slerp(
 
 
 def _order_of(heading: list[str], path: str | Path) -> str:
-    """The order of a quaternion's numbers by the names of the columns; empty where there are none.
+    """Return the order of a quaternion's components by the names of the columns; empty if there are none.
 
     Raises:
         GavoError: they are not those of a pose in one of the two orders.
@@ -413,7 +413,7 @@ def _order_of(heading: list[str], path: str | Path) -> str:
 
 
 def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
-    """The numbers of a row; None where they are no pose."""
+    """Parse the numbers of a row; None if they are not a pose."""
     if len(fields) != 8:
         raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
     try:
@@ -432,7 +432,7 @@ def _digits(value: float, decimals: int) -> str:
 
 
 def write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    """Write a text file whole or not at all.
+    """Write a text file atomically.
 
     Raises:
         GavoError: the file cannot be written.
