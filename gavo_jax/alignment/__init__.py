@@ -1,1 +1,1 @@
-"""From two frames to a motion with its covariance and status."""
+"""Alignment of two frames: their motion with its covariance and status."""

@@ -1,4 +1,4 @@
-"""Where a frame looks like itself: a pattern that repeats lets a motion win by which repetition was found first."""
+"""Self-similarity of a frame: on a repetitive pattern, a motion could win just because it was found first."""
 
 from dataclasses import replace
 
@@ -12,22 +12,22 @@ from gavo_jax.objective.error import Objective
 from gavo_jax.se3 import exp
 
 REACH = (20, 15)
-"""Pixels of the level that a pattern is looked for within, to either side and up and down."""
+"""Largest horizontal and vertical shifts that are tried, in pixels of the level."""
 SHIFT_POINTS = 480
-"""Points that a shift's evidence is taken on."""
+"""Number of points that a shift's evidence is taken on."""
 LEAST_LIKENESS = 0.6
-"""Evidence, over that of no shift, from which on a frame looks like itself when it is shifted."""
+"""Ratio of a shift's evidence to that of no shift above which the shifted frame looks like itself."""
 MOST_ALIASES = 4
-"""Shifts after which a frame looks like itself that are kept, the likest ones."""
+"""Largest number of shifts that are kept, those with the most evidence."""
 PEAK = 5
-"""Pixels across within which a shift must be the likeliest; nearer to no shift than half of that is none."""
+"""Width in pixels of the window in which a shift must be the maximum; shifts within half of it do not count."""
 
 
 def self_motions(objective: Objective, own: Target) -> Float[Array, "k 4 4"]:
-    """Motions to the side, up and down after which a frame looks as before; not-a-number where there are fewer.
+    """Find lateral and vertical motions after which a frame looks as before; NaN where there are fewer.
 
     Args:
-        objective: Of a level, with the frame as its reference.
+        objective: Objective of a level, with the frame as its reference.
         own: The same frame, packed as a target.
     """
     plane, q = objective.plane, objective.reference.points.q
@@ -37,7 +37,7 @@ def self_motions(objective: Objective, own: Target) -> Float[Array, "k 4 4"]:
     steps = jnp.stack([across.ravel() * depth / plane.fx, down.ravel() * depth / plane.fy], axis=-1)
     motions = exp(jnp.concatenate([steps, jnp.zeros((steps.shape[0], 4))], axis=-1))
     found = jax.lax.map(lambda motion: evidence(here, motion, SHIFT_POINTS), motions, batch_size=31)
-    # of what is still in view, so that a large shift is no less of a repetition
+    # over the points still in view, so that large shifts are not at a disadvantage
     likeness = jnp.where(found.total > 0.1 * jnp.max(found.total), found.seen, -jnp.inf).reshape(across.shape)
     around = jax.lax.reduce_window(likeness, -jnp.inf, jax.lax.max, (PEAK, PEAK), (1, 1), "SAME")
     is_alias = (likeness == around) & (likeness > LEAST_LIKENESS * jnp.max(likeness))

@@ -1,4 +1,4 @@
-"""Candidates of any origin, refined and chosen by the evidence for them: prior, features, what the islands found."""
+"""Refinement of candidates of any origin (prior, features, islands), and choice among them by their evidence."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,14 +13,14 @@ from gavo_jax.alignment.modes import rival_error
 from gavo_jax.objective.estimates import Brightness
 
 STRONG_TOTAL, STRONG_SEEN = 0.9, 2.8
-"""Evidence beyond which a motion that was known before needs no search."""
+"""Evidence beyond which a motion that was known beforehand makes a search unnecessary."""
 LEAST_EVIDENCE = 0.02
-"""Evidence counts as this much at least where two are compared."""
+"""Lower bound on evidence where two motions are compared."""
 KNOWN, FOUND, ALIASES, WINNER = range(4)
-"""Rounds: what is known before, what a search finds, what a pattern that repeats would have instead of the best of
-both, and the best of all on the finest level."""
+"""Rounds: motions known beforehand, those that a search finds, the aliases of the best of both on a repetitive pattern,
+and the best of all on the finest level."""
 LEAST_RIVAL = 0.5
-"""Evidence, over the winner's, from which on another mode is a rival."""
+"""Ratio of a mode's evidence to the winner's above which it is a rival."""
 
 
 class Entry(NamedTuple):
@@ -28,9 +28,9 @@ class Entry(NamedTuple):
 
     motion: Float[Array, "*k 4 4"]
     evidence: Evidence
-    """-inf in a place that is empty."""
+    """Negative infinity in an empty place."""
     brightness: Brightness
-    """With which the motion was refined."""
+    """Brightness with which the motion was refined."""
 
 
 def hold_contest(
@@ -40,18 +40,20 @@ def hold_contest(
     refine: Callable[[Float[Array, "4 4"], Bool[Array, ""]], Entry],
     always: bool,
 ) -> tuple[Entry, Float[Array, ""], Any]:
-    """Refine what is known and, unless that decides it, what a search finds; then the winner on the finest level.
+    """Refine the known motions and, unless one of them is decisive, those of a search; then the winner once more.
+
+    The winner is refined on the finest level, all others on the coarser ones.
 
     Args:
-        known: Motions that need no search; not-a-number where there is none.
-        search: Finds K motions, and whatever else is to be kept of it.
+        known: Motions that need no search; NaN where there is none.
+        search: Finds K motions, and returns whatever else is to be kept.
         aliases: Motions after which the reference looks as before (`aliases.self_motions`).
-        refine: Takes a motion to the nearest one that the frames speak for, on the finest level or on all the others.
-        always: Whether to search even where what is known decides it (static).
+        refine: Refines a motion, on the finest level if its second argument is true, else on all the others.
+        always: Whether to search even if a known motion is decisive (static).
 
     Returns:
-        The winner; its evidence over a rival's of another mode, of the points that each sees, +inf without one; and
-        what was kept of the search, not-a-number if there was none.
+        The winner; the ratio of its evidence to that of a rival mode, over the points that each sees, +inf without a
+        rival; and what was kept of the search, NaN if there was none.
     """
     search, refine = jax.jit(search), jax.jit(refine)  # traced once, for the shapes of their results and for the rounds
     found, kept = jax.eval_shape(search)
@@ -97,24 +99,25 @@ def hold_contest(
 
 
 def _unknown(leaf: jax.ShapeDtypeStruct) -> jax.Array:
-    """Not-a-number; 0 where there are whole numbers."""
+    """NaN, or 0 for integers."""
     return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0, leaf.dtype)
 
 
 def _competing(rows: Entry) -> Entry:
-    """All that competed."""
+    """Return all entries that competed."""
     return jax.tree.map(lambda leaf: leaf[:WINNER].reshape(-1, *leaf.shape[2:]), rows)
 
 
 def _best(rows: Entry) -> Entry:
-    """The entry that most speaks for."""
+    """Return the entry with the most evidence."""
     entries = _competing(rows)
     return jax.tree.map(lambda leaf: leaf[jnp.argmax(entries.evidence.total)], entries)
 
 
 def _lead(rows: Entry) -> Float[Array, ""]:
-    """The winner's evidence over a rival's, of the points that each sees: a motion is no better for a larger overlap
-    alone.
+    """Return the ratio of the winner's evidence to a rival's.
+
+    Only the points that each sees count, as a larger overlap alone makes no motion better.
     """
     motions, (total, seen), _ = _competing(rows)
     winner = jnp.argmax(total)

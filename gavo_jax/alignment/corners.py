@@ -1,7 +1,7 @@
-"""Corners of one frame found again in another one, from a motion that is nearly right.
+"""Tracking of one frame's corners in another one, from an approximate motion.
 
-The target is first seen from where the reference was taken: what differs then is what the motion does not explain, a
-few pixels, and Lucas and Kanade's tracking finds it to a part of one.
+The target is first warped to the reference's view. The remaining displacement, which the motion does not explain, is a
+few pixels, and Lucas-Kanade tracking finds it to a fraction of one.
 """
 
 from typing import NamedTuple
@@ -15,21 +15,21 @@ from gavo_jax.image.motion_compensation import filled_inverse_depth
 from gavo_jax.image.numbers import Depth, grey_bytes
 
 MOST = 500
-"""Most corners of a frame; the strongest ones count."""
+"""Largest number of corners of a frame; the strongest are kept."""
 QUALITY = 0.005
 """Smallest response of a corner, as a share of the strongest one's."""
 LEAST_SLOPE = 2.0
-"""Grey levels a pixel that a corner must have in every direction; noise has about one."""
+"""Smallest gradient of a corner in every direction, grey levels a pixel; noise has about one."""
 RESPONSE = 64.0 * 9.0 / (12.0 * 255.0) ** 2
 """OpenCV's response to one grey level a pixel in every direction: sums of its Sobel filter over 3 x 3 pixels."""
 SPACING = 1 / 80
 """Smallest distance of two corners, as a share of the image's width."""
 WINDOW = 1 / 30
-"""What is compared about a corner, as a share of the width."""
+"""Side of the window that is tracked about a corner, as a share of the width."""
 RETURN = 0.5
-"""Pixels within which tracking back must end where it began."""
+"""Largest distance between a corner and where tracking back ends, pixels."""
 NEAREST = 0.05
-"""Metres in front of a camera from which on a point is seen."""
+"""Smallest depth at which a point is seen, metres."""
 
 
 class Matches(NamedTuple):
@@ -47,13 +47,13 @@ def track_corners(
     target_T_reference: Float[np.ndarray, "4 4"],
     camera: Camera,
 ) -> Matches:
-    """Find corners of a frame in another one.
+    """Find a frame's corners in another frame.
 
     Args:
         reference: Grey and depth, 0 = no reading.
         target: Grey.
-        target_T_reference: The motion as far as it is known.
-        camera: Of both, without distortion.
+        target_T_reference: Approximate motion.
+        camera: Camera of both, without distortion.
     """
     grey, depth, target = grey_bytes(reference[0]), reference[1], grey_bytes(target)
     column, row, seen = _view(depth, target_T_reference, camera)
@@ -79,7 +79,7 @@ def track_corners(
 
 
 def _view(depth: np.ndarray, motion: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column and row in the target of each of the reference's pixels, and whether they are in view there."""
+    """Return each reference pixel's column and row in the target, and whether it is in view there."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = to_ray(camera, u, v)
     q = filled_inverse_depth(depth, camera)
@@ -94,7 +94,7 @@ def _view(depth: np.ndarray, motion: np.ndarray, camera: Camera) -> tuple[np.nda
 
 
 def _as_bright(grey: np.ndarray, other: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """An image with the mean and the contrast of another one, by what both see."""
+    """Give an image the mean and contrast of another one, by the pixels that both see."""
     own, wanted = grey[seen].astype(np.float32), other[seen].astype(np.float32)
     gain = wanted.std() / max(float(own.std()), 1.0)
     return np.clip((grey - own.mean()) * gain + wanted.mean(), 0.0, 255.0).astype(np.uint8)

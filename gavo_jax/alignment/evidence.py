@@ -1,10 +1,10 @@
-"""How much two frames speak for a motion, on one scale for candidates of any origin.
+"""The evidence of two frames for a motion, on one scale for candidates of any origin.
 
-E's scales are estimated at the motion that a level starts from, and what leaves the view is paid for by a share of
-them. Errors of candidates that were found on different ways are therefore not comparable. The evidence is: every
-candidate is asked about the same points of both frames, with the same fixed scales. Each point in view tells by how
-much likelier its residuals are under "the frames match here" than under "any two pixels of these frames meet here". A
-point that is out of view, or hidden behind something nearer, tells nothing.
+E's scales are estimated at the motion that a level starts from, and points that leave the view cost a share of them.
+Errors of candidates from different searches are therefore not comparable, but their evidence is: it is taken on the
+same points of both frames, with the same fixed scales. Each point in view contributes the log-likelihood ratio of its
+residuals under "the frames match here" and "two random pixels of these frames meet here". A point that is out of view
+or occluded contributes nothing.
 """
 
 from dataclasses import replace
@@ -18,50 +18,50 @@ from gavo_jax.objective.error import Objective
 from gavo_jax.se3 import exp, rigid_inverse
 
 POINTS = 1200
-"""Points of a frame, evenly spread, that are asked at most."""
+"""Largest number of points of a frame, evenly spread, that the evidence is taken on."""
 GREY_SCALE = 15.0
-"""Grey levels: what noise, a change of gain and half a pixel leave of a match."""
+"""Grey residual of a match, grey levels: from noise, a change of gain and an error of half a pixel."""
 DEPTH_SCALE = 0.02
-"""1/m, likewise: a few times the quantisation of a structured-light sensor."""
+"""Inverse-depth residual of a match, 1/m: a few times the quantisation of a structured-light sensor."""
 LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD = 20.0, 0.05
-"""What two pixels of a frame differ by at least (grey levels, 1/m)."""
+"""Lower bounds on the difference of two random pixels of a frame (grey levels, 1/m)."""
 MISMATCH = 0.2
-"""Chance that a point of frames that match does not itself (moving things, reflections, edges); no point can say more
-against a motion than its logarithm."""
+"""Probability that a point does not match although the frames do (moving things, reflections, edges). Its logarithm
+bounds what a point can say against a motion."""
 HIDDEN = 3.0
-"""Depth scales by which the target must be nearer than a point for the point to be hidden."""
+"""Number of depth scales by which the target must be nearer than a point for the point to be occluded."""
 MAY_BE_HIDDEN = 0.3
-"""What a point counts in the exposure whose target has no depth, which would tell whether it is hidden."""
+"""Weight, in the estimate of exposure, of a point where the target has no depth to show whether it is occluded."""
 LEAST_SEEN = 0.02
-"""Share of the readings that count as seen at least: what a few points say is little."""
+"""Smallest share of the readings that counts as seen, so that a few points have little say."""
 
 
 STEP = (0.05, 0.05)
-"""Metres and radians: how far a motion is moved aside to ask whether the evidence holds it."""
+"""Metres and radians by which a motion is displaced to test whether the evidence holds it."""
 LEAST_FALL = 0.03
-"""Share of the evidence that has to be lost by a step of `STEP` for the evidence to hold the motion."""
+"""Share of the evidence that a displacement by `STEP` must lose for the evidence to hold the motion."""
 
 
 class Evidence(NamedTuple):
-    """What the frames say of a motion."""
+    """Evidence of the frames for a motion."""
 
     total: Float[Array, ""]
-    """Mean logarithm of the likelihood ratio over all readings of both frames; 0 for what is not seen."""
+    """Mean log-likelihood ratio over all readings of both frames; points that are not seen contribute 0."""
     seen: Float[Array, ""]
-    """The same over the points that are seen alone: how well the frames match where they do overlap."""
+    """Mean over only the points that are seen: how well the frames match where they overlap."""
 
 
 class Held(NamedTuple):
-    """What the evidence says of six directions."""
+    """Whether the evidence holds a motion in six directions."""
 
     held: Bool[Array, " 6"]
-    """Whether the evidence falls on both sides of the motion, by each direction."""
+    """Whether the evidence falls on both sides of the motion, for each direction."""
     steps: Float[Array, "6 6"]
-    """The steps that were asked about, as columns, metres and radians."""
+    """The displacements that were tested, as columns, metres and radians."""
 
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
-    """What both directions of an objective say of one motion; its scales and brightness do not count."""
+    """Return the evidence for one motion from both directions of an objective, whatever its scales and brightness."""
     sums = _sums(objective, target_T_reference, points)
     if objective.backward is not None:
         sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference), points)
@@ -70,15 +70,15 @@ def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], poin
 
 
 def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], directions: Float[Array, "6 6"]) -> Held:
-    """Whether the evidence falls on both sides of a motion, along some directions of a step on the reference's side.
+    """Test whether the evidence falls on both sides of a motion, along directions of a step on the reference's side.
 
-    Gradients of frames that lie far apart agree little, and a direction may seem open for that alone. What counts then
-    is whether a motion that is off by `STEP` explains the frames as well.
+    Gradients of frames far apart agree little, which alone can make a direction seem undetermined. The test is then
+    whether a motion that is off by `STEP` explains the frames as well.
 
     Args:
-        objective: Of the level that the evidence is taken on.
+        objective: Objective of the level that the evidence is taken on.
         target_T_reference: The motion.
-        directions: As columns, metres and radians, of any length.
+        directions: Directions as columns, metres and radians, of any length.
     """
     size = jnp.repeat(jnp.stack([jnp.float32(step) for step in STEP]), 3)
     steps = directions / jnp.max(jnp.abs(directions) / size[:, None], axis=0)
@@ -89,7 +89,7 @@ def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], direc
 
 
 def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Float[Array, " 3"]:
-    """Sum of the logarithms, points that tell something, and readings, of one direction."""
+    """Sum of the log-likelihood ratios, number of points seen, and number of readings, in one direction."""
     few = replace(objective.sample(points), backward=None, centred=None)
     reference = few.reference
     has_reading = reference.points.q > 0
@@ -113,6 +113,6 @@ def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Flo
 
 
 def _log_ratio(residual: jax.Array, scale: float, spread: jax.Array) -> jax.Array:
-    """Logarithm of the likelihood of a normal residual of one scale over that of a wider one."""
+    """Log-likelihood ratio of a residual under a normal distribution of one scale and under a wider one."""
     wide = jnp.sqrt(spread**2 + scale**2)
     return jnp.log(wide / scale) - 0.5 * residual**2 * (1.0 / scale**2 - 1.0 / wide**2)

@@ -1,4 +1,4 @@
-"""E of one level, with all that is estimated from the data: brightness, noise, and how much depth is worth."""
+"""E of one level, with all that is estimated from the data: brightness, noise, and the weight of depth."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from gavo_jax.settings import AlignmentOptions
 
 
 def level_objective(level: Level, target: Target, options: AlignmentOptions, brightness: Brightness) -> Objective:
-    """E of one level under a brightness model, its scales still those of the paper's error."""
+    """Return E of one level under a brightness model, with the scales of the paper's error."""
     reference = level.reference._replace(grey=brightness.seen(level.reference.grey))
     charge = 0.0 if options.outside_cost is None else jnp.where(level.islands > 1, options.outside_cost, 0.0)
     return Objective(
@@ -45,12 +45,12 @@ def fit_objective(
     guess: Float[Array, "4 4"],
     exchanged: Exchanged | None = None,
 ) -> tuple[Objective, Brightness]:
-    """E of one level with everything that is estimated from the data at the motion that it starts from.
+    """Return E of one level with everything that is estimated from the data at its initial motion.
 
     On the first level nothing is aligned yet, and while several islands compete the leader may be wrong. A regression
-    of one image on the other would only tell that they differ, its gain would fall towards 0 and reward motions that
-    hide contrast; and residuals of a wrong motion say nothing of how much depth is worth. So brightness is left alone
-    there (`Objective.centred` takes care of exposure), and depth keeps the whole of its weight.
+    of one image on the other would then have a gain near 0, which rewards motions that hide contrast. Nor do residuals
+    of a wrong motion show how far depth can be trusted. So brightness is left unchanged there (`Objective.centred`
+    handles exposure); depth keeps its whole weight on the first level.
     """
     brightness = unchanged_brightness(level)
     objective = level_objective(level, target, options, brightness)
@@ -78,7 +78,7 @@ def fit_objective(
 def comparable_objective(
     level: Level, target: Target, options: AlignmentOptions, exchanged: Exchanged | None
 ) -> Objective:
-    """What `evidence` asks of one level: nothing in it depends on a motion."""
+    """Return the objective for `evidence` on one level; nothing in it depends on a motion."""
     objective = level_objective(level, target, options, unchanged_brightness(level))
     if exchanged is None or level.exchanged is None:
         return objective
@@ -94,7 +94,7 @@ def objectives_of(
     options: AlignmentOptions,
     target_T_reference: Float[Array, "4 4"],
 ) -> list[Objective]:
-    """E of some levels of a pair, each as a search that starts its level at one motion would minimise it."""
+    """Return E of some levels of a pair, each as minimised by a search that starts the level at a given motion."""
     levels = Levels.of(camera, numbers, options.points)
     view, packed, exchanged = prepare_pair(reference, target, camera, levels, options)
     stacked = stack_levels((view,), camera, levels, options, exchanged)
@@ -103,5 +103,5 @@ def objectives_of(
 
 
 def unchanged_brightness(level: Level) -> Brightness:
-    """Every view as bright as the target."""
+    """Return the brightness model in which every view is as bright as the target."""
     return Brightness.unchanged(level.reference.grey.shape[0])

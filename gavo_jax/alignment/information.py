@@ -1,9 +1,9 @@
-"""What two frames tell of each direction of motion, against what noise alone would tell.
+"""Information of two frames about each direction of motion, compared with that of noise alone.
 
-The Hessian of E is a sum of squared image gradients, and noise has gradients too: a wall without any texture looks as
-well determined as a picture. The noise of two frames is independent, though. So each direction's information is taken
-from products of a point's gradient in the reference with its gradient in the target: what both frames show adds up,
-what only one of them shows cancels, and how far it cancels by chance is known as well.
+The Hessian of E is a sum of squared image gradients, and noise has gradients too: a textureless wall looks as well
+determined as a picture. The noise of two frames is independent, though. So each direction's information is taken from
+products of a point's gradient in the reference with its gradient in the target. What both frames show adds up, what
+only one shows cancels, and the variance of what remains by chance is known.
 """
 
 from typing import NamedTuple
@@ -20,14 +20,14 @@ from gavo_jax.objective.points import Reference
 from gavo_jax.objective.problem import Problem
 
 SIGNIFICANCE = 4.0
-"""Standard deviations of what noise alone would give, below which a direction's information counts as none."""
+"""Number of standard deviations of noise alone below which a direction's information counts as none."""
 MIN_ALIGNED_SHARE = 1e-3
-"""Mean squared cosine between image gradients and a direction's flow below which its information counts as none: an
-interpolated gradient is wrong by two or three per cent, so that a stripe seems to tell of a motion along itself."""
+"""Mean squared cosine between image gradients and a direction's flow below which its information counts as none.
+Interpolated gradients are wrong by two or three per cent, so that a stripe seems to constrain motion along itself."""
 ENOUGH = 4800
-"""Points, evenly spread, that the information is taken from where there are twice as many or more."""
+"""Number of evenly spread points that the information is taken from if there are twice as many or more."""
 LEAST = 0.01
-"""Squared grey levels a m² or rad²: what is less tells nothing, on any number of points."""
+"""Squared grey levels per m² or rad² below which information counts as none, whatever the number of points."""
 
 
 class Information(NamedTuple):
@@ -38,7 +38,7 @@ class Information(NamedTuple):
     curvature: Float[Array, " 6"]
     """Curvature of E along the directions, as far as both frames confirm it."""
     determined: Bool[Array, " 6"]
-    """Whether that is more than noise and interpolation would give."""
+    """Whether that curvature exceeds what noise and interpolation would give."""
 
     def inverse(self) -> Float[Array, "6 6"]:
         """Inverse of E's Hessian over the determined directions; 0 along the others."""
@@ -47,11 +47,11 @@ class Information(NamedTuple):
 
 
 def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_body: Bool[Array, ""]) -> Information:
-    """What the frames tell at the problem's origin, of which these are the residuals and the `weighted_terms`.
+    """Measure the frames' information at the problem's origin, given its residuals and `weighted_terms`.
 
-    Few points that are steep tell of a motion with a large variance, which would hide what depth tells. Of a body,
-    grey and depth are therefore asked each alone, too. Of the whole image they are not: where grey goes by a wrong
-    match, depth that tells the other directions would confirm it.
+    Information from a few steep points has a large variance, which could mask that of depth. For a body, grey and depth
+    are therefore also tested each alone. Not for the whole image: where grey settles on a wrong match, depth that
+    determines the other directions would confirm it.
     """
     objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // ENOUGH)
     factor = 2.0 * every / objective.divisor(jnp.sum(r.inside))

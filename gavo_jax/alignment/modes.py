@@ -9,11 +9,11 @@ from gavo_jax.se3 import log
 NICHE = (0.08, 0.08)
 """Metres and radians of ξ within which two motions count as one mode."""
 NOT_FINITE, PICKED = 10**6, 10**9
-"""How often a mode counts as taken whose motion's error is not finite, and one whose motion has its place already."""
+"""Counts that rank a motion whose error is not finite, and one that was already chosen, behind all others."""
 
 
 def _niches(motions: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
-    """ξ in units of `NICHE`: what lies less than 1 apart counts as one mode."""
+    """Return ξ in units of `NICHE`: motions less than 1 apart count as one mode."""
     return log(motions) / jnp.repeat(jnp.stack([jnp.float32(radius) for radius in NICHE]), 3)
 
 
@@ -23,10 +23,10 @@ def _near(places: Float[Array, "n 6"], index: Integer[Array, ""]) -> Bool[Array,
 
 
 def best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], count: int) -> Integer[Array, " k"]:
-    """Indices of the `count` best motions with no two of one mode, best first (clearing, Petrowski 1996).
+    """Return the indices of the `count` best motions of distinct modes, best first (clearing, Petrowski 1996).
 
-    Where there are fewer modes than that, the last places go to the best motions of the modes that are taken least
-    often, and only then to motions whose error is not finite.
+    If there are fewer modes than that, the remaining places go to the best motions of the modes chosen least often,
+    and only then to motions whose error is not finite.
     """
     if count == 1:
         return jnp.argmin(errors)[None]
@@ -43,5 +43,5 @@ def best_distinct(motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], co
 def rival_error(
     motions: Float[Array, "n 4 4"], errors: Float[Array, " n"], best: Integer[Array, ""]
 ) -> Float[Array, ""]:
-    """Smallest error of a motion outside the mode of the best one, given by its index; +inf where there is none."""
+    """Return the smallest error outside the mode of the motion with index `best`; +inf if there is none."""
     return jnp.min(jnp.where(_near(_niches(motions), best), jnp.inf, errors))

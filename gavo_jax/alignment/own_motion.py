@@ -1,9 +1,9 @@
-"""The motion between two frames, each taken by a camera that was moving.
+"""The motion between two frames, each taken by a moving camera.
 
-A rolling shutter reads the rows of an image one after the other, and depth comes from another moment than grey. Between
-frames of a video the motion between the two tells how fast the camera was; between frames far apart it doesn't. But
-what a frame's own motion does to it, the other frame shows. So both velocities are unknowns beside the motion, with a
-prior, and corners tell all three: where those of each frame land in the other one, pixels.
+A rolling shutter reads the rows of an image one after the other, and depth has another timestamp than grey. In a video
+the motion between two frames gives the camera's velocity; between frames far apart it doesn't. But the distortion of
+one frame by the camera's motion shows in the other frame. So both velocities are unknowns beside the motion, with a
+prior. All three are fitted to the reprojection errors of each frame's corners in the other one.
 """
 
 from typing import NamedTuple
@@ -26,25 +26,25 @@ from gavo_jax.trajectory import inverse
 USUAL_SPEED = (0.5, 1.0)
 """m/s and rad/s: standard deviations of a hand-held camera's velocity."""
 UNSHUTTERED = (0.04, 0.04)
-"""Metres and radians: standard deviations of a motion that was found as if all rows were exposed at once."""
+"""Metres and radians: standard deviations of a motion that was found under the assumption of a global shutter."""
 NOISE = 1.0
-"""Pixels by which a corner is off at least."""
+"""Lower bound on the reprojection error's scale, pixels."""
 INDEPENDENT = 4.0
-"""Corners that tell something of their own, at most: their errors are shared by whole surfaces (depth, blur)."""
+"""Largest effective number of independent corners, as whole surfaces share their errors (depth, blur)."""
 FEWEST = 20
-"""Corners below which nothing is told."""
+"""Smallest number of corners for a result."""
 ROUNDS = 8
 LOOKS = 3
-"""Rounds after each of which depth is looked up anew."""
+"""Number of first rounds in which depth is looked up anew."""
 
 Images = tuple[UInt8[np.ndarray, "h w"], Depth]
 
 
 class OwnMotion(NamedTuple):
-    """What corners say."""
+    """The motion that corners give."""
 
     target_T_reference: Float64[np.ndarray, "4 4"]
-    """The motion between the two frames' moments, that of the middle row."""
+    """The motion between the two frames' timestamps, those of their middle rows."""
     covariance: Float64[np.ndarray, "6 6"]
     """Covariance of δ in target_T_reference · exp(δ), metres and radians."""
 
@@ -56,14 +56,14 @@ def refine_moving(
     target_T_reference: Float[np.ndarray, "4 4"],
     delays: tuple[float, float] = (0.0, 0.0),
 ) -> OwnMotion | None:
-    """Refine a motion that was found as if each frame were of one moment; None where too few corners tell of it.
+    """Refine a motion that was found as if each frame were taken at one instant; None if there are too few corners.
 
     Args:
         reference: Grey and depth.
-        target: Of the other frame.
-        camera: Of both, without distortion.
+        target: The other frame's.
+        camera: Camera of both, without distortion.
         target_T_reference: The motion that was found.
-        delays: Seconds from each colour image's moment to its depth image's.
+        delays: Seconds from each colour image's timestamp to its depth image's.
     """
     matches = track_corners(reference, target[0], target_T_reference, camera)
     if len(matches.reference) < FEWEST:
@@ -89,7 +89,7 @@ def refine_moving(
         weighted = slopes * (counted / scale**2)[:, None, None]
         hessian = np.einsum("nki,nkj->ij", weighted, slopes) + np.diag(prior)
         x = x - np.linalg.solve(hessian, np.einsum("nki,nk->i", weighted, residuals) + prior * x)
-    # what the corners alone say, without the motion that was found before
+    # from the corners alone, without the prior on the motion
     told = hessian - np.diag([*prior[:6], *np.zeros(12)])
     covariance = np.linalg.inv(told + np.diag(1e-9 * np.diag(told)))[:6, :6]
     if not (np.isfinite(x).all() and np.isfinite(covariance).all()):
@@ -98,19 +98,19 @@ def refine_moving(
 
 
 class _Points(NamedTuple):
-    """Corners in space, each at the moment that its row was read."""
+    """Corners in space, each at the time its row was read."""
 
     place: Float64[np.ndarray, "n 3"]
-    """Metres, in the frame's camera; anything where the depth is not known."""
+    """Metres, in the frame's camera; arbitrary where the depth is not known."""
     known: Bool[np.ndarray, " n"]
 
 
 class _Side(NamedTuple):
-    """What one frame sees of the corners."""
+    """One frame's view of the corners."""
 
     pixels: Float64[np.ndarray, "n 2"]
     seconds: Float64[np.ndarray, " n"]
-    """After the frame's moment, by the row."""
+    """Time of each corner's row after the frame's timestamp."""
     depth: Depth
     usual: Float[np.ndarray, " n"]
     """1/z [1/m] about each corner."""
@@ -124,7 +124,7 @@ class _Side(NamedTuple):
         return cls(pixels, seconds, depth, filled_inverse_depth(depth, camera)[row, column], camera, delay)
 
     def points(self, twist: Float64[np.ndarray, " 6"]) -> _Points:
-        """The corners in space, by depth from where they are, with that velocity, when it is read."""
+        """Return the corners in space, with depth looked up where they are, given that velocity, when it is read."""
         u, v = self.pixels.T
         along_u, along_v, away = pixel_flow(self.camera, u, v, self.usual, twist)
         column, row = _nearest(self.pixels + self.delay * np.stack([along_u, along_v], axis=-1), self.camera)
@@ -142,8 +142,10 @@ def _nearest(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray
 def _errors(
     frames: list[_Side], points: list[_Points], motion: np.ndarray, twists: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each frame's corners land in the other one, less where they are seen there: pixels [2n, 2]; the
-    derivatives by (δ, both twists) [2n, 2, 18]; and which are known.
+    """Return the corners' reprojection errors in the other frame, for both frames.
+
+    Returns:
+        Pixels [2n, 2]; derivatives by (δ, both twists) [2n, 2, 18]; and which ones are known.
     """
     residuals, slopes, known = [], [], []
     for here in (0, 1):
@@ -187,7 +189,7 @@ def _by_twist(points: np.ndarray) -> np.ndarray:
 
 
 def _weights(distances: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Weigh corners by Geman and McClure's loss of how far off they are, pixels."""
+    """Weights of corners under Geman and McClure's loss of their reprojection errors, pixels."""
     scale = 2.0 * max(NOISE, float(np.median(distances[known])))
     return 1.0 / (1.0 + (distances / scale) ** 2) ** 2
 
@@ -201,8 +203,9 @@ def _step(xi: np.ndarray) -> np.ndarray:
 
 
 def with_own_motion(result: Alignment, found: OwnMotion) -> Alignment:
-    """A pair's result, on the host, with the motion that corners tell; how well that is known decides whether it counts
-    as determined.
+    """Return a pair's result, on the host, with the motion that corners give.
+
+    Its covariance decides whether the pair counts as `LOW_TEXTURE`.
     """
     motion = found.target_T_reference
     variance = np.diag(found.covariance)

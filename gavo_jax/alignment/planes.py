@@ -1,4 +1,4 @@
-"""The large planes that a frame shows, by its depth, and its image as it is seen from straight before one of them."""
+"""The large planes in a frame's depth, and rectified (frontal) views of them."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -10,23 +10,23 @@ from jaxtyping import Bool, Float, Float64
 from gavo_jax.camera import Camera, inverse_depth, to_ray
 
 MOST, LARGE = 3, 0.25
-"""Planes that are looked for, and the share of the readings that each has at least."""
+"""Largest number of planes, and the smallest share of the readings on each."""
 STEP = 5
-"""From one reading to the next, in pixels of the smaller frame, that planes are looked for among."""
+"""Stride of the readings that planes are fitted to, in pixels of the reduced frame."""
 TRIES = 150
-"""Threes of readings that are tried for each plane: one that has a quarter of them is found in 9 of 10 frames."""
+"""Random triples of readings per plane: a plane with a quarter of the readings is found in 9 of 10 frames."""
 NEAR = (0.01, 0.02)
-"""How far a reading lies from a plane at most, 1/m, and as a share of its inverse depth."""
+"""Largest distance of an inlier from a plane in inverse depth: 1/m, and as a share of the reading."""
 MIDDLE = (2.0, 98.0)
-"""Percentiles, along either side, of the part of a plane that a view from straight before it holds."""
+"""Percentiles, along either axis, of the part of a plane that a frontal view covers."""
 EVERY = 7
-"""Pixels of which one is asked where the plane lies."""
+"""Stride of the pixels that determine which part of the plane is covered."""
 LEAST, NARROW = 16, 8
-"""Pixels that are asked, and that the view has along either side, at least."""
+"""Smallest number of these pixels, and smallest side of the view in pixels."""
 
 
 class Plane(NamedTuple):
-    """A plane before a camera: the points X with normal · X = distance."""
+    """A plane in front of a camera: the points X with normal · X = distance."""
 
     normal: Float64[np.ndarray, " 3"]
     """Unit normal, away from the camera."""
@@ -35,16 +35,16 @@ class Plane(NamedTuple):
 
     @property
     def foot(self) -> Float64[np.ndarray, " 3"]:
-        """Its point that is nearest to the camera, metres."""
+        """The plane's point nearest to the camera, metres."""
         return self.distance * self.normal
 
 
 class Small(NamedTuple):
-    """A frame made smaller."""
+    """A frame reduced in size."""
 
     grey: Float[np.ndarray, "h w"]
     inverse_depth: Float[np.ndarray, "h w"]
-    """1/m; 0 where nothing was read."""
+    """1/m; 0 = no reading."""
     camera: Camera
     """Camera of the smaller images."""
 
@@ -55,30 +55,30 @@ class Small(NamedTuple):
         return to_ray(self.camera, columns, rows)
 
     def inverse_depth_of(self, plane: Plane) -> Float[np.ndarray, "h w"]:
-        """What its pixels would read, 1/m, if they showed a plane; below 0 where they look away from it."""
+        """Inverse depth, 1/m, of a plane at each pixel; negative where the ray points away from it."""
         x, y = self.slopes
         a, b, c = (plane.normal / plane.distance).astype(np.float32)
         return a * x + (b * y + c)[:, None]
 
 
 class StraightView(NamedTuple):
-    """An image as a camera sees it that looks along a plane's normal."""
+    """A frontal view of a plane: the image of a camera that looks along its normal."""
 
     grey: Float[np.ndarray, "h w"]
     inside: Bool[np.ndarray, "h w"]
-    """Where it shows the plane."""
+    """Where the view shows the plane."""
     axes: Float64[np.ndarray, "2 3"]
-    """What a pixel to the right and one down are on the plane, metres, by the camera's axes."""
+    """Steps on the plane by a pixel to the right and by one down, metres, in the camera's axes."""
 
 
 def smaller(grey: Any, depth: Any, camera: Camera, factor: int) -> Small:
-    """A frame with fewer pixels.
+    """Reduce a frame's size.
 
     Args:
         grey: [H, W].
-        depth: In units of the camera's; 0 where nothing was read.
-        camera: Of both.
-        factor: By how much smaller along either side.
+        depth: Raw depth; 0 = no reading.
+        camera: Camera of both.
+        factor: Reduction along either side.
     """
     by = 1 / factor
     small = cv2.resize(np.asarray(grey, np.float32), None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
@@ -90,7 +90,7 @@ def smaller(grey: Any, depth: Any, camera: Camera, factor: int) -> Small:
 
 
 def planes(frame: Small) -> list[Plane]:
-    """The planes that have a quarter of the readings each, the largest first."""
+    """Find the planes with at least a quarter of the readings each, the largest first."""
     q = frame.inverse_depth[::STEP, ::STEP]
     x, y = (slopes[::STEP] for slopes in frame.slopes)
     row, column = np.nonzero(q > 0)
@@ -110,14 +110,14 @@ def planes(frame: Small) -> list[Plane]:
 
 
 def _is_near(plane: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Whether inverse depths are those of a plane."""
+    """Whether inverse depths lie on a plane."""
     return np.abs(plane - q) < np.maximum(NEAR[0], NEAR[1] * q)
 
 
 def _most_supported(
     rays: Float[np.ndarray, "n 3"], q: Float[np.ndarray, " n"], generator: np.random.Generator
 ) -> Float[np.ndarray, " 3"]:
-    """The plane through three readings, as inverse depth by ray, that most others are near to."""
+    """Return the plane through three readings with the most inliers, as a linear function of the ray."""
     threes = generator.integers(len(q), size=(TRIES, 3))
     corners = rays[threes]
     is_open = np.abs(np.linalg.det(corners)) > 1e-6
@@ -128,8 +128,9 @@ def _most_supported(
 
 
 def seen_straight(frame: Small, plane: Plane) -> StraightView | None:
-    """A frame as it is seen from straight before a plane, or None where too little of it would be; what was not read is
-    taken for the plane.
+    """Return the frontal view of a plane, or None if it would show too little of it.
+
+    Pixels without a reading are taken to show the plane.
     """
     expected, q = frame.inverse_depth_of(plane), frame.inverse_depth
     inside = (expected > 0) & ((q == 0) | _is_near(expected, q))
@@ -155,7 +156,7 @@ def seen_straight(frame: Small, plane: Plane) -> StraightView | None:
 
 
 def _axes(normal: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-    """Two axes along a plane: to the camera's right as far as that lies in it, and down."""
+    """Return two axes in a plane: the camera's right, projected onto it, and down."""
     right = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     if np.linalg.norm(right) < 1e-3:
         right = np.array([0.0, 0.0, 1.0]) - normal[2] * normal

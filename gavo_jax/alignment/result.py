@@ -13,7 +13,7 @@ from gavo_jax.status import AlignmentStatus, bit
 MAX_TRANSLATION_DEVIATION = 0.05
 """Metres: a larger standard deviation of a translation makes a pair `LOW_TEXTURE`."""
 MAX_ROTATION_DEVIATION = 0.05
-"""Radians, likewise for the rotation."""
+"""Radians: a larger standard deviation of a rotation makes a pair `LOW_TEXTURE`."""
 
 
 class Alignment(NamedTuple):
@@ -26,43 +26,45 @@ class Alignment(NamedTuple):
     """Maps points of the reference camera into the target camera, metres. On the host it is a NumPy array of float64
     with an orthonormal rotation."""
     xi: Float[Array, " 6"]
-    """Its logarithm (v, w): metres, radians."""
+    """Logarithm (v, w) of the motion: metres, radians."""
     error: Float[Array, ""]
     """E at the finest level, squared grey levels."""
     overlap: Float[Array, ""]
     """Share of the reference's points that land inside the target."""
     covariance: Float[Array, "6 6"]
-    """Covariance of δ in target_T_reference · exp(δ), δ = (v, w) in metres and radians; not-a-number where nothing is
-    known."""
+    """Covariance of δ in target_T_reference · exp(δ), δ = (v, w) in metres and radians; NaN where unknown."""
     status: Any
-    """`AlignmentStatus`: the gravest of what the search found, plausibility among the run's pairs included. What is
-    found later, of the frame or of the run, is the status only where nothing was found before."""
+    """`AlignmentStatus`: the gravest finding of the search, including plausibility among the run's pairs. A later
+    finding about the frame or the run becomes the status only if there was none before."""
     history: Float[Array, " iterations"]
-    """Best error after every iteration of every level, coarsest first (the levels' errors are not comparable)."""
+    """Best error after every iteration of every level, coarsest first (errors of different levels are not
+    comparable)."""
     findings: Any = 0
-    """Every status that holds, `OK` apart: the bits of an integer; see `statuses`."""
+    """Every status that holds, except `OK`, as the bits of an integer; see `statuses`."""
     explained: ExplainedShare = ExplainedShare(np.float32(np.nan), np.float32(np.nan))  # pyright: ignore
     """Share of the grey and of the depth residuals that are not large."""
     depth_scale: Any = np.float32(np.nan)
     """Scale of the depth residuals, 1/m."""
     sway: Any = np.zeros(6, np.float32)
-    """Twist of the points in the target camera at its moment, less ξ: metres and radians over the time between the
-    frames; 0 where a rolling shutter does not tell it. See `alignment.sway`."""
+    """Twist of the points in the target camera at its timestamp, less ξ: metres and radians over the time between the
+    frames; 0 unless a rolling shutter shows it. See `alignment.sway`."""
     brightness: Brightness = Brightness(np.float32(1.0), np.float32(0.0))  # pyright: ignore
-    """Gain and bias, grey levels, that make of each view's grey the target's: the reference's, and in a sequence the
-    keyframe's, too."""
+    """Gain and bias (grey levels) that map each view's grey to the target's: for the reference and, in a sequence, the
+    keyframe."""
 
     @property
     def statuses(self) -> tuple[AlignmentStatus, ...]:
-        """Every status that holds, `status` first; `OK` alone where nothing speaks against the motion."""
+        """Every status that holds, `status` first; only `OK` if there are no findings."""
         others = (other for other in AlignmentStatus if int(self.findings) & bit(other) and other != self.status)
         return (self.status, *others)
 
     @property
     def undetermined(self) -> str:
-        """The directions of motion that the images of a `LOW_TEXTURE` pair leave open, in the axes of the reference
-        camera: some of ξ's six, as words, joined by "with" where only their mixture is open. Else empty.
-        An axis is named for its share of what is open, or where that share alone exceeds the tolerable deviation.
+        """Directions of motion that the images of a `LOW_TEXTURE` pair leave undetermined, in words; else empty.
+
+        They are some of the six axes of ξ, in the reference camera, joined by "with" if only their mixture is
+        undetermined. An axis is named if its share of the undetermined directions is large, or if that share alone
+        exceeds the tolerable deviation.
         """
         covariance = np.asarray(self.covariance, np.float64)
         if AlignmentStatus.LOW_TEXTURE not in self.statuses or not np.isfinite(covariance).all():
@@ -80,8 +82,9 @@ class Alignment(NamedTuple):
 
     @property
     def frozen(self) -> Literal["", "image", "depth"]:
-        """What of a frame that is `FROZEN` is the last one's once more; else empty. Nothing is aligned with an image
-        that is, so that there is no error then.
+        """Which part of a `FROZEN` frame repeats the last one's; else empty.
+
+        A frozen image is not aligned, so that there is no error then.
         """
         if AlignmentStatus.FROZEN not in self.statuses:
             return ""
@@ -89,7 +92,7 @@ class Alignment(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """What is known of the result, in a sentence or two for people."""
+        """The status of the result in a sentence or two."""
         words, left_open = self.status.sentence, self.undetermined
         if self.status is AlignmentStatus.FROZEN:
             words = f"The {self.frozen} is the last one once more."
@@ -99,8 +102,9 @@ class Alignment(NamedTuple):
 
 
 def on_host(alignment: Alignment) -> Alignment:
-    """The same result, or batch of results, as NumPy arrays: motions rigid in double precision, and the status of a
-    single result an `AlignmentStatus`.
+    """Return a result, or a batch of results, as NumPy arrays.
+
+    Motions are made rigid in double precision; the status of a single result becomes an `AlignmentStatus`.
     """
     host = jax.device_get(alignment)
     status = host.status if np.ndim(host.status) else AlignmentStatus(int(host.status))
@@ -108,7 +112,7 @@ def on_host(alignment: Alignment) -> Alignment:
 
 
 def with_finding(result: Alignment, status: AlignmentStatus) -> Alignment:
-    """A result with one more finding; it is the status where nothing else was found."""
+    """Return a result with one more finding, which becomes the status if there was none."""
     if status is AlignmentStatus.OK:
         return result
     first = status if result.status == AlignmentStatus.OK else result.status
@@ -116,7 +120,7 @@ def with_finding(result: Alignment, status: AlignmentStatus) -> Alignment:
 
 
 def no_alignment(status: AlignmentStatus) -> Alignment:
-    """The result of a pair that could not be aligned at all: no motion, nothing known."""
+    """Return the result of a pair that could not be aligned: identity motion, unknown covariance."""
     nothing: dict[str, Any] = {
         "target_T_reference": np.eye(4),
         "xi": np.zeros(6, np.float32),

@@ -1,4 +1,4 @@
-"""What is looked at on the host once a pair was aligned: moving cameras, each image by itself, repetitions."""
+"""Checks on the host after a pair was aligned: camera motion during exposure, each image by itself, repetitions."""
 
 from typing import Any
 
@@ -25,15 +25,15 @@ def review(
     settings: Settings,
     expected: Float[Array | np.ndarray, "b 4 4"] | None,
 ) -> Alignment:
-    """Return a batch's results on the host, with all that is looked at there.
+    """Move a batch's results to the host, and apply the checks that are made there.
 
     Args:
         result: The result of `align_rows`, of B pairs.
-        frames: References and targets as they were given, whose stamps tell the delays of depth.
-        sides: The same images as `stacked_images` gives them.
+        frames: References and targets as they were given, whose stamps give the delays of depth.
+        sides: The same images as returned by `stacked_images`.
         camera: Camera of both frames.
-        settings: What searched.
-        expected: Motions to start from, where any were given.
+        settings: Settings of the search.
+        expected: Initial guesses, if any were given.
     """
     result, count = on_host(result), len(sides[0].grey)
     delays = zip(*(_depth_delays(side, count) for side in frames), strict=True)
@@ -50,8 +50,8 @@ def review(
 
 
 def _depth_delays(side: Any, count: int) -> list[float]:
-    """Seconds from each frame's colour image to its depth image; 0 where that is not known."""
-    frames = list(side) if len(side) == count else [None] * count  # else both kinds of images, each of all frames
+    """Return the seconds from each frame's colour image to its depth image; 0 where unknown."""
+    frames = list(side) if len(side) == count else [None] * count  # else a pair of stacked arrays, without stamps
     return [frame.depth_delay if isinstance(frame, Frame) else 0.0 for frame in frames]
 
 
@@ -63,7 +63,7 @@ def _with_moving_cameras(
     settings: Settings,
     delays: tuple[float, float],
 ) -> Alignment:
-    """Take into account what each frame's own motion did to it, where the settings look for features."""
+    """Correct for the camera's motion during each exposure, if the settings use features."""
     options = settings.alignment
     if not options.refine or options.features == "off" or not np.isfinite(result.covariance).all():
         return result
@@ -74,8 +74,9 @@ def _with_moving_cameras(
 
 
 def _with_image_findings(result: Alignment, reference: Images, target: Images, camera: Camera) -> Alignment:
-    """Add what speaks against each image by itself: depth may tell of a motion to a black image, or numbers that are
-    no metres agree with each other. Of a target the grey image is enough.
+    """Add the faults of each image by itself, which the alignment may not show; a target needs no depth.
+
+    Depth can determine a motion despite a black image, and depths in wrong units can agree with each other.
     """
     found = set(check_images(target.grey, target.depth, camera.depth_scale)) - {AlignmentStatus.NO_DEPTH}
     for finding in sorted(found.union(check_images(reference.grey, reference.depth, camera.depth_scale))):
@@ -86,8 +87,9 @@ def _with_image_findings(result: Alignment, reference: Images, target: Images, c
 def _with_repetition(
     result: Alignment, reference: Images, camera: Camera, expected: Float[np.ndarray, "4 4"] | None
 ) -> Alignment:
-    """Call a motion ambiguous whose image repeats itself, so that another motion explains it as well; where a motion
-    was expected, only if the other one is about as near to that.
+    """Mark a motion as ambiguous if a repetitive image lets another motion explain it as well.
+
+    If a motion was expected, the other one must also be about as near to that.
     """
     if result.status not in (AlignmentStatus.OK, AlignmentStatus.LOW_TEXTURE):
         return result

@@ -1,8 +1,8 @@
 """Coarse to fine: the motion between two RGB-D frames (paper, section 3).
 
-`align_views` is the method in one place. From the coarsest level to the finest it takes the reference's points,
-estimates what the data say about brightness and noise, chooses search coordinates, lets a solver minimise E there, and
-starts the next level from its best candidate.
+`align_views` is the whole method. On each level, from the coarsest to the finest, it takes the reference's points,
+estimates brightness and noise from the data, chooses search coordinates and lets a solver minimise E there. The next
+level starts from the best candidate.
 """
 
 from collections.abc import Callable
@@ -38,26 +38,26 @@ from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
 
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
-"""What refines what islands found. These are small and widely spread, which finds the basin, not its middle: on
-pairs 15 frames apart such a population ends up to 10° from where this method goes on from it."""
+"""Solver that refines the islands' motions. Islands are small and widely spread, which finds a basin but not its
+minimum: on pairs 15 frames apart their results are up to 10° from the refined ones."""
 FINALISTS = 4
-"""Islands, those that most speaks for, whose motions are refined."""
+"""Number of islands, those with the most evidence, whose motions are refined."""
 REFINED_OVERLAP = 0.1
-"""Overlap that a motion must keep while it is refined: the evidence tells whether so little is enough."""
+"""Overlap that a motion must keep during refinement; the evidence decides whether so little is enough."""
 SCOUT_RANGE = (0.5, 2.0)
 """Factors on the scouts' translations, from the first one to the last."""
 SCOUTED_POINTS = 480
-"""Points of a frame that a scout's evidence is taken on."""
+"""Number of points of a frame that a scout's evidence is taken on."""
 LEAST_ERROR = 1e-6
-"""Squared grey levels that the best error counts as at least, where a rival's is compared with it."""
+"""Lower bound on the best error, squared grey levels, where a rival's is compared with it."""
 SCOUTS_AT_ONCE = 32
-"""Motions whose evidence is taken side by side."""
+"""Number of motions whose evidence is computed side by side."""
 
 
 def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[Array, "4 4"]:
-    """The guess with the smallest grey residuals.
+    """Return the guess with the smallest grey residuals.
 
-    Unscaled residuals are compared: each guess would have its own scales, and E in units of them says nothing.
+    Unscaled residuals are compared: each guess would have its own scales, in units of which E is not comparable.
     """
     if guesses.shape[0] == 1:
         return guesses[0]
@@ -66,27 +66,27 @@ def _best_guess(objective: Objective, guesses: Float[Array, "g 4 4"]) -> Float[A
 
 
 class Population(NamedTuple):
-    """The candidates of the levels' searches, [L], iteration after iteration, for people to look at."""
+    """All candidates of the levels' searches, [L], by iteration, for plots and the viewer."""
 
     level: Integer[Array, "..."]
     xi: Float[Array, "... iterations p 6"]
-    """Twists of target_T_reference (m, rad); those of all islands. NaN from the iteration that stagnation, or a level's
-    smaller number of iterations, left out."""
+    """Twists of target_T_reference (m, rad) of all islands. NaN for iterations that were not run, because of stagnation
+    or a level's smaller number of iterations."""
     error: Float[Array, "... iterations p"]
-    """E, squared grey levels; +inf where a candidate is worthless."""
+    """E, squared grey levels; +inf for an invalid candidate."""
     centre: Float[Array, "... 6"]
-    """Twist that the search is held about, and `half_widths` of the box it is held in."""
+    """Twist at the centre of the search box; `half_widths` are the box's."""
     half_widths: Float[Array, "... 6"]
 
     def trimmed(self) -> "Population":
-        """One level's candidates on the host, without the places and iterations that the level left empty."""
+        """Return one level's candidates on the host, without the places and iterations that it left empty."""
         host = jax.device_get(self)
         rows, places = ~np.isnan(host.error).all(axis=1), ~np.isnan(host.xi[..., 0]).all(axis=0)
         return host._replace(xi=host.xi[rows][:, places], error=host.error[rows][:, places])
 
 
 class Frames(NamedTuple):
-    """What all searches of a pair have in common."""
+    """Inputs that all searches of a pair share."""
 
     target: Target
     options: AlignmentOptions
@@ -102,8 +102,8 @@ class SearchState(NamedTuple):
     """Half-widths of the search box, metres and radians."""
     brightness: Brightness
     rival: Float[Array, ""]
-    """How far the second-best mode is behind: its error over the best one's or, after a contest, the best one's
-    evidence over its; +inf without one."""
+    """How far the second-best mode is behind: the ratio of its error to the best one's or, after a contest, of the best
+    one's evidence to its; +inf without one."""
 
 
 class Ended(NamedTuple):
@@ -111,11 +111,11 @@ class Ended(NamedTuple):
 
     search: SearchState
     centre: Float[Array, "4 4"] | None
-    """Motion that they were held about; None where motions from anywhere competed."""
+    """Motion at the centre of the search; None where motions from anywhere competed."""
     histories: Float[Array, "l iterations"]
     populations: Population | None
     judge: Objective | None = None
-    """What the evidence was asked of, where motions competed by it."""
+    """Objective that the evidence was computed on, where motions competed by it."""
 
 
 def align_views(
@@ -135,31 +135,31 @@ def align_views(
     swaying: Swaying | None = None,
     part: Part | None = None,
 ) -> tuple[Alignment, Population | None]:
-    """Motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
+    """Estimate the motion from an anchor camera to the target camera, coarse to fine; traced, not compiled by itself.
 
-    The levels are one `lax.scan`: what a level does is compiled once and serves all of them.
+    The levels are one `lax.scan`: a level's code is compiled once and serves all of them.
 
     Args:
-        views: Of `make_references`; the first one's frame is the anchor, in whose camera the others' points are too.
-        target: Of `prepare_target`, for the same solver.
+        views: From `make_references`; the first one's frame is the anchor, in whose camera all points are given.
+        target: From `prepare_target`, for the same solver.
         camera: Camera of level 0.
-        levels: Of `levels_of`.
+        levels: From `levels_of`.
         solver: Any `solvers.base.Solver` with an entry per level.
         options: What is minimised.
         key: Random key.
-        guesses: Motions to start from; the best by error leads, so that a wrong one costs nothing.
+        guesses: Motions to start from; the one with the least error leads, so that a wrong one does no harm.
         record: Whether the candidates are kept (static).
-        exchanged: What the `symmetric` error needs; None where it is not asked for.
-        readout: Time that the shutter takes from the first to the last row, over the time between anchor and target;
-            None where all rows are exposed at once.
-        hypotheses: Motions that compete with what a search with `refine` finds, wherever they lie; not-a-number where
-            there is none.
-        swaying: Under a rolling shutter what is known of the target's own velocity, which is then refined with the
-            motion at the end; None where it is taken for the mean since the anchor.
-        part: Of the image, whose points take part; None for all of it.
+        exchanged: Data for the `symmetric` error; None if it is not used.
+        readout: Readout time of the shutter as a share of the time between anchor and target; None for a global
+            shutter.
+        hypotheses: Motions that compete with those of a search with `refine`, wherever they lie; NaN where there is
+            none.
+        swaying: Under a rolling shutter, prior knowledge of the target's velocity, which is then refined with the
+            motion at the end; None to assume the mean velocity since the anchor.
+        part: Part of the image whose points take part; None for all of it.
 
     Returns:
-        The alignment and, where they were recorded, the candidates of each level of `visited_levels`.
+        The alignment and, if recorded, the candidates of each level of `visited_levels`.
     """
     visits = stack_levels(views, camera, levels, options, exchanged, readout)
     first, finest = (jax.tree.map(lambda leaf, at=at: leaf[at], visits) for at in (0, -1))
@@ -182,7 +182,7 @@ def align_views(
         known = guesses if hypotheses is None else jnp.concatenate([guesses, hypotheses])
         finalists = min(FINALISTS, options.islands[searched[-1]])
         ended = _search_in_contest(frames, visits, known, box, search_alone, finalists=finalists, record=record)
-        # nothing competes any more
+        # from here on a single motion is refined
         finest = finest._replace(is_first=jnp.array(False), islands=jnp.int32(1))
     else:
         ended = search_alone()
@@ -205,7 +205,7 @@ def _search_in_contest(
     finalists: int,
     record: bool,
 ) -> Ended:
-    """The winner of motions that are known, of what islands find, and of the aliases of either."""
+    """Return the winner among known motions, those that islands find, and aliases of either."""
     (target, options, exchanged), count = frames, visits.number.shape[0]
     judged = jax.tree.map(lambda leaf: leaf[-min(2, count)], visits)
     judge = comparable_objective(judged, target, options, exchanged)
@@ -235,8 +235,9 @@ def _refine_through_levels(
     box: Float[Array, " 6"],
     is_last: Bool[Array, ""],
 ) -> SearchState:
-    """Take one motion by Gauss-Newton through all levels but the finest one, or through that alone. Nothing else
-    competes, so that the brightness can be told from the first level on.
+    """Refine one motion by Gauss-Newton on all levels but the finest one, or on that alone.
+
+    No other motion competes, so that brightness can be estimated from the first level on.
     """
     count = visits.number.shape[0]
     is_finest = jnp.arange(count) == count - 1
@@ -262,11 +263,11 @@ def _search_levels(
     record: bool,
     skips_empty: bool = False,
 ) -> tuple[SearchState, Float[Array, "l iterations"], Population | None]:
-    """Search some levels, one after the other, each from the islands of the last; held about a centre.
+    """Search some levels one after the other, each from the islands of the last, about a fixed centre.
 
-    Whether a level without islands is left out is static: where every level has some, the test would cost time.
+    Whether levels without islands are skipped is static: if every level has some, the test would only cost time.
     """
-    # traced once, where its shapes are asked for first
+    # jitted, so that it is traced once for its shapes and for the scan
     search_level = jax.jit(partial(_search_level, frames, solver, centre, record))
 
     def visit_level(search: SearchState, visit: tuple[Level, PRNGKeyArray]) -> Any:
@@ -290,8 +291,8 @@ def _search_level(
 ) -> tuple[SearchState, tuple[Float[Array, " iterations"], Population | None]]:
     """Search one level, from the islands of the last one, in the paper's five steps.
 
-    Take the reference's points (the visit has them), estimate brightness and noise, choose search coordinates, have
-    the solver minimise E on every island, and hand the best distinct motions on to the next level.
+    Take the reference's points (given by the visit), estimate brightness and noise, choose search coordinates, let the
+    solver minimise E on every island, and pass the best distinct motions on to the next level.
     """
     (target, options, exchanged), places = frames, search.islands.shape[0]
     level, keys = visit
@@ -320,7 +321,7 @@ def _search_level(
         errors = jnp.where(jnp.isfinite(errors), -total, jnp.inf)
     order = best_distinct(found, errors, places)
     rival = search.rival
-    if places > 1 and not options.refine:  # then the contest says it
+    if places > 1 and not options.refine:  # with `refine` the contest measures it
         ratio = rival_error(found, errors, order[0]) / jnp.maximum(errors[order[0]], LEAST_ERROR)
         rival = jnp.where(level.islands > 1, ratio, rival)
     search = SearchState(found[order], search.box * options.bounds_factor, brightness, rival)
@@ -337,7 +338,7 @@ def _search_island(
     origin: Float[Array, "4 4"],
     inhabited: Bool[Array, ""],
 ) -> tuple[Float[Array, "4 4"], Float[Array, ""], Float[Array, " iterations"], Candidates | None]:
-    """Search one level from one origin; with `record` also the candidates, as motions [iterations, P, 4, 4]."""
+    """Search one level from one origin; with `record`, also return the candidates, [iterations, P, 4, 4]."""
     if options.precondition:
         problem = replace(problem, origin=origin, reach=reach_of(options), searched=inhabited)
         reach = jnp.abs(unconditioner(problem.basis)) @ box
@@ -355,8 +356,9 @@ def _search_island(
 
 
 def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: PRNGKeyArray) -> Float[Array, "i 4 4"]:
-    """Return where the coarsest level's islands start: at the best guess, or at the best distinct ones of many motions
-    drawn about it.
+    """Return the motions where the coarsest level's islands start.
+
+    These are the best guess or, with scouts, the best distinct ones of many motions drawn about it.
     """
     target, options, exchanged = frames
     places = max(options.islands)
@@ -382,7 +384,7 @@ def _origins(frames: Frames, level: Level, guesses: Float[Array, "g 4 4"], key: 
         return jnp.repeat(leader[None], places, axis=0)
     spread = jnp.repeat(jnp.stack([jnp.float32(s) for s in options.scout_spread]), 3)
     twists = spread * jax.random.normal(key, (options.scouts, 6))
-    if options.refine:  # far ones as well as near ones
+    if options.refine:  # the translations vary in scale
         farther = jnp.linspace(*SCOUT_RANGE, options.scouts)[:, None]
         twists *= jnp.concatenate([jnp.repeat(farther, 3, axis=1), jnp.ones((options.scouts, 3))], axis=1)
     scouts = leader @ exp(twists.at[0].set(0.0))

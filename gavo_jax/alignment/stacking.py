@@ -1,4 +1,4 @@
-"""Frames as they are given, of many kinds, stacked into arrays without lens distortion, as the program takes them."""
+"""Stacking of frames, given in various forms, into undistorted arrays for the compiled program."""
 
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -24,10 +24,10 @@ class Images(NamedTuple):
 
 
 def require_untraced(*values: Any) -> None:
-    """Refuse to work within `jax.jit`, and on what it, `jax.vmap` or `jax.grad` traces.
+    """Refuse to run inside `jax.jit`, or on values traced by it, `jax.vmap` or `jax.grad`.
 
     Raises:
-        GavoError: One of the values, or what is made here, has no number yet.
+        GavoError: One of the values, or an array made here, is a tracer.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((values, jnp.zeros(())))):
         raise GavoError(TRACED)
@@ -36,10 +36,10 @@ def require_untraced(*values: Any) -> None:
 def stacked_pairs(
     references: Any, targets: Any, camera: Camera, keys: PRNGKeyArray | None
 ) -> tuple[list[Images], PRNGKeyArray]:
-    """Both sides of B pairs as `stacked_sides` gives them, and their keys.
+    """Stack both sides of B pairs as `stacked_sides` does, and check or make their keys.
 
     Raises:
-        GavoError: As `stacked_images`, or there are not as many of one as of the other.
+        GavoError: As `stacked_images`, or the two sides differ in number.
     """
     sides = stacked_sides(references, targets, camera)
     count, others = (len(side.grey) for side in sides)
@@ -49,14 +49,15 @@ def stacked_pairs(
 
 
 def typed_keys(keys: Any, shape: tuple[int, ...]) -> PRNGKeyArray:
-    """Random keys of a shape, () for one, as `jax.random.key` makes them; as `jax.random.PRNGKey` does they are the
-    same ones, of another type, for which the search would be compiled anew.
+    """Return random keys of a given shape, () for one, in the type that `jax.random.key` makes.
+
+    Keys of `jax.random.PRNGKey` are converted, as the search would be compiled anew for their type.
 
     Raises:
-        GavoError: They are none, or of another shape.
+        GavoError: They are not keys, or of another shape.
     """
     if isinstance(keys, jax.Array) and keys.dtype == np.uint32:
-        with suppress(TypeError, ValueError):  # numbers of another shape are no keys
+        with suppress(TypeError, ValueError):  # numbers of another shape are not keys
             keys = jax.random.wrap_key_data(keys)
     if not isinstance(keys, jax.Array) or not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
         raise GavoError(f"a key is needed, jax.random.key(seed), not {shown(keys)}")
@@ -67,7 +68,7 @@ def typed_keys(keys: Any, shape: tuple[int, ...]) -> PRNGKeyArray:
 
 
 def _plain(image: Any) -> Any:
-    """An array that a program takes; one that is on a device stays there."""
+    """Return an array that a program accepts; one that is on a device stays there."""
     return image if isinstance(image, jax.Array) else as_array(image)
 
 
@@ -87,8 +88,9 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
 
 
 def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
-    """Both sides as `stacked_images` gives them: bytes and 16 bits, or float32 throughout. For each other combination
-    of types the search would be compiled anew.
+    """Stack both sides as `stacked_images` does, in bytes and 16 bits, or in float32 throughout.
+
+    For any other combination of types the search would be compiled anew.
     """
     sides = [stacked_images(side, camera) for side in (references, targets)]
     if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):
@@ -97,10 +99,10 @@ def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]
 
 
 def stacked_images(side: Any, camera: Camera) -> Images:
-    """B frames as `align_batch` takes them, stacked and free of lens distortion.
+    """Stack B frames, in any form that `align_batch` accepts, without lens distortion.
 
     Raises:
-        GavoError: They are none, too small, or not of the camera's size.
+        GavoError: They are not frames, too small, or not of the camera's size.
     """
     require_camera(camera)
     if not hasattr(side, "__len__"):

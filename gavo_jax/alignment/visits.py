@@ -1,4 +1,4 @@
-"""What a search meets on each level of the pyramid: which levels it visits, and the frames' data there."""
+"""The pyramid levels that a search visits, and the frames' data on each."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from gavo_jax.solvers.base import Solver
 
 
 class Exchanged(NamedTuple):
-    """The two frames of a pair with their parts exchanged, for the symmetric error."""
+    """A pair of frames with their roles exchanged, for the symmetric error."""
 
     references: Reference
     """Points of the target frame; see `make_references`."""
@@ -26,19 +26,19 @@ class Exchanged(NamedTuple):
 
 
 def levels_of(camera: Camera, solver: Solver, options: AlignmentOptions) -> Levels:
-    """The levels that a solver searches, with as many points as the options say."""
+    """Return the levels that a solver searches, with the options' numbers of points."""
     return Levels.of(camera, solver.levels, options.points)
 
 
 def prepare_target(pyramid: Pyramid, levels: Levels) -> Target:
-    """What a search needs of a target frame: a solver's levels packed for sampling, coarsest first."""
+    """Pack a target frame's levels for sampling, coarsest first."""
     return pack_target(make_atlas([pyramid[number] for number in levels.numbers]))
 
 
 def prepare_pair(
     reference: Pyramid, target: Pyramid, camera: Camera, levels: Levels, options: AlignmentOptions
 ) -> tuple[Reference, Target, Exchanged | None]:
-    """What a search needs of two frames."""
+    """Prepare two frames for a search: reference points, packed target, and both exchanged if it is symmetric."""
     view = make_references(reference, camera, levels)
     exchanged = None
     if options.symmetric:
@@ -47,7 +47,7 @@ def prepare_pair(
 
 
 class Level(NamedTuple):
-    """What changes from level to level; with a leading axis L the input of the scan over the levels."""
+    """Data of one level; with a leading axis L, the input of the scan over the levels."""
 
     number: Integer[Array, ""]
     """Number of the pyramid's level; 0 is the full image."""
@@ -56,13 +56,13 @@ class Level(NamedTuple):
     reference: Reference
     """[V, N]: the points of all views as rays of the anchor camera."""
     points: Integer[Array, ""]
-    """Points a view on this level; places from there on are empty."""
+    """Number of points of a view on this level; the arrays are empty beyond."""
     columns: Integer[Array, ""]
-    """Points of a view in one row."""
+    """Number of points of a view in one row."""
     views: Integer[Array, ""]
-    """Views that count; the points of the others have lost their readings."""
+    """Number of views that count; the points of the others have no readings."""
     islands: Integer[Array, ""]
-    """Number of independent populations; 0 leaves the level out, where a search skips some."""
+    """Number of independent populations; 0 skips the level, in searches that can skip some."""
     depth_weight: Float[Array, ""]
     """Weight of the depth cost."""
     exchanged: Reference | None = None
@@ -72,11 +72,11 @@ class Level(NamedTuple):
 
     @property
     def is_undecided(self) -> Bool[Array, ""]:
-        """Whether the motion that the level starts from may be far off: nothing is aligned yet, or several compete."""
+        """Whether the level's initial motion may be far off: nothing is aligned yet, or several motions compete."""
         return self.is_first | (self.islands > 1)
 
     def with_parts_exchanged(self) -> "Level":
-        """The level of the target's points, for the symmetric error; rows pass in the other direction then."""
+        """Return the level of the target's points, for the symmetric error; the readout changes its sign."""
         readout = None if self.readout is None else -self.readout
         return self._replace(reference=self.exchanged, exchanged=None, readout=readout)
 
@@ -89,7 +89,7 @@ def stack_levels(
     exchanged: Exchanged | None = None,
     readout: Float[Array, ""] | None = None,
 ) -> Level:
-    """The visits of a search to the levels, [L], coarsest first."""
+    """Stack the data of the levels that a search visits, [L], coarsest first."""
     numbers, count = levels.numbers, len(levels.numbers)
     rows, columns = np.array(levels.grids).T
     counted = jnp.array([min(options.views[number], len(views)) for number in numbers])
@@ -112,11 +112,11 @@ def stack_levels(
 
 
 def reach_of(options: AlignmentOptions) -> Float[Array, " 2"]:
-    """How far from its centre a search is held on every level: metres and radians."""
+    """Return the largest distance from the search's centre on every level: metres and radians."""
     return jnp.stack([jnp.float32(half) for half in options.bounds])
 
 
 def visited_levels(numbers: tuple[int, ...], options: AlignmentOptions) -> tuple[int, ...]:
-    """The levels that a solver searches, coarsest first; with `refine` those on which islands compete."""
+    """Return the levels that a solver searches, coarsest first; with `refine` only those where islands compete."""
     competing = tuple(number for number in numbers if options.islands[number] > 1)
     return competing if options.refine and competing else numbers
