@@ -1,4 +1,4 @@
-"""From what a search ended with to a result: estimate, refine, judge."""
+"""From a search's best motion to a result: final estimates, refinement, covariance and status."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -23,48 +23,49 @@ from gavo_jax.settings import AlignmentOptions
 from gavo_jax.status import AlignmentStatus, as_findings, bit, gravest
 
 MIN_CONTRAST = 2.0
-"""Grey levels: a smaller standard deviation over the reference makes a pair `LOW_TEXTURE`."""
+"""Standard deviation of the reference's grey levels below which a pair is `LOW_TEXTURE`."""
 MIN_FINAL_OVERLAP = 0.3
 """Overlap of the result below which a pair is `LOW_OVERLAP`."""
 MIN_EXPLAINED_GREY = 0.45
-"""Share of the grey residuals that must not be large (`objective.estimates.explained_share`); below, a pair is
+"""Share of grey residuals that are not large (`objective.estimates.explained_share`) below which a pair is
 `HIGH_ERROR`."""
 MIN_EXPLAINED_DEPTH = 0.9
-"""Share of the depth residuals that must not be large, for a motion that is less certain than `DOUBTFUL_DEVIATION`."""
+"""Share of depth residuals that are not large below which a motion is `HIGH_ERROR` if its standard deviation exceeds
+`DOUBTFUL_DEVIATION`."""
 DOUBTFUL_DEVIATION = 0.005
-"""Metres or radians: standard deviation of a motion above which depth that disagrees says that it is wrong. A
-well-determined motion may move much of the depth: surfaces come into view, others are hidden."""
+"""Metres or radians: standard deviation of a motion above which disagreeing depth proves it wrong. Depth may disagree
+with a well-determined motion because of disocclusions and occlusions."""
 MIN_EVIDENCE, MIN_SEEN_EVIDENCE = 0.7, 1.8
-"""Evidence, of all readings and of those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
+"""Evidence over all readings, and over those seen, below which a motion that was chosen by it is `HIGH_ERROR`."""
 MAX_RIVAL = 1.1
-"""Error of a second mode, over the best one's, below which a pair is `AMBIGUOUS`. Only rival islands can tell."""
+"""Ratio of a second mode's error to the best one's below which a pair is `AMBIGUOUS`. Only rival islands show it."""
 AT_THE_EDGE = 0.98
 """Share of the search's reach beyond which a pair is `HIGH_ERROR`: a better motion may lie outside."""
 MAX_DEPARTURE = 1e-4
-"""Largest entry of RᵀR − I; rounding alone leaves a hundredth of it. Beyond, a pair is `NOT_RIGID`."""
+"""Entry of RᵀR − I above which a pair is `NOT_RIGID`; rounding alone causes a hundredth of it."""
 SHARED_ERRORS = 9.0
 """Factor on the covariance for errors that the whole image shares (interpolation, the choice of points, the pyramid's
-rounding), of which its scatter from tile to tile tells nothing; measured by `benchmarks/calibration.py`."""
+rounding). The scatter between tiles does not show them; measured by `benchmarks/calibration.py`."""
 UNDETERMINED = 0.5
-"""Metres or radians: the standard deviation that stands for a direction of which nothing is known."""
+"""Metres or radians: the standard deviation that stands for an undetermined direction."""
 UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
-"""Covariance of a motion that images do not tell."""
+"""Covariance of a motion that the images do not determine at all."""
 LARGEST_STEP = 0.01
-"""Metres or radians: a last step beyond this leaves the basin that the search ended in, or follows a direction that the
-images leave open; it is not taken."""
+"""Metres or radians: a larger last step is not taken. It would leave the basin that the search ended in, or follow a
+direction that the images leave undetermined."""
 
 
 class Part(NamedTuple):
     """The part of the image whose points take part."""
 
     share: Float[Array, ""]
-    """Of the image: less than 1 where the points of bodies are left out."""
+    """Share of the image: less than 1 where the points of bodies are left out."""
     is_body: Bool[Array, ""]
     """Whether it is one body, whose outline is known in both frames."""
 
     @classmethod
     def whole(cls) -> "Part":
-        """Take all of the image."""
+        """Return the whole image."""
         return cls(jnp.float32(1.0), jnp.array(False))
 
 
@@ -75,10 +76,10 @@ class Winner(NamedTuple):
     rival: Float[Array, ""]
     """See `search.SearchState`."""
     centre: Float[Array, "4 4"] | None
-    """Motion that the search was held about; None where motions from anywhere competed."""
+    """Motion at the centre of the search; None where motions from anywhere competed."""
     history: Float[Array, " iterations"]
     judge: Objective | None = None
-    """What the evidence is asked of, where motions competed by it."""
+    """Objective that the evidence is computed on, where motions competed by it."""
 
 
 def conclude(
@@ -89,13 +90,13 @@ def conclude(
     swaying: Swaying | None = None,
     part: Part | None = None,
 ) -> Alignment:
-    """Make the result of what the search ended with on a part of the image: estimate, refine, judge."""
+    """Make a result of a search's winner on a part of the image: estimate scales, refine, and judge."""
     part = Part.whole() if part is None else part
     residuals = objective.residuals(winner.motion)
     if options.robust_scale:
         # once more, at the motion found, so that errors of different solvers can be compared
         objective = replace(objective, scales=estimate_scales(residuals, finest.depth_weight))
-    points = finest.points * finest.views  # arrays may be longer
+    points = finest.points * finest.views  # the arrays may be longer
     reach = reach_of(options)
     centre = winner.motion if winner.centre is None else winner.centre
     problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=centre, reach=reach)
@@ -108,7 +109,7 @@ def conclude(
     against = find_against(examination, covariance, objective, winner.rival, part.share * points, chosen_by)
     if options.precondition and winner.centre is not None:
         edge = replace(problem, origin=motion, reach=AT_THE_EDGE * reach)
-        # along a way that the images leave open any motion is as good, that at the edge, too
+        # in an undetermined direction any motion is as good, even one at the edge
         is_told = ~against[AlignmentStatus.LOW_TEXTURE]
         against[AlignmentStatus.HIGH_ERROR] |= is_told & edge.is_out_of_reach(motion)
     findings = as_findings(against)
@@ -131,8 +132,10 @@ def conclude(
 def _last_step(
     problem: Problem, residuals: Residuals, swaying: Swaying | None, points: Integer[Array, ""]
 ) -> tuple[Problem, Residuals, Float[Array, "6 6"]]:
-    """The problem about a refined motion, under a rolling shutter with the target's sway; its residuals; and what not
-    knowing the sway adds to the covariance.
+    """Refine the motion and, under a rolling shutter, the target's sway.
+
+    Returns:
+        The problem about the refined motion, its residuals, and the sway's contribution to the covariance.
     """
 
     def without_sway() -> Swayed:
@@ -148,23 +151,23 @@ def _last_step(
 
 
 def _newton_step(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
-    """The motion one Newton step from the problem's origin, of which these are the residuals, if that is no worse."""
+    """Return the motion one Newton step from the problem's origin, given its residuals; the origin if that is worse."""
     model = problem.linearize_residuals(residuals)
     step = -jnp.linalg.solve(_regular(model.hessian), model.gradient)
     stepped = problem.origin @ exp(step)
     error, _ = problem.objective.error(stepped)
     better = (error < model.error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
     better &= ~problem.is_out_of_reach(stepped)
-    # held back, or XLA would carry both motions through all that follows
+    # a barrier, or XLA would carry both motions through all that follows
     return jax.lax.optimization_barrier(jnp.where(better, stepped, problem.origin))
 
 
 class Examination(NamedTuple):
-    """What the images say of one motion at the finest level."""
+    """Statistics of one motion at the finest level."""
 
     motion: Float[Array, "4 4"]
     inside: Float[Array, ""]
-    """Points that both frames see."""
+    """Number of points that both frames see."""
     model: Linearization
     """E and its derivatives by a step on the reference's side."""
     scatter: Float[Array, "6 6"]
@@ -174,7 +177,7 @@ class Examination(NamedTuple):
 
 
 def _examine(problem: Problem, r: Residuals, part: Part) -> Examination:
-    """What a part of the images says of the problem's origin, of which these are the residuals."""
+    """Examine the problem's origin on a part of the images, given its residuals."""
     model, scatter, terms = problem.examine(r)
     return Examination(
         motion=problem.origin,
@@ -189,14 +192,15 @@ def _examine(problem: Problem, r: Residuals, part: Part) -> Examination:
 def _weigh(
     examination: Examination, objective: Objective, judge: Objective | None, added: Float[Array, "6 6"]
 ) -> tuple[Examination, Float[Array, "6 6"], Evidence | None]:
-    """What the images say of a motion, its covariance, and the evidence for it where motions competed by that: a
-    direction is determined, too, if the evidence holds it.
+    """Return the examination, the covariance, and the evidence where motions competed by it.
+
+    A direction also counts as determined if the evidence holds it.
 
     Args:
-        examination: What the images say at the finest level.
-        objective: Of that level.
-        judge: What the evidence is asked of; None where nothing competed.
-        added: To the covariance.
+        examination: Statistics of the motion at the finest level.
+        objective: Objective of that level.
+        judge: Objective that the evidence is computed on; None if nothing competed.
+        added: Added to the covariance.
     """
     if judge is None:
         return examination, _covariance(examination, objective, None) + added, None
@@ -209,18 +213,19 @@ def _weigh(
 
 
 def _regular(hessian: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """A Hessian that can be inverted, hardly changed."""
+    """Regularise a Hessian slightly, so that it can be inverted."""
     return hessian + 1e-6 * jnp.diag(jnp.diag(hessian)) + 1e-9 * jnp.eye(6)
 
 
 def _covariance(examination: Examination, objective: Objective, held: Held | None) -> Float[Array, "6 6"]:
-    """Covariance of the motion: of what is determined from the scatter of E's gradient, never below what independent
-    residuals would leave (the scatter tells nothing of a direction in which the images happen to agree). A direction
-    that is not determined has half the step within which the evidence holds it, and `UNDETERMINED` where it does not.
+    """Covariance of the motion, from the scatter of E's gradient along determined directions.
+
+    The covariance of independent residuals is added, as the scatter vanishes where the images happen to agree. An
+    undetermined direction has half the step within which the evidence holds it as its deviation, else `UNDETERMINED`.
     """
     information, known_within = examination.information, jnp.zeros((6, 6))
     if held is not None:
-        # the gradients of frames far apart may tell less of a direction than that the motion is not a step off
+        # the gradients of frames far apart may constrain a direction less than the evidence does
         ways = information.directions
         spread = jnp.sqrt(SHARED_ERRORS * jnp.sum(ways * (examination.scatter @ ways), axis=0))
         half = 0.5 * jnp.max(jnp.abs(held.steps), axis=0) / jnp.max(jnp.abs(ways), axis=0)
@@ -246,8 +251,9 @@ def find_against(
     points: Float[Array, ""],
     chosen_by: Evidence | None = None,
 ) -> dict[AlignmentStatus, Bool[Array, ""]]:
-    """All that can be said against a motion, for which so many points were asked, by its status; docs/status.md gives
-    the reasons.
+    """Test a motion for every status that speaks against it; docs/status.md gives the reasons.
+
+    `points` is the number of points that were used for it.
     """
     motion, model, explained = examination.motion, examination.model, examination.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
@@ -271,5 +277,5 @@ def find_against(
 
 
 def is_unknown(result: Alignment) -> bool:
-    """Whether a result, on the host, has the covariance of a motion that images do not tell."""
+    """Whether a result, on the host, has the covariance of a motion that images do not determine at all."""
     return bool(np.all(np.diagonal(result.covariance) >= UNDETERMINED**2))

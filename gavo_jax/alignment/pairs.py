@@ -48,17 +48,16 @@ def _align_images(
 
 
 POINTS_SIDE_BY_SIDE = 2**20
-"""Points a level of the pairs that an accelerator aligns at once, some 200 pairs by most presets: each takes memory for
-its images' pyramids (some 10 MB) and its candidates' residuals. Reckoned, not measured."""
+"""Number of points of a level, over all pairs that an accelerator aligns at once: some 200 pairs with most presets. A
+pair takes memory for its pyramids (some 10 MB) and its candidates' residuals. Estimated, not measured."""
 
 
 @partial(CachedProgram, returns=(Alignment,))
 def _align_pairs(count, references, targets, camera, solver, options, keys, guesses):
-    """The first `count` of B pairs: one after the other on a CPU, which one pair already fills; side by side elsewhere,
-    `POINTS_SIDE_BY_SIDE` at a time.
+    """Align the first `count` of B pairs: one by one on a CPU, which a single pair keeps busy, else side by side.
 
-    The count is an input, so that XLA compiles one and the same loop body for one pair and for many, whose results then
-    agree to the last bit; unrolled, a single pair would round differently.
+    Side by side `POINTS_SIDE_BY_SIDE` limits the number. The count is an input, so that XLA compiles the same loop body
+    for one pair and for many, and their results agree to the last bit. Unrolled, a single pair would round differently.
     """
 
     @jax.jit  # traced once, for the shapes of its results and for the loop
@@ -88,11 +87,12 @@ FEATURE_KINDS: dict[str, tuple[FeatureKind, ...]] = {
 def starts_of(
     guesses: Float[Array | np.ndarray, "b 4 4"] | None, sides: Any, camera: Camera, settings: Settings
 ) -> Float[Array, "b g 4 4"]:
-    """Each pair's guess, the identity if left out, and the motions that its features ask for, one per kind;
-    not-a-number where there is none.
+    """Return each pair's guess (by default the identity) and the motions from its features, one per kind.
+
+    Feature motions are NaN where none was found.
 
     Raises:
-        GavoError: The guesses are no rigid motions, or not as many as there are pairs.
+        GavoError: The guesses are not rigid motions, or not as many as there are pairs.
     """
     shape = (len(sides[0].grey), 4, 4)
     if guesses is None:
@@ -120,10 +120,10 @@ def _as_numbers(guesses: Any) -> Float64[np.ndarray, "*b 4 4"]:
 
 
 def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray, "b 4 4"]:
-    """The rigid motions that guesses stand for: a search starts from each, and its result would be none otherwise.
+    """Make guesses exactly rigid, as the result of a search that starts from one is rigid only then.
 
     Raises:
-        GavoError: One is no rigid motion, or not finite.
+        GavoError: One is not a rigid motion, or not finite.
     """
     broken = np.flatnonzero(~is_rigid(guesses))
     if len(broken):
@@ -133,8 +133,9 @@ def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray,
 
 
 def align_rows(sides, camera, settings, keys, guesses, count: int | None = None) -> Alignment:
-    """`align_batch` of images that are stacked already, from the guesses of `starts_of`, its results on the device; of
-    the first `count` rows alone, where that is given.
+    """Align stacked images from the guesses of `starts_of`, with results on the device.
+
+    If `count` is given, only the first `count` rows are computed.
     """
     rows = len(guesses)
     count = rows if count is None else count
@@ -166,28 +167,28 @@ def align(
 ) -> Alignment:
     """Estimate the motion of the camera between two RGB-D frames.
 
-    The search takes each image as of one moment, its depth with it. Where a rolling shutter (`Camera.readout`) or a
-    delay of depth (a `Frame`'s stamps) says that it is not, the camera's velocity is needed, which the motion between
-    frames far apart does not tell. The preset `wide` finds both at the end (`alignment.own_motion`), `error`, `overlap`
-    and `explained` being those of the motion before. The driver knows the velocity from the frames before.
+    The search takes each image, with its depth, as exposed at one instant. With a rolling shutter (`Camera.readout`) or
+    a delay of depth (a `Frame`'s stamps), the camera's velocity is needed, too. The motion between frames far apart
+    doesn't give it. The preset `wide` estimates it at the end (`alignment.own_motion`); `error`, `overlap` and
+    `explained` are then those of the motion before. The driver knows the velocity from earlier frames.
 
     Args:
         reference: Frame t: a `Frame`, or a pair of arrays (grey, depth) of [H, W]; depth in units of
             `camera.depth_scale` a metre, 0 = no reading.
         target: Frame t + 1.
-        camera: Their camera. Lens distortion, where it has any, is taken out first.
-        settings: What searches and what is minimised; a solver stands for the default settings with that solver.
+        camera: Their camera. Any lens distortion is removed first.
+        settings: Solver and objective; a solver alone stands for the default settings with that solver.
         key: Random key; `jax.random.key(0)` by default. The same key gives the same result, bit for bit.
         guess: A motion target_T_reference to start from; the identity by default.
-        solver: Takes the place of the settings' solver.
+        solver: Replaces the settings' solver.
         options: Deprecated: `alignment` of the settings.
 
     Returns:
         `Alignment`; the camera's own motion is the inverse of its `target_T_reference`.
 
     Raises:
-        GavoError: The images are not of the camera's size, or hold no numbers of grey levels; the key is none, the
-            guess no rigid motion; or the call is traced, by `jax.jit` for instance.
+        GavoError: The images are not of the camera's size or do not hold grey levels, the key is not a key, the guess
+            is not a rigid motion, or the call is traced, by `jax.jit` for instance.
     """
     require_untraced(reference, target, camera, settings, solver, key, guess)
     settings = as_settings(settings, solver, alignment=options)
@@ -212,12 +213,12 @@ def align_batch(
     solver: Solver | None = None,
     options: AlignmentOptions | None = None,
 ) -> Alignment:
-    """Align B pairs in one compiled call; what it takes of memory beside the images does not grow with a large B.
+    """Align B pairs in one compiled call; apart from the images, memory use does not grow with a large B.
 
     Args:
         references: B frames: a list of `Frame` or of (grey, depth), or a pair of arrays of [B, H, W] from a camera
             without distortion.
-        targets: The other B frames, alike.
+        targets: The other B frames, likewise.
         camera: Their camera.
         settings: As in `align`.
         keys: [B] random keys; `jax.random.split(jax.random.key(0), B)` by default.
@@ -229,7 +230,7 @@ def align_batch(
         An `Alignment` of NumPy arrays with a leading axis B; `status` is an integer array.
 
     Raises:
-        GavoError: As of `align`, or the two sides differ in number, or there are none.
+        GavoError: As for `align`, or the two sides differ in number, or there are no pairs.
     """
     require_untraced(references, targets, camera, settings, solver, keys, guesses)
     settings = as_settings(settings, solver, alignment=options)

@@ -1,7 +1,7 @@
-"""Whether an image repeats itself, so that a motion may be off by a whole period of a pattern.
+"""Whether an image is repetitive, so that a motion may be off by a whole period of a pattern.
 
-Tiles, checks and wire netting look alike after a step of one period. E is as low there, and no covariance tells. Which
-of the steps it was, only what was known before can say.
+Tiles, checks and wire netting look alike after a step of one period. E is as low there, and no covariance shows it.
+Only prior knowledge can say which of the steps it was.
 """
 
 from typing import Any
@@ -16,35 +16,35 @@ from gavo_jax.frame_checks import some_of
 from gavo_jax.trajectory import inverse
 
 REPEATS = 0.6
-"""Correlation of an image with itself, shifted, from which on it may repeat itself. Rooms reach 0.4."""
+"""Autocorrelation of an image above which a shift may be a repetition. Ordinary rooms reach 0.4."""
 APART = 0.3
-"""How much lower that correlation has to be on the way to the shift: a smooth image is like itself everywhere."""
+"""Drop of the autocorrelation that is required on the way to the shift: smooth images correlate everywhere."""
 FARTHEST = 3
-"""The largest shift that is looked at is the view's size over this."""
+"""The largest shift that is examined is the view's size over this."""
 OVERLAP = 0.3
-"""Share of a plane that has to be seen before and after a shift."""
+"""Smallest share of a view of a plane that overlaps itself after a shift."""
 AHEAD = 0.2
 """Cosine between the optical axis and a plane's normal above which the plane lies ahead."""
 QUICK, EXACT = 4, 2
-"""Factors by which the image is made smaller: for a first look, and where that finds something."""
+"""Factors by which the image is reduced: for a quick test, and for the exact one if that is positive."""
 HINT = 0.3
-"""Correlation from which on a first look finds something: it takes no account of what lies outside."""
+"""Autocorrelation above which the quick test is positive; that one is not normalised by the overlap."""
 FAST = (1.0, 2.0)
-"""m/s and rad/s of a hand that moves fast."""
+"""m/s and rad/s of a fast hand."""
 NEAREST, FARTHEST_POINT, USUAL_DISTANCE = 0.1, 100.0, 1.5
-"""Metres: nothing is nearer, nor farther; and where an image without depth is taken to be."""
+"""Smallest and largest depth of any point, and the one assumed for an image without depth, metres."""
 NEARLY = 2.0
-"""Distance from what was expected to another repetition, over the distance to what was found, up to which it may be
-that one."""
+"""Another repetition may be the right one if its distance from the expected motion is at most this many times that of
+the motion found."""
 
 
 def repetitions(grey: Any, depth: Any, camera: Camera) -> list[tuple[Plane, Float64[np.ndarray, "n 3"]]]:
-    """Planes of a frame, and steps along each after which what is seen of it looks much as before, metres.
+    """Find a frame's planes with the steps along each, in metres, after which its view looks much as before.
 
     Args:
         grey: [H, W].
-        depth: In units of the camera's; 0 where nothing was read.
-        camera: Of both, by whose axes the steps are.
+        depth: Raw depth; 0 = no reading.
+        camera: Camera of both; the steps are along its axes.
     """
     if min(np.shape(grey)) < QUICK:
         return []
@@ -70,11 +70,11 @@ def _steps_along(plane: Plane, frame: Small) -> Float64[np.ndarray, "n 3"]:
 
 
 def _self_likeness(view: StraightView, exact: bool) -> Float[np.ndarray, "n m"]:
-    """Correlation of a view with itself by the shift; none is in the middle.
+    """Autocorrelation of a view as a function of the shift; zero shift is in the middle.
 
     Args:
-        view: Straight before a plane.
-        exact: Whether it is that of the parts that overlap, else of the view as a torus.
+        view: Frontal view of a plane.
+        exact: Whether to correlate only the parts that overlap; else the view wraps around.
     """
     there = view.inside.astype(np.float32)
     image = there * (view.grey - view.grey[view.inside].mean()) if view.inside.any() else there
@@ -104,7 +104,7 @@ def _self_likeness(view: StraightView, exact: bool) -> Float[np.ndarray, "n m"]:
 
 
 def _peaks(likeness: Float[np.ndarray, "n m"], least: float) -> Integer[np.ndarray, "k 2"]:
-    """Shifts (columns, rows) at which it is highest around, between which and no shift it is lower."""
+    """Return the shifts (columns, rows) of local maxima, with a drop between them and zero shift."""
     middle = np.array(likeness.shape) // 2
     highest = cv2.dilate(likeness, np.ones((5, 5), np.uint8))
     shifts = np.argwhere((likeness == highest) & (likeness > least)) - middle
@@ -119,7 +119,7 @@ def _peaks(likeness: Float[np.ndarray, "n m"], least: float) -> Integer[np.ndarr
 def _between_pixels(
     likeness: Float[np.ndarray, "n m"], shifts: Integer[np.ndarray, "k 2"]
 ) -> Float64[np.ndarray, "k 2"]:
-    """Return where parabolas through the likeness at peaks and beside them are highest."""
+    """Refine peaks to subpixel precision, by parabolas through the likeness at them and beside them."""
     padded = np.pad(likeness, 1, mode="edge")
     column, row = shifts.T + np.array(likeness.shape[::-1])[:, None] // 2 + 1
     here = padded[row, column]
@@ -134,13 +134,14 @@ def _between_pixels(
 
 
 def _difference(frame: Small, step: Float64[np.ndarray, " 3"], plane: Plane) -> float:
-    """Mean square, squared grey levels, of what a frame differs by from itself after a step of all it shows; infinite
-    where none of it is left in view.
+    """Return the mean squared difference, in squared grey levels, of a frame from itself after its scene is shifted.
+
+    It is infinite if nothing remains in view.
 
     Args:
-        frame: Of full size.
-        step: Metres, by the camera's axes.
-        plane: What is taken to be seen where nothing was read.
+        frame: Frame in full size.
+        step: Metres, along the camera's axes.
+        plane: Plane that is assumed where there is no reading.
     """
     image, q, step = frame.grey, frame.inverse_depth, step.astype(np.float32)
     z = 1 / np.where(q > 0, q, np.maximum(frame.inverse_depth_of(plane), 1 / FARTHEST_POINT))
@@ -153,12 +154,13 @@ def _difference(frame: Small, step: Float64[np.ndarray, " 3"], plane: Plane) -> 
 
 
 LEAST_SHIFT = 4.0
-"""Pixels from which on what was found is asked about: a third of the smallest period that a first look sees."""
+"""Distance in pixels from the expected motion above which a motion is examined: a third of the smallest period that the
+quick test sees."""
 AS_GOOD, NOISE = 6.0, 4.0
-"""What a repetition differs by, over E, up to which it explains the images as well; and squared grey levels that E has
-at least, as an image between pixels is a guess."""
+"""Largest ratio of a repetition's difference to E for it to explain the images as well, and a lower bound on that E,
+squared grey levels, as interpolated images are inexact."""
 MOST = 8
-"""Repetitions of each plane that are compared, the nearest."""
+"""Largest number of repetitions of each plane that are compared, the nearest ones."""
 
 
 def another_period_fits_expected(
@@ -169,14 +171,14 @@ def another_period_fits_expected(
     depth: Any,
     camera: Camera,
 ) -> bool:
-    """Whether a motion may be off by a period of a pattern: another repetition is nearly as near to what was expected.
+    """Whether a motion may be off by a period of a pattern: another repetition is about as near to the expected motion.
 
     Args:
         found: target_T_reference.
         error: Its E, squared grey levels.
-        expected: The same motion, by what was known before.
+        expected: The motion that was expected.
         grey: Grey of either frame, [H, W].
-        depth: Depth of the same frame, in units of the camera's.
+        depth: Raw depth of the same frame.
         camera: Camera of both frames.
     """
     apart = found @ inverse(expected)
@@ -193,15 +195,16 @@ def another_period_fits_expected(
 def another_period_is_in_reach(
     found: Float64[np.ndarray, "4 4"], error: Any, seconds: float, grey: Any, depth: Any, camera: Camera
 ) -> bool:
-    """Whether a motion of which nothing was known before may be off by a period of a pattern: another repetition is a
-    motion that a hand makes in that time.
+    """Whether a motion without prior may be off by a period of a pattern.
+
+    It may if another repetition is a motion that a hand can make in that time.
 
     Args:
         found: target_T_reference.
         error: Its E, squared grey levels.
-        seconds: Time that the motion took; infinite where that is not known.
+        seconds: Time that the motion took; infinite if unknown.
         grey: Grey of either frame, [H, W].
-        depth: Depth of the same frame, in units of the camera's.
+        depth: Raw depth of the same frame.
         camera: Camera of both frames.
     """
     reach = seconds * (FAST[0] + FAST[1] * _distance(depth, camera))
@@ -212,26 +215,27 @@ def another_period_is_in_reach(
 
 
 def _ahead(depth: Any, camera: Camera) -> Plane:
-    """A plane straight ahead, for what shows none."""
+    """Return a fronto-parallel plane, for frames that show none."""
     return Plane(np.array([0.0, 0.0, 1.0]), _distance(depth, camera))
 
 
 def _distance(depth: Any, camera: Camera) -> float:
-    """Metres, of the median of what is read."""
+    """Median depth, metres."""
     read = some_of(depth)
     read = read[read > 0]
     return max(float(np.median(read)) / float(camera.depth_scale), NEAREST) if read.size else USUAL_DISTANCE
 
 
 def _pixels(motion: Float64[np.ndarray, "4 4"], depth: Any, camera: Camera) -> float:
-    """Pixels by which a motion moves the middle of an image, about."""
+    """Approximate displacement of the image centre by a motion, pixels."""
     ahead = _ahead(depth, camera)
     return float(np.linalg.norm(_step_of(motion, ahead))) * float(camera.fx) / ahead.distance
 
 
 def _step_of(motion: Float64[np.ndarray, "4 4"], plane: Plane) -> Float64[np.ndarray, " 3"]:
-    """Metres along a plane by which a motion moves the point of it that is straight ahead, or where none is its
-    foot.
+    """Displacement, along a plane, of its point on the optical axis by a motion, metres.
+
+    If the plane does not lie ahead, its foot is taken instead.
     """
     cosine = plane.normal[2]
     point = np.array([0.0, 0.0, plane.distance / cosine]) if cosine > AHEAD else plane.foot
@@ -249,7 +253,7 @@ def _nearest(
 def _is_any_as_good(
     near: list[tuple[Plane, Float64[np.ndarray, "k 3"]]], error: Any, grey: Any, depth: Any, camera: Camera
 ) -> bool:
-    """Whether an image differs from itself after one of some planes' steps by no more than E allows."""
+    """Whether an image, after one of the planes' steps, differs from itself by no more than E allows."""
     if not any(len(steps) for _, steps in near):
         return False
     bound, full = AS_GOOD * max(float(error), NOISE), smaller(grey, depth, camera, 1)

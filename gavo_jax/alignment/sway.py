@@ -1,9 +1,9 @@
-"""The camera's velocity at a frame's own moment, as the rolling shutter shows it.
+"""The camera's velocity at a frame's timestamp, estimated from its rolling shutter distortion.
 
-The motion between two frames tells the mean velocity since the last one. A hand trembles several times a second: when a
-frame is taken the camera turns faster or slower than that, by up to half a radian a second, which stretches and shears
-the image. A search that knows the mean alone explains the stretch by a step to the side that a turn makes up for, a
-centimetre and more. So how far the frame's own velocity is from the mean, its sway, is an unknown beside the motion.
+The motion between two frames gives the mean velocity since the last one. But a hand trembles several times a second.
+At a frame's timestamp the camera turns faster or slower than that, by up to 0.5 rad/s, which stretches and shears the
+image. A search that knows only the mean explains the stretch by a sideways translation and a compensating rotation, a
+centimetre and more. So the difference of the frame's velocity from the mean, its sway, is an unknown beside the motion.
 """
 
 from typing import Any, NamedTuple
@@ -20,28 +20,27 @@ from gavo_jax.objective.problem import Problem
 from gavo_jax.se3 import adjoint, exp, rigid_inverse
 
 SHARE = 1.5
-"""Standard deviation of a sway, over that of the mean velocity's changes from pair to pair. By the truth of the TUM
-clips it is 0.5 to 0.9, whatever the rate (`benchmarks/acceleration.py`); single frames have much more."""
+"""Ratio of a sway's standard deviation to that of the mean velocity's changes from pair to pair. From the ground truth
+of the TUM clips it is 0.5 to 0.9 at any rate (`benchmarks/acceleration.py`); single frames have much more."""
 FORGETTING = 0.97
-"""Factor from frame to frame on the sum of the sways, which is expected to be no larger than one of them: the mean
-velocity follows them, so that they make up for each other. What does not is an error of the model (depth, lens), which
-would add up to drift."""
+"""Factor from frame to frame on the sum of the sways. The sum is expected to be no larger than one of them, as the mean
+velocity follows them and they cancel. What doesn't cancel is a model error (depth, lens), which would cause drift."""
 FIRST_CHANGES, LEAST_CHANGES = (0.03, 0.3), (0.002, 0.01)
-"""m/s and rad/s: changes of the mean velocity before any is known, and at least."""
+"""m/s and rad/s: initial value of the mean velocity's changes, and a lower bound on them."""
 REMEMBERED = 15.0
-"""Pairs that tell how much it changes, about."""
+"""Approximate number of last pairs that the mean velocity's changes are estimated from."""
 UNSWAYED = (0.03, 0.03)
 """Metres and radians: standard deviations of a motion that was found with the mean velocity."""
 DEPENDENT = 10.0
-"""Points that tell as much as one: errors of neighbours are alike. Over the square of the share of the points that have
-depth and are at rest: the less of the image these fill, the more alike are a turn and a step."""
+"""Number of points that carry as much information as one, as neighbours have similar errors. It is divided by the
+squared share of points with depth and at rest: the less of the image they fill, the more a turn looks like a step."""
 FRAMES = 2.0
-"""Factor on the covariance that comes from the target's sway: the reference's is known no better."""
+"""Factor on the covariance due to the target's sway, as the reference's is known no better."""
 ROUNDS = 2
-"""Gauss-Newton steps; one falls short of half the way."""
+"""Number of Gauss-Newton steps; a single one covers less than half the distance."""
 LARGEST_RISE = 0.003
-"""Share by which what refines a search's result may raise E: between pixels E is rough, by about that much, and the aim
-is the middle of its basin. Beyond, the motion stays, without sway."""
+"""Share by which refinement of a search's result may raise E: between pixels E is rough by about that much, and the aim
+is the centre of its basin. If E rises more, the motion stays as it was, without sway."""
 
 
 class VelocityChange(NamedTuple):
@@ -50,17 +49,17 @@ class VelocityChange(NamedTuple):
     summed: Float[Array, " 6"]
     """Sum of the last frames' sways, m/s and rad/s."""
     changes: Float[Array, " 2"]
-    """Mean square of the mean velocity's change from pair to pair, of one axis: (m/s)² and (rad/s)²."""
+    """Mean square of the mean velocity's change from pair to pair, per axis: (m/s)² and (rad/s)²."""
 
     @classmethod
     def unknown(cls) -> "VelocityChange":
-        """Before the first pair."""
+        """Return the state before the first pair."""
         still: Any = np.zeros(6, np.float32)
         changes: Any = np.square(np.asarray(FIRST_CHANGES, np.float32))
         return cls(still, changes)
 
     def after(self, sway: Float[Array, " 6"], change: Float[Array, " 6"]) -> "VelocityChange":
-        """Add one more pair: its sway and its mean velocity's change, m/s and rad/s."""
+        """Return the state after one more pair, given its sway and its mean velocity's change, m/s and rad/s."""
         squares = jnp.mean(jnp.square(change.reshape(2, 3)), axis=1)
         return VelocityChange(FORGETTING * (self.summed + sway), self.changes + (squares - self.changes) / REMEMBERED)
 
@@ -72,7 +71,7 @@ class VelocityChange(NamedTuple):
 
 
 class Swaying(NamedTuple):
-    """What is known of the sway before a frame is looked at."""
+    """Prior knowledge of a frame's sway."""
 
     elapsed: Float[Array, ""]
     """Seconds since the last frame."""
@@ -85,20 +84,20 @@ class Swayed(NamedTuple):
 
     motion: Float[Array, "4 4"]
     twist: Float[Array, " 6"]
-    """Velocity of the points in the target camera at its moment less the mean since the last frame, as a twist: metres
-    and radians over the time between the two."""
+    """Velocity of the points in the target camera at its timestamp, less the mean since the last frame, as a twist:
+    metres and radians over the time between the two."""
     covariance: Float[Array, "6 6"]
-    """What not knowing the sway adds to that of δ in motion · exp(δ)."""
+    """Contribution of the sway's uncertainty to the covariance of δ in motion · exp(δ)."""
     residuals: Residuals
 
 
 def unswayed(motion: Float[Array, "4 4"], residuals: Residuals) -> Swayed:
-    """A motion without sway."""
+    """Return a motion without sway."""
     return Swayed(motion, jnp.zeros(6), jnp.zeros((6, 6)), residuals)
 
 
 class Iterate(NamedTuple):
-    """Where the refinement stands after some of its steps."""
+    """State of the refinement after some of its steps."""
 
     motion: Float[Array, "4 4"]
     x: Float[Array, " 12"]
@@ -108,16 +107,16 @@ class Iterate(NamedTuple):
 
 
 def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying, points: Integer[Array, ""]) -> Swayed:
-    """The motion and the sway about the problem's origin, of which these are the residuals, that explain the images
-    best; the origin without sway where E would rise.
+    """Estimate the motion and sway that explain the images best, starting at the problem's origin and its residuals.
 
-    Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from what is known of both beforehand. A twist of the
-    target's own moves a point in row v as a step on the target's side would, times the row's time.
+    Minimises Σ w r² / (σ² DEPENDENT) plus the squared deviations from the priors of both. The target's sway moves a
+    point in row v as a step on the target's side does, times the row's time. If E would rise, the result is the origin
+    without sway.
     """
     readout = problem.objective.readout
     assert readout is not None, "only a rolling shutter shows a sway"
     known = (swaying.elapsed * swaying.velocity_change.deviation) ** -2.0
-    prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # of the sway, and of the sum
+    prior = jnp.concatenate([jnp.repeat(jnp.array(UNSWAYED), 3) ** -2.0, 2.0 * known])  # on the sway and on the sum
     share = problem.objective.readings() / points
     factor = share**2 / (problem.objective.scales.grey**2 * DEPENDENT)
 
@@ -135,7 +134,7 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying, poi
         return Iterate(motion, x, problem.with_sway(x[6:]).objective.residuals(motion), hessian)
 
     start = Iterate(problem.origin, jnp.zeros(12), residuals, jnp.diag(prior))
-    # a loop, as steps written out one by one take XLA a second longer
+    # a loop, as XLA takes a second longer to compile unrolled steps
     motion, x, r, hessian = jax.lax.fori_loop(0, ROUNDS, step_on, start)
     objective = problem.with_sway(x[6:]).objective
     error, _ = objective.error_of(r)
@@ -148,6 +147,6 @@ def refine_swaying(problem: Problem, residuals: Residuals, swaying: Swaying, poi
 
 
 def _from_sway(hessian: Float[Array, "12 12"]) -> Float[Array, "6 6"]:
-    """Covariance of the motion that comes from the sway's: what is left of it where that is known is taken off."""
+    """Contribution of the sway's uncertainty to the motion's covariance: marginal minus conditional covariance."""
     follows = jnp.linalg.solve(hessian[:6, :6], hessian[:6, 6:])
     return follows @ jnp.linalg.inv(hessian[6:, 6:] - hessian[6:, :6] @ follows) @ follows.T

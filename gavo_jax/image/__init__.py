@@ -1,1 +1,1 @@
-"""One image of a frame: pyramid, levels, warp, shutter and sampling."""
+"""Operations on a frame's images: pyramid, levels, warp, rolling shutter and sampling."""

@@ -1,6 +1,6 @@
-"""Geometry of the levels: what follows from an image's size, the levels that are searched and the number of points.
+"""Geometry of the levels, from the image's size, the levels that are searched and the number of points.
 
-Made once for a search and handed along. Nothing in it is an input of a program: it shapes them.
+It is made once per search and passed along. It is static: it shapes the compiled programs and is no input of them.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,18 @@ PointsPerLevel = int | None | tuple[int, ...]
 
 
 class AtlasLayout(NamedTuple):
-    """Where levels lie in an atlas: the largest on top, the others from left to right below, a pixel between them."""
+    """Positions of levels in an atlas: the largest on top, the others below from left to right, one pixel apart."""
 
     height: int
     width: int
     corners: tuple[tuple[int, int], ...]
     """Row and column of each level's first pixel."""
     gap: int
-    """Place, in the flat image, of a pixel that belongs to no level."""
+    """Index, in the flattened image, of a pixel that belongs to no level."""
 
 
 class ImagePlane(NamedTuple):
-    """Intrinsics and place of a pyramid level as numbers that a program takes as input, so that one compiled program
-    serves every level.
-    """
+    """Intrinsics and atlas position of a pyramid level, as inputs of a program that is compiled once for all levels."""
 
     fx: Float[Array, "*l"]
     fy: Float[Array, "*l"]
@@ -44,7 +42,7 @@ class ImagePlane(NamedTuple):
     offset: Integer[Array, "*l"]
     """Offset of the level's first pixel in the packed target."""
     stride: Integer[Array, "*l"]
-    """Pixels from one in the packed target to the one below it."""
+    """Number of pixels from one row of the packed target to the next."""
 
 
 @dataclass(frozen=True)
@@ -65,37 +63,37 @@ class Levels:
 
     @classmethod
     def of(cls, camera: Camera, numbers: tuple[int, ...], points: PointsPerLevel = None) -> Self:
-        """Those of a camera."""
+        """Return the given levels of a camera."""
         return cls(camera.width, camera.height, tuple(numbers), points)
 
     @cached_property
     def sizes(self) -> list[tuple[int, int]]:
-        """Height and width of each."""
+        """Height and width of each level."""
         return [(self.height >> number, self.width >> number) for number in self.numbers]
 
     @cached_property
     def layout(self) -> AtlasLayout:
-        """Places of the levels in an atlas."""
+        """Positions of the levels in an atlas."""
         return atlas_layout(self.sizes)
 
     @cached_property
     def cells(self) -> list[int]:
-        """Side of the blocks of pixels that give one point each."""
+        """Side of the blocks of pixels that give one point each, for each level."""
         most = [self.points[number] if isinstance(self.points, tuple) else self.points for number in self.numbers]
         return [cell_of(height, width, count) for (height, width), count in zip(self.sizes, most, strict=True)]
 
     @cached_property
     def grids(self) -> list[tuple[int, int]]:
-        """Rows and columns of the points of each."""
+        """Rows and columns of points on each level."""
         return [(height // cell, width // cell) for (height, width), cell in zip(self.sizes, self.cells, strict=True)]
 
     @property
     def most_points(self) -> int:
-        """Points of the level that has the most, N of `objective.points.make_references`."""
+        """Number of points of the level that has the most, N of `objective.points.make_references`."""
         return max(rows * columns for rows, columns in self.grids)
 
     def planes(self, camera: Camera) -> ImagePlane:
-        """Planes of the levels, [L], packed together."""
+        """Return the planes of the levels, [L], packed together."""
         intrinsics = camera.scaled(np.float32(0.5) ** np.array(self.numbers, np.float32))
         height, width = np.array(self.sizes).T
         offset = [row * self.layout.width + column for row, column in self.layout.corners]
@@ -104,12 +102,12 @@ class Levels:
 
 
 def image_plane(camera: Camera) -> ImagePlane:
-    """The plane of one image that is packed alone."""
+    """Return the plane of an image that is packed alone."""
     return jax.tree.map(lambda leaf: leaf[0], Levels.of(camera, (0,)).planes(camera))
 
 
 def cell_of(height: int, width: int, points: int | None) -> int:
-    """Side of the blocks that give one point each, so that an image gives at most `points`; None takes every pixel."""
+    """Return the side of the blocks of one point each that give at most `points`; None takes every pixel."""
     cell = 1
     while points is not None and (width // cell) * (height // cell) > points and cell < min(height, width):
         cell += 1
@@ -117,7 +115,7 @@ def cell_of(height: int, width: int, points: int | None) -> int:
 
 
 def atlas_layout(sizes: Sequence[tuple[int, int]]) -> AtlasLayout:
-    """The layout of levels of some sizes (height, width), whose order `corners` keeps."""
+    """Lay out levels of the given sizes (height, width); `corners` keeps their order."""
     top = max(sizes)
     corners, column, below = [], 0, 0
     for size in sizes:

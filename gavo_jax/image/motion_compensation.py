@@ -1,7 +1,7 @@
-"""A frame as a camera without rolling shutter would have taken it, at half its size, its depth read at the same moment.
+"""Motion compensation of a frame, at half its size: global shutter, and depth at the image's timestamp.
 
-A keyframe is aligned with others from other times, where neither frame's motion is the motion between the two. So what
-its own motion did to it is taken out once, and everything after sees plain images of one moment each.
+Keyframes are aligned with ones from other times, and neither frame's own motion is the motion between the two. So its
+effect on a keyframe is removed once, and everything after sees images that were taken at one instant.
 """
 
 from typing import NamedTuple
@@ -16,17 +16,17 @@ from gavo_jax.image.pyramid import EDGE_TOLERANCE
 from gavo_jax.image.shutter import row_time
 
 HALVING = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0
-"""Weights along either side of the pixels that become one, as in `pyramid.halve_grey`."""
+"""Weights, along either axis, of the pixels that are averaged, as in `pyramid.halve_grey`."""
 UNKNOWN_DEPTH = 2.0
-"""Metres that a pixel is taken to be away where the whole image has no reading."""
+"""Depth in metres that is assumed if the whole image has no reading."""
 
 
 class CompensatedImages(NamedTuple):
-    """What a keyframe keeps of its images: a camera of half the size, `Camera.level(1)`."""
+    """Motion-compensated images of a keyframe in half size, with the camera `Camera.level(1)`."""
 
     grey: UInt8[np.ndarray, "h w"]
     depth: Depth
-    """In the camera's units, 0 = no reading."""
+    """Depth in the camera's units, 0 = no reading."""
 
 
 def compensate_motion(
@@ -36,17 +36,17 @@ def compensate_motion(
     twist: Float[np.ndarray, " 6"],
     depth_delay: float = 0.0,
 ) -> CompensatedImages:
-    """Images of one moment from those that a moving camera took.
+    """Convert images from a moving camera to ones taken at a single instant.
 
-    A point P of the frame's moment is seen in row v at exp(t ξ̂) P, t = `row_time`(v) readouts; its depth is read a
-    delay later. To first order each pixel looks grey and depth up where its point was then.
+    A point that is at P at the frame's timestamp is seen in row v at exp(t ξ̂) P, t = `row_time`(v) readouts; its depth
+    is read a delay later. Each pixel looks up grey and depth where its point was then, to first order.
 
     Args:
         grey: Intensities.
         depth: Raw depth, 0 = no reading.
-        camera: Of the images, without distortion.
+        camera: Camera of the images, without distortion.
         twist: Motion of the points in the camera, (v, w) in m/s and rad/s.
-        depth_delay: Seconds from the colour image's moment to the depth image's.
+        depth_delay: Seconds from the colour image's timestamp to the depth image's.
     """
     grey, depth, camera = halve_grey(grey_bytes(grey)), halve_depth(depth), camera.level(1)
     twist = np.asarray(twist, np.float32)
@@ -69,7 +69,7 @@ def compensate_motion(
 def pixel_flow(
     camera: Camera, u: np.ndarray, v: np.ndarray, q: np.ndarray, twist: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Motion of each pixel along u and v, pixels a second, and the rotation's part in its depth's relative rate."""
+    """Flow of each pixel along u and v, pixels a second, and the rotation's part in the relative rate of its depth."""
     x, y = to_ray(camera, u, v)
     (a, b, c), (wx, wy, wz) = twist[:3], twist[3:]
     forward = wx * y - wy * x
@@ -80,7 +80,7 @@ def pixel_flow(
 
 
 def filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """1/z [1/m], gaps filled from their surroundings."""
+    """Inverse depth, 1/m, with gaps filled from their surroundings."""
     q = inverse_depth(depth, camera).astype(np.float32)
     known = q > 0
     usual = np.float32(np.median(q[known])) if known.any() else np.float32(1.0 / UNKNOWN_DEPTH)
@@ -91,7 +91,7 @@ def filled_inverse_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def halve_grey(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
-    """Half the size, as the pyramid does it."""
+    """Halve a grey image, as the pyramid does."""
     height, width = (size // 2 * 2 for size in grey.shape)
     blurred = cv2.sepFilter2D(
         grey[:height, :width], cv2.CV_32F, HALVING, HALVING, anchor=(1, 1), borderType=cv2.BORDER_REPLICATE
@@ -100,7 +100,7 @@ def halve_grey(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
 
 
 def halve_depth(depth: Shaped[np.ndarray, "h w"]) -> Depth:
-    """Half the size: of each 2 × 2 block the mean of the nearest surface's readings, as the pyramid does it."""
+    """Halve a depth image: average the readings on the nearest surface of each 2 × 2 block, as in the pyramid."""
     height, width = (size // 2 * 2 for size in depth.shape)
     block = depth[:height, :width].reshape(height // 2, 2, width // 2, 2).transpose(1, 3, 0, 2).reshape(4, -1)
     readings = np.where(block > 0, block.astype(np.float32), np.inf)

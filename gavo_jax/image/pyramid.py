@@ -15,8 +15,8 @@ from gavo_jax.image.levels import atlas_layout
 
 LEVELS = 5
 
-# Two surfaces whose inverse depths differ by more than this share are not averaged: a 2x2 block across an edge keeps
-# the nearer one.
+# Inverse depths that differ by more than this share are of two surfaces and are not averaged: a 2x2 block across an
+# edge keeps the nearer one.
 EDGE_TOLERANCE = 0.03
 
 
@@ -41,7 +41,7 @@ def halve_grey(grey: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
 
 
 def _halve(taps: Sequence[jax.Array], axis: int) -> jax.Array:
-    """[1 3 3 1]/8 of four taps; the first and the last place of an axis have none outside."""
+    """Apply [1 3 3 1]/8 to four taps; at the ends of the axis the tap outside is replicated."""
     place = jax.lax.broadcasted_iota(jnp.int32, taps[0].shape, axis)
     before = jnp.where(place == 0, taps[1], taps[0])
     after = jnp.where(place == taps[0].shape[axis] - 1, taps[2], taps[3])
@@ -49,10 +49,10 @@ def _halve(taps: Sequence[jax.Array], axis: int) -> jax.Array:
 
 
 def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
-    """Mean inverse depth of each 2x2 block over the readings on the block's nearest surface; 0 where there are none.
+    """Halve an image of inverse depth: the mean reading on each 2x2 block's nearest surface; 0 where there is none.
 
-    Inverse depth is what is averaged because it is affine in the pixel coordinates on a plane, and because the
-    sensor's noise is uniform in it.
+    Inverse depth is averaged because it is affine in the pixel coordinates on a plane, and because the sensor's noise
+    is uniform in it.
     """
     height, width = inverse_depth.shape
     rows = inverse_depth[: height // 2 * 2, : width // 2 * 2]
@@ -71,7 +71,7 @@ def build_pyramid(
     depth_scale: Float[Array, ""] | float,
     levels: int = LEVELS,
 ) -> Pyramid:
-    """Pyramid of a frame from its raw images.
+    """Build the pyramid of a frame from its raw images.
 
     Args:
         grey: [H, W] intensity, 0 to 255, of any number type.
@@ -92,9 +92,9 @@ def build_pyramid(
 
 
 class Atlas(NamedTuple):
-    """Levels of a frame in one image, so that a step of the work on them is one operation and not one a level.
+    """Levels of a frame in one image, so that each step processes all of them in one operation.
 
-    Around what the layout says lies a margin of no pixels, one row and column before and two behind: a pixel's
+    The layout is surrounded by an empty margin, one row and column before it and two behind, so that a pixel's
     neighbours are slices of the image.
     """
 
@@ -105,11 +105,11 @@ class Atlas(NamedTuple):
 
 
 NO_PIXEL = -1.0
-"""Grey of what is no pixel."""
+"""Grey value of places that are not pixels."""
 
 
 def make_atlas(levels: Sequence[PyramidLevel]) -> Atlas:
-    """The atlas of some levels, laid out as `levels.atlas_layout` says."""
+    """Make the atlas of some levels, with the layout of `levels.atlas_layout`."""
     layout = atlas_layout([(level.grey.shape[0], level.grey.shape[1]) for level in levels])
     size = (layout.height + 3, layout.width + 3)
     grey, inverse_depth = jnp.full(size, NO_PIXEL), jnp.zeros(size)

@@ -1,7 +1,7 @@
 """Sampling the target image at warped points.
 
-The target's 2x2 neighbourhoods are packed into one 32-bit word a pixel, so that a residual costs one gather: on a CPU
-this is what decides the speed of the whole program (`benchmarks/kernel.py` prints by how much).
+The target's 2x2 neighbourhoods are packed into one 32-bit word per pixel, so that a residual costs one gather. On a CPU
+this decides the speed of the whole program (`benchmarks/kernel.py` prints by how much).
 """
 
 from typing import NamedTuple
@@ -15,17 +15,17 @@ from gavo_jax.image.pyramid import Atlas
 from gavo_jax.image.warp import Warped
 
 INVERSE_DEPTH_STEP = 1.0 / 8192.0
-"""1/m a unit of the packed inverse depth: 16 bits reach 8 1/m (12.5 cm) at a twentieth of a first Kinect's steps."""
+"""Unit of packed inverse depth, 1/m: 16 bits reach 8 1/m (12.5 cm) in a twentieth of a first Kinect's steps."""
 SAME_SURFACE = 0.1
-"""Neighbouring readings of inverse depth that differ by less than this share are of one surface."""
+"""Neighbouring readings whose inverse depths differ by less than this share are of one surface."""
 SLOPE_STEP = 1.0 / 4096.0
-"""1/m a pixel and unit of the packed inverse-depth slopes (signed 8 bits)."""
+"""Unit of packed inverse-depth slopes (signed 8 bits), 1/m a pixel."""
 
 
 class Target(NamedTuple):
-    """Levels of the target frame, packed for sampling with one gather a channel; laid out as an `Atlas`.
+    """Levels of the target frame, packed for sampling with one gather per channel; laid out as an `Atlas`.
 
-    Flat arrays would do as well, but to write them XLA would divide every place into row and column.
+    They are not flat arrays, as XLA would divide every index into row and column to write them.
     """
 
     grey: UInt32[Array, "h w"]
@@ -35,7 +35,7 @@ class Target(NamedTuple):
 
 
 def pack_grey(grey: Float[Array, "h+1 w+1"]) -> UInt32[Array, "h w"]:
-    """The 2x2 neighbourhood of every pixel but the last ones in one word; rounding to 8 bits is far below the noise."""
+    """Pack the 2x2 neighbourhood of every pixel but the last ones into a word; rounding is far below the noise."""
     rounded = jnp.clip(jnp.round(grey), 0, 255).astype(jnp.uint32)
     pair = rounded[:, :-1] | (rounded[:, 1:] << 8)
     return pair[:-1] | (pair[1:] << 16)
@@ -44,7 +44,7 @@ def pack_grey(grey: Float[Array, "h+1 w+1"]) -> UInt32[Array, "h w"]:
 def inverse_depth_slopes(
     inverse_depth: Float[Array, "h+2 w+2"],
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from whichever neighbours lie on the same surface; 0 where none does.
+    """Return ∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from neighbours on the same surface; 0 where there are none.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, with a margin of one pixel.
@@ -64,10 +64,10 @@ def inverse_depth_slopes(
 
 
 def pack_depth(inverse_depth: Float[Array, "h+3 w+3"]) -> UInt32[Array, "h w"]:
-    """Inverse depth and its slopes in one word: a plane about the middle of the 2x2 block that starts at the pixel, so
-    that sampling between pixels needs no neighbours.
+    """Pack inverse depth and its slopes into a word: a plane about the middle of the 2x2 block that starts at a pixel.
 
-    Each of the four readings says by its own slopes what lies in the middle; those on the nearest surface are averaged.
+    Sampling between pixels then needs no neighbours. Each of the four readings is extrapolated to the middle by its own
+    slopes; those on the nearest surface are averaged.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, with the margin of an `Atlas`.
@@ -100,7 +100,7 @@ def pack_target(atlas: Atlas) -> Target:
 
 
 class Words(NamedTuple):
-    """What the target holds at the warped points' pixels: a packed word a channel, [*n]."""
+    """Packed words of the target at the warped points' pixels, one per channel, [*n]."""
 
     grey: UInt32[Array, "*n"]
     depth: UInt32[Array, "*n"]
@@ -130,7 +130,7 @@ def _byte(word: jax.Array, shift: int) -> jax.Array:
 
 
 def sample_grey(words: Words, warped: Warped) -> GreySample:
-    """I_{t+1}(ω(ξ, p)), bilinear; what lies outside the image is meaningless and must be masked by `inside`."""
+    """I_{t+1}(ω(ξ, p)), bilinear; values outside the image are meaningless and must be masked by `inside`."""
     a, b = warped.u - jnp.floor(warped.u), warped.v - jnp.floor(warped.v)
     top_left, top_right, low_left, low_right = (_byte(words.grey, shift) for shift in (0, 8, 16, 24))
     top = top_left + a * (top_right - top_left)
@@ -149,7 +149,7 @@ class DepthSample(NamedTuple):
 
 
 def sample_depth(words: Words, warped: Warped) -> DepthSample:
-    """Inverse depth of the target's surface at the warped points, from the plane of the block that was looked up."""
+    """Inverse depth of the target's surface at the warped points, from the plane of each point's block."""
     value = (words.depth & 65535).astype(jnp.int32).astype(jnp.float32) * INVERSE_DEPTH_STEP
     along_u = (_byte(words.depth, 16) - 128.0) * SLOPE_STEP
     along_v = (_byte(words.depth, 24) - 128.0) * SLOPE_STEP

@@ -1,4 +1,4 @@
-"""The rolling shutter: rows are exposed one after the other while the camera moves on."""
+"""The rolling shutter: rows are exposed one after the other while the camera moves."""
 
 from typing import Any, NamedTuple
 
@@ -13,29 +13,29 @@ from gavo_jax.image.warp import Points, Slopes, Warped, has_neighbours
 
 
 class Shutter(NamedTuple):
-    """A rolling shutter that reads row after row while the camera moves on."""
+    """A rolling shutter's readout, the row times of points, and the target's sway."""
 
     readout: Float[Array, ""]
-    """Of the motion between the two frames, the share that falls between the target's first and last row; negative
-    where the target was taken before the reference."""
+    """Share of the motion between the two frames that passes between the target's first and last row; negative if the
+    target was taken before the reference."""
     row_time: Float[Array, "*n"]
-    """When each reference point was seen, in readouts after its frame's moment (that of the middle row); 0 where the
-    point was moved there."""
+    """Time at which each reference point was seen, in readouts after its frame's timestamp (the middle row's); 0 where
+    the rolling shutter was undone."""
     sway: Float[Array, " 6"] | None = None
-    """Twist, over the same time, that the points in the target camera have at the target's moment beside that motion;
-    see `alignment.sway`."""
+    """Additional twist, over the same time, of the points in the target camera at the target's timestamp; see
+    `alignment.sway`."""
 
 
 def row_time(v: Float[Array | np.ndarray, "*n"] | float, camera: Camera | ImagePlane) -> Any:
-    """When rows are exposed, in readouts after the middle of the image."""
+    """Return the exposure times of rows, in readouts after that of the image's middle."""
     return (v + 0.5) / camera.height - 0.5
 
 
 def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane) -> Warped:
-    """Return where warped points really are when the row on which they land is read.
+    """Return where warped points really are when the row that they land on is read.
 
-    The camera moves on along ξ meanwhile, so each point goes on along its own way from the reference, by the share of
-    the motion that falls into its delay; and by its sway on top of that. To first order in that share, a few hundredths
+    Meanwhile the camera moves on along ξ. So each point continues along its path from the reference by the share of the
+    motion that falls into its delay, plus its sway. This is to first order in that share, which is a few hundredths
     between frames of a video.
     """
     share, way = _passed(points, warped, shutter, camera)
@@ -51,7 +51,7 @@ def delay(points: Points, warped: Warped, shutter: Shutter, camera: Camera | Ima
 def twist_flow(
     twist: Float[Array, " 6"], warped: Warped, camera: Camera | ImagePlane
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """How far a small twist moves the points that are seen at pixels: along u, v and 1/z."""
+    """Return the motion of points seen at pixels by a small twist: along u, v and 1/z."""
     (x, y), q, (v, w) = to_ray(camera, warped.u, warped.v), warped.inverse_depth, (twist[:3], twist[3:])
     away = w[0] * y - w[1] * x + v[2] * q
     along_u = camera.fx * (w[1] - w[2] * y + v[0] * q - x * away)
@@ -62,7 +62,7 @@ def twist_flow(
 def delayed_slopes(
     slopes: Slopes, points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane
 ) -> Slopes:
-    """Slopes along `warped`'s own (u, v, 1/z), from those along its `delay`ed values."""
+    """Return slopes with respect to `warped`'s (u, v, 1/z), from those with respect to its `delay`ed values."""
     share, way = _passed(points, warped, shutter, camera)
     later = shutter.readout / camera.height * sum(slope * step for slope, step in zip(slopes, way, strict=True))
     along_u, along_v, along_inverse_depth = ((1.0 + share) * slope for slope in slopes)
@@ -72,7 +72,7 @@ def delayed_slopes(
 def _passed(
     points: Points, warped: Warped, shutter: Shutter, camera: Camera | ImagePlane
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
-    """Share of the motion that falls into each point's delay, and the points' ways (u, v, 1/z) from the reference."""
+    """Return the share of the motion in each point's delay, and the points' paths (u, v, 1/z) from the reference."""
     share = shutter.readout * (row_time(warped.v, camera) - shutter.row_time)
     u, v = to_pixels(camera, points.x, points.y)
     return share, (warped.u - u, warped.v - v, warped.inverse_depth - points.q)

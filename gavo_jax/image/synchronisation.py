@@ -1,4 +1,4 @@
-"""Depth at the colour image's moment, where the two were not exposed together."""
+"""Warping of depth to the colour image's timestamp, if the two were not exposed together."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,15 +11,15 @@ from gavo_jax.se3 import rigid_inverse
 def synchronise_depth(
     inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
 ) -> Float[Array, "h w"]:
-    """Inverse depth as the camera would have read it at the colour image's moment.
+    """Warp inverse depth to what the camera would have read at the colour image's timestamp.
 
-    A structured-light camera's depth and colour images are not exposed together: TUM's pairs lie up to 20 ms apart,
-    at handheld speed several pixels. Each pixel looks up, in the depth image, where its point was when that was taken.
+    A structured-light camera's depth and colour images are not exposed together: TUM's pairs are up to 20 ms apart,
+    several pixels at handheld speed. Each pixel looks up the depth image where its point was when that was taken.
 
     Args:
-        inverse_depth: [h, w] 1/m, 0 = no reading, seen by the camera where it stood when depth was read.
+        inverse_depth: [h, w] 1/m, 0 = no reading, seen from the camera's pose when depth was read.
         camera: Camera of the image.
-        depth_T_colour: Maps points of the camera at the colour image's moment into the camera at the depth image's.
+        depth_T_colour: Maps points of the camera at the colour image's timestamp into that at the depth image's.
     """
     height, width = inverse_depth.shape
     x, y = to_ray(camera, jnp.arange(width), jnp.arange(height)[:, None])

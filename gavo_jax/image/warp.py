@@ -23,18 +23,18 @@ class Points(NamedTuple):
 
 
 class Warped(NamedTuple):
-    """Reference points seen by the target camera, all at one moment."""
+    """Reference points seen by the target camera, all at one instant."""
 
     u: Float[Array, "*n"]
     v: Float[Array, "*n"]
     inverse_depth: Float[Array, "*n"]
     """1/z in the target camera, 1/m."""
     inside: Float[Array, "*n"]
-    """1 where the point has a reading, lies before the camera and inside the image, else 0."""
+    """1 where the point has a reading, lies in front of the camera and inside the image, else 0."""
 
 
 class Slopes(NamedTuple):
-    """Derivatives of what is sampled at warped points, by their coordinates; see `Warped`."""
+    """Derivatives of a sampled quantity with respect to the coordinates of warped points; see `Warped`."""
 
     along_u: Float[Array, "*n"]
     along_v: Float[Array, "*n"]
@@ -42,12 +42,12 @@ class Slopes(NamedTuple):
 
 
 def has_neighbours(u: Float[Array, "*n"], v: Float[Array, "*n"], camera: Camera | ImagePlane) -> Bool[Array, "*n"]:
-    """Whether the four pixels around a place lie in the image."""
+    """Whether the four pixels around a position lie in the image."""
     return (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
 
 
 def moved(points: Points, camera_T_reference: Float[Array, "4 4"]) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Points seen from another camera, their coordinates times their old inverse depth: R (x, y, 1) + t q."""
+    """Return points in another camera's frame, scaled by their old inverse depth: R (x, y, 1) + t q."""
     r, t = camera_T_reference[:3, :3], camera_T_reference[:3, 3]
     x, y, q = points
     along = [r[i, 0] * x + r[i, 1] * y + (r[i, 2] + t[i] * q) for i in range(3)]

@@ -24,18 +24,18 @@ class Linearization(NamedTuple):
 
 
 def pixel_jacobian(slopes: Slopes, warped: Warped, camera: Camera | ImagePlane) -> Float[Array, "6 n"]:
-    """Derivative by a step δ on the target's side, exp(δ) · target_T_reference, by way of u, v and 1/z."""
+    """Derivative with respect to a step δ on the target's side, exp(δ) · target_T_reference, through u, v and 1/z."""
     (x, y), q = to_ray(camera, warped.u, warped.v), warped.inverse_depth
     pull_x, pull_y = slopes.along_u * camera.fx, slopes.along_v * camera.fy
     pull_z = -(pull_x * x + pull_y * y + slopes.along_inverse_depth * q)
-    # held back, or XLA would compute what is sampled once more for each of the six rows
+    # a barrier, or XLA would compute the samples anew for each of the six rows
     x, y, q, pull_x, pull_y, pull_z = jax.lax.optimization_barrier((x, y, q, pull_x, pull_y, pull_z))
     turns = (y * pull_z - pull_y, pull_x - x * pull_z, x * pull_y - y * pull_x)
     return jnp.stack([q * pull_x, q * pull_y, q * pull_z, *turns]).reshape(6, -1)
 
 
 def depth_slopes(along_u: Float[Array, "*n"], along_v: Float[Array, "*n"], facing: Float[Array, "*n"]) -> Slopes:
-    """Slopes of depth residuals, from those of an image of inverse depth and how far its surface faces the camera."""
+    """Slopes of depth residuals, from those of the inverse-depth image and its surface's inclination."""
     return Slopes(facing * along_u, facing * along_v, -facing)
 
 
@@ -44,9 +44,7 @@ Term = tuple[Float[Array, "6 n"], Float[Array, " n"], Float[Array, " n"]]
 
 
 def linearize(objective: Objective, motion: Float[Array, "4 4"], tangent: Float[Array, "6 6"]) -> Linearization:
-    """E of one direction and its first two derivatives at a motion, by coordinates of which exp(tangent · dx) follows
-    it.
-    """
+    """E of one direction and its first two derivatives at a motion, in coordinates with step exp(tangent · dx)."""
     mean = objective.mean_residual(motion)
 
     def part(reference: Reference) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -60,15 +58,16 @@ def linearize(objective: Objective, motion: Float[Array, "4 4"], tangent: Float[
 def linearization(
     objective: Objective, tangent: Float[Array, "6 6"], sums: jax.Array, gradient: jax.Array, hessian: jax.Array
 ) -> Linearization:
-    """E and its derivatives from sums over the points: of costs and points inside, and of the normal equations."""
+    """E and its derivatives from sums over the points: costs, number of points inside, and normal equations."""
     error, overlap = objective.error_and_overlap(sums)
     factor = 2.0 / objective.divisor(sums[1])
     return Linearization(error, overlap, factor * tangent.T @ gradient, factor * tangent.T @ hessian @ tangent)
 
 
 def weighted_terms(objective: Objective, reference: Reference, r: Residuals) -> list[Term]:
-    """Return each channel's J of [6, N], r and w of [N]: half of E's gradient, by a step on the target's side, is
-    Σ J w r over the number of points, half its Gauss-Newton Hessian Σ w J Jᵀ.
+    """Return each channel's J [6, N], r [N] and w [N], for a step on the target's side.
+
+    Divided by the number of points, Σ J w r is half of E's gradient and Σ w J Jᵀ half of its Gauss-Newton Hessian.
     """
     scales, facing, shutter = objective.scales, reference.facing, objective.shutter(reference)
     grey, depth = r.grey_sample, r.depth_sample

@@ -1,10 +1,10 @@
 """The photometric error E(ξ) of a whole population of motions in one call, equations (1) and (2).
 
 r_i(ξ) = I_{t+1}(ω(ξ, p_i)) − I_t(p_i) over the reference's points; E(ξ) = mean of a loss of r_i over the points that
-land inside the target. With the L2 loss and nothing else switched on this is the paper's objective to the letter.
-Beyond it: robust losses whose scale comes from the data, an affine brightness change between the frames, and a depth
-residual 1/z_{t+1}(ω(ξ, p_i)) − 1/z_i(ξ). Inverse depth is the right quantity: σ_z ∝ z² for a structured-light sensor,
-so the noise of 1/z is the same at every range and one scale serves all pixels.
+land inside the target. With the L2 loss and everything else switched off this is exactly the paper's objective.
+Extensions are robust losses whose scale comes from the data, an affine brightness change between the frames, and a
+depth residual 1/z_{t+1}(ω(ξ, p_i)) − 1/z_i(ξ). It is taken in inverse depth: σ_z ∝ z² for a structured-light sensor, so
+the noise of 1/z is the same at every range and one scale serves all pixels.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from gavo_jax.se3 import rigid_inverse
 
 
 class Scales(NamedTuple):
-    """What is estimated from the data before a level is searched, and held while its candidates are compared."""
+    """Scales estimated from the data before a level is searched, and fixed while its candidates are compared."""
 
     grey: Float[Array, ""]
     """Scale σ of the grey residuals, grey levels."""
@@ -37,18 +37,18 @@ class Scales(NamedTuple):
 
     @property
     def depth_factor(self) -> Float[Array, ""]:
-        """What the square of a depth residual counts against that of a grey one."""
+        """Weight of a squared depth residual relative to that of a grey one."""
         return self.depth_weight * (self.grey / self.depth) ** 2
 
     @classmethod
     def unit(cls) -> "Scales":
-        """Scales that leave residuals as they are, without depth: the paper's error."""
+        """Return unit scales without depth: the paper's error."""
         one = jnp.float32(1.0)
         return cls(one, one, jnp.float32(0.0))
 
 
 class Residuals(NamedTuple):
-    """Residuals of one motion at every reference point, with what a derivative needs."""
+    """Residuals of one motion at every reference point, with the samples that derivatives need."""
 
     grey: Float[Array, "*n"]
     """Grey levels; the paper's residual after the brightness model, about its mean where the objective is `centred`."""
@@ -56,27 +56,27 @@ class Residuals(NamedTuple):
     """Inverse depth, 1/m, along the surface normal; 0 where `depth_valid` is 0."""
     inside: Float[Array, "*n"]
     lit: Float[Array, "*n"]
-    """The reference's, see `Reference`."""
+    """From the reference; see `Reference`."""
     depth_valid: Float[Array, "*n"]
     warped: Warped
-    """Before any delay by the shutter."""
+    """Warped points before any delay by the rolling shutter."""
     grey_sample: GreySample
     depth_sample: DepthSample
 
 
 GROUP = 8
-"""Candidates that are scored side by side on a CPU; a population's size is best a multiple of it."""
+"""Number of candidates scored side by side on a CPU; a population's size is best a multiple of it."""
 CHUNK = 1200
-"""Points of a view on which a group of candidates is scored at a time on a CPU; what lies between two loops stays in
-the cache (`benchmarks/kernel.py`). Twice as many suit an image of more than `FEW_POINTS`, but of several levels in
-arrays of one length the short ones would be scored with what fills them up."""
+"""Number of points of a view on which a group of candidates is scored at a time on a CPU, so that intermediate arrays
+stay in the cache (`benchmarks/kernel.py`). Twice as many suit images of more than `FEW_POINTS`. On smaller ones, whose
+levels share arrays of one length, larger chunks would score more padding."""
 FEW_POINTS = 9600
 LINEARIZED_CHUNK = 4800
-"""Points of a view that are linearised at a time; there is only one candidate then."""
+"""Number of points of a view that are linearised at a time; there is only one candidate then."""
 CENTRING_POINTS = 480
-"""Points a view that tell a motion's mean residual."""
+"""Number of points of a view that a motion's mean residual is taken over."""
 MOST_SAMPLED = 46340
-"""Points a view in any sample: two places in it have a product of 32 bits."""
+"""Largest number of points of a view in any sample: the product of two indices fits into 32 bits."""
 
 
 @jax.tree_util.register_dataclass
@@ -84,8 +84,8 @@ MOST_SAMPLED = 46340
 class Objective:
     """E of one level of one pair of frames: prepared arrays, scales and a loss.
 
-    A point that lands inside costs ρ(r²/σ²) + λ ρ(q²/τ²), or λ ρ(1) for the second term where the target has no depth
-    reading: as much as a typical one, so that neither seeking nor shunning gaps pays. E is σ² times the mean cost.
+    A point that lands inside costs ρ(r²/σ²) + λ ρ(q²/τ²). Where the target has no depth reading the second term is
+    λ ρ(1), the cost of a typical one, so that gaps are neither rewarded nor punished. E is σ² times the mean cost.
     """
 
     reference: Reference
@@ -94,30 +94,30 @@ class Objective:
     scales: Scales
     min_overlap: Float[Array, ""]
     outside_cost: Float[Array, ""] = field(default_factory=lambda: jnp.float32(0.0))
-    """Cost of a reference point that leaves the view, in units of a typical point's. Positive, and a motion cannot win
-    by pushing pixels out of view; 0 averages over the points in view alone, as the paper's error does."""
+    """Cost of a reference point that leaves the view, in units of a typical point's. If positive, a motion cannot win
+    by pushing pixels out of view; 0 averages over only the points in view, as the paper's error does."""
     count: Integer[Array, ""] | None = None
-    """Points a view that hold something, from the first on; None: all."""
+    """Number of points of a view that are used, the first ones; None: all."""
     views: Integer[Array, ""] | None = None
-    """Views that hold something, from the first on; None: all."""
+    """Number of views that are used, the first ones; None: all."""
     columns: Integer[Array, ""] | int = 1
-    """Reference points a row: they come from a grid, row after row."""
+    """Number of reference points in a row: they come from a grid, row by row."""
     centred: Bool[Array, ""] | None = None
-    """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may be
-    larger than any contrast, says nothing against the true motion. None: never, at no cost."""
+    """Whether each motion's grey residuals are taken about their own mean, so that a change of exposure, which may
+    exceed any contrast, does not penalise the true motion. None: never, at no cost."""
     readout: Float[Array, ""] | None = None
-    """Of a camera with a rolling shutter the share of the motion that passes during a readout; see `Shutter`. None: all
-    rows are exposed at once."""
+    """Share of the motion that passes during the readout of a rolling shutter; see `Shutter`. None: global shutter."""
     sway: Float[Array, " 6"] | None = None
-    """The target's, under a rolling shutter; see `Shutter`. None: it moved as on average since the reference."""
+    """Sway of the target under a rolling shutter; see `Shutter`. None: it moved at the mean velocity since the
+    reference."""
     backward: "Objective | None" = None
-    """The same error with the frames' parts exchanged: the target's points seen from the reference, by the inverse
-    motion. With it E is the mean of both, as neither frame is nearer to the truth than the other."""
+    """The error with the frames' roles exchanged: the target's points seen from the reference, by the inverse motion.
+    With it E is the mean of both directions, as neither frame is nearer to the truth than the other."""
     loss: Loss = field(default=l2, metadata={"static": True})
     use_depth: bool = field(default=False, metadata={"static": True})
 
     def sum_over_points(self, part: Callable[[Reference], Any], chunk_size: int) -> Any:
-        """Sum of `part` over chunks of the reference's points, view after view, as far as there are any."""
+        """Sum `part` over chunks of the reference's points that are used, view by view."""
         views, points = self.reference.grey.reshape(-1, self.reference.grey.shape[-1]).shape
         size = min(chunk_size, points)
         chunks = -(-points // size)
@@ -144,21 +144,19 @@ class Objective:
         return jnp.where(self.centred, jnp.sum(r.grey) / jnp.maximum(jnp.sum(r.inside), 1.0), 0.0)
 
     def sample(self, points: int | None) -> "Objective":
-        """The same error on at most so many points a view, spread evenly; None: on all."""
+        """Return the same error on at most `points` evenly spread points of a view; None: on all."""
         if points is None:
             return self
         available = self.reference.grey.shape[-1]
         size = min(points, available, MOST_SAMPLED)
         apart, rest = divmod(available if self.count is None else self.count, size)
         places = jnp.arange(size)
-        places = places * apart + places * rest // size  # a place times all points would pass 32 bits
+        places = places * apart + places * rest // size  # an index times all points would overflow 32 bits
         some = jax.tree.map(lambda a: a.at[..., places].get(mode="promise_in_bounds"), self.reference)
         return replace(self, reference=some, count=None)
 
     def merged(self) -> "Objective":
-        """The same error with the points of all views in one flat array: sums over them then need no arithmetic on
-        indices.
-        """
+        """Return the same error with the points of all views in one flat array, which is simpler to sum over."""
         return replace(self, reference=jax.tree.map(jnp.ravel, self.reference), count=None, views=None)
 
     def residuals(
@@ -169,7 +167,7 @@ class Objective:
     ) -> Residuals:
         """Residuals r_i(ξ) = I_{t+1}(ω(ξ, p_i)) − I_t(p_i) of one motion. Equation (1).
 
-        They are of all points or of some, and about a mean that may be known already.
+        `reference` selects some of the points, and `mean` gives their mean residual if it is already known.
         """
         reference = self.reference if reference is None else reference
         mean = self.mean_residual(target_T_reference) if mean is None else mean
@@ -193,11 +191,11 @@ class Objective:
         )
 
     def shutter(self, reference: Reference) -> Shutter | None:
-        """How the rows of some points were exposed; None where all were at once."""
+        """Return the rolling shutter of some points; None for a global shutter."""
         return None if self.readout is None else Shutter(self.readout, reference.row_time, self.sway)
 
     def cost(self, r: Residuals) -> Float[Array, "*n"]:
-        """Cost of every point; −1 marks those outside, so that one pass over the points does."""
+        """Cost of every point; −1 marks those outside, so that one pass over the points is enough."""
         scales = self.scales
         cost = self.loss(r.grey**2 * (1.0 / scales.grey**2))
         if self.use_depth:
@@ -206,7 +204,7 @@ class Objective:
         return jnp.where(r.inside > 0, cost, -1.0)
 
     def sums(self, cost: Float[Array, "*n"]) -> Float[Array, " 2"]:
-        """Sum of the costs inside, and the number of points there."""
+        """Sum of the costs of points inside, and the number of these points."""
         inside = lane_sum((cost >= 0).astype(jnp.float32))
         return jnp.stack([lane_sum(cost) + (cost.size - inside), inside])
 
@@ -244,14 +242,15 @@ class Objective:
         )
 
     def error_of(self, r: Residuals) -> tuple[jax.Array, jax.Array]:
-        """E and overlap of the motion of which these are the residuals, in this direction alone."""
+        """E and overlap of a motion from its residuals, in this direction only."""
         return self.error_and_overlap(self.sums(self.cost(r)))
 
     def score(
         self, target_T_reference: Float[Array, "p 4 4"], counted: Bool[Array, " p"] | None = None
     ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P motions in one call; those not `counted` have an error of +inf, and on a
-        CPU cost nothing.
+        """Errors and overlaps of P motions in one call.
+
+        Those that are not `counted` have an error of +inf, and cost nothing on a CPU.
         """
         if counted is None:
             counted = jnp.ones(target_T_reference.shape[0], bool)
@@ -264,26 +263,26 @@ class Objective:
 def both_directions(
     forward: tuple[jax.Array, jax.Array], backward: tuple[jax.Array, jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """Error and overlap of both directions together."""
+    """Combine error and overlap of both directions: mean error, smaller overlap."""
     return 0.5 * (forward[0] + backward[0]), jnp.minimum(forward[1], backward[1])
 
 
 def lane_sum(values: Float[Array, "*n"]) -> Float[Array, ""]:
-    """Sum over all points in lanes: a plain sum is one chain of additions, which no compiler may reorder."""
+    """Sum over all points in lanes: a plain sum is a single chain of additions, which a compiler must not reorder."""
     flat = values.reshape(-1)
     lanes = next(size for size in (480, 240, 120, 60, 32, 1) if flat.shape[0] % size == 0)
     return jnp.sum(jnp.sum(flat.reshape(-1, lanes), axis=0))
 
 
 def _score_side_by_side(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """All candidates and points at once: what a GPU wants."""
+    """Score all candidates on all points at once, which suits a GPU."""
     sums = jax.vmap(lambda motion: objective.sums(objective.cost(objective.residuals(motion))), out_axes=1)(motions)
     error, overlap = objective.error_and_overlap(sums)
     return jnp.where(counted, error, jnp.inf), overlap
 
 
 def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Groups of candidates on chunks of points: what a CPU wants. Both loops run only as far as there is something."""
+    """Score groups of candidates on chunks of points, which suits a CPU; neither loop runs over empty places."""
     candidates, points = motions.shape[0], objective.reference.grey.shape[-1]
     size = CHUNK if points <= FEW_POINTS else 2 * CHUNK
     group = min(GROUP, candidates)
@@ -312,7 +311,7 @@ def _score_in_groups(objective: Objective, motions: jax.Array, counted: jax.Arra
 
 @jax.custom_batching.custom_vmap
 def _score(objective: Objective, motions: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The form that suits the backend."""
+    """Score in the form that suits the backend."""
     if jax.default_backend() == "cpu":
         return _score_in_groups(objective, motions, counted)
     return _score_side_by_side(objective, motions, counted)
@@ -322,7 +321,7 @@ def _score(objective: Objective, motions: jax.Array, counted: jax.Array) -> tupl
 def _score_batch(
     size: int, batched: Any, objective: Objective, motions: jax.Array, counted: jax.Array
 ) -> tuple[Any, tuple[bool, bool]]:
-    """Several populations on one objective are one large population; several objectives are side by side."""
+    """Score several populations on one objective as one large population; several objectives side by side."""
     if any(jax.tree.leaves(batched[0])):
         axes = jax.tree.map(lambda flag: 0 if flag else None, batched)
         return jax.vmap(_score_side_by_side, in_axes=tuple(axes))(objective, motions, counted), (True, True)

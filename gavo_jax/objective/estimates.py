@@ -1,4 +1,4 @@
-"""What the data say before a level is searched: scales, brightness, and how far depth and the match can be trusted."""
+"""Estimates from the data before a level is searched: scales, brightness, and trust in depth and in the match."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from gavo_jax.objective.error import Objective, Residuals, Scales
 from gavo_jax.objective.points import SATURATED
 
 ROUNDS = 6
-"""Rounds of the re-weighted estimates below; each contracts the remaining error several times."""
+"""Number of iterations of the re-weighted estimates below; each reduces the remaining error several times."""
 
 
 def _t_weight(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -19,7 +19,7 @@ def _t_weight(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _t_scales(residual: Float[Array, "c n"], mask: Float[Array, "c n"]) -> Float[Array, " c"]:
-    """Scales of t distributions fitted to the masked residuals of some channels, by fixed-point rounds."""
+    """Scales of t distributions fitted to the masked residuals of some channels, by fixed-point iteration."""
     square = mask * residual**2
     count = jnp.maximum(jnp.sum(mask, axis=1), 1.0)
 
@@ -30,19 +30,19 @@ def _t_scales(residual: Float[Array, "c n"], mask: Float[Array, "c n"]) -> Float
 
 
 SMALLEST_GREY_SCALE = 0.5
-"""Grey levels: rounding alone leaves 0.3."""
+"""Lower bound on the grey scale, grey levels: rounding alone causes 0.3."""
 SMALLEST_DEPTH_SCALE = 5e-4
-"""1/m: a sixth of the quantisation of a structured-light sensor."""
+"""Lower bound on the depth scale, 1/m: a sixth of the quantisation of a structured-light sensor."""
 
 
 def _independent_share(
     residual: jax.Array, mask: jax.Array, scale: jax.Array, columns: jax.Array | int
 ) -> Float[Array, ""]:
-    """Share of a channel's residuals that are independent witnesses, from their correlation between neighbours.
+    """Share of a channel's residuals that are effectively independent, from the correlation of neighbours.
 
-    n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ the correlation at lag one of the residuals as the
-    loss weighs them (an autoregressive model along either direction). Where depth and colour are out of step, whole
-    surfaces err together: ρ is near 1 and the share falls to a few per cent.
+    n_eff/n = ∏ (1 − ρ)/(1 + ρ) over the two image directions, ρ being the lag-one correlation of the weighted residuals
+    (an autoregressive model along either direction). Where depth and colour are not synchronous, whole surfaces share
+    their error: ρ is near 1 and the share falls to a few per cent.
     """
     weighted = mask * residual * _t_weight((residual / scale) ** 2)
     place = jnp.arange(residual.shape[-1])
@@ -60,13 +60,13 @@ def _independent_share(
 
 
 FULL_DEPTH_RATIO = 0.3
-"""Independent share of the depth residuals, over that of the grey ones, from which on depth has its whole weight."""
+"""Ratio of the independent share of depth residuals to that of grey ones above which depth has its whole weight."""
 LEAST_DEPTH_TRUST = 1 / 3
-"""Part of its weight that depth always keeps."""
+"""Share of its weight that depth always keeps."""
 
 
 def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], scales: Scales) -> Float[Array, ""]:
-    """Factor on depth's weight, from 1 to a third where its residuals, more than grey's, err by whole surfaces."""
+    """Factor on depth's weight: 1, falling to a third where whole surfaces share their depth residuals."""
     r = objective.residuals(target_T_reference)
     depth = _independent_share(r.depth, r.depth_valid, scales.depth, objective.columns)
     grey = _independent_share(r.grey, lit_in_both(r), scales.grey, objective.columns)
@@ -74,14 +74,15 @@ def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], s
 
 
 def lit_in_both(r: Residuals) -> Float[Array, "*n"]:
-    """1 where a point is inside and neither image was cut off there: two of those that are white agree whatever the
-    motion, and would make the noise seem smaller than it is.
+    """Return 1 where a point is inside and saturated in neither image, else 0.
+
+    Two saturated pixels agree whatever the motion, and would make the noise seem smaller than it is.
     """
     return r.inside * r.lit * (r.grey_sample.value < SATURATED)
 
 
 def estimate_scales(r: Residuals, depth_weight: jax.Array | float) -> Scales:
-    """Scales of the grey and the depth residuals of one motion, with the weight that depth is given."""
+    """Estimate the scales of the grey and depth residuals of one motion; the weight of depth is as given."""
     residual = jnp.stack([r.grey, r.depth]).reshape(2, -1)
     mask = jnp.stack([lit_in_both(r), r.depth_valid]).reshape(2, -1)
     found = jnp.maximum(_t_scales(residual, mask), jnp.array([SMALLEST_GREY_SCALE, SMALLEST_DEPTH_SCALE]))
@@ -96,18 +97,18 @@ class Brightness(NamedTuple):
 
     @classmethod
     def unchanged(cls, views: int) -> "Brightness":
-        """Every view as bright as the target."""
+        """Return the model in which every view is as bright as the target."""
         return cls(jnp.ones(views), jnp.zeros(views))
 
     def seen(self, grey: Float[Array, "v n"]) -> Float[Array, "v n"]:
-        """Grey of the views' points as the target shows them, which is nowhere brighter than white."""
+        """Return the grey of the views' points as the target shows it, at most white."""
         return jnp.minimum(self.gain[:, None] * grey + self.bias[:, None], WHITE)
 
 
 def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
-    """Brightness of each view at one motion, by re-weighted regression of what was sampled on the reference's grey.
+    """Estimate each view's brightness at one motion, by re-weighted regression of the samples on the reference's grey.
 
-    The gain leans to 1 where the image has little contrast.
+    The gain is drawn towards 1 where the image has little contrast.
     """
     mask = lit_in_both(r)
     sample = jnp.where(mask > 0, r.grey_sample.value, MIDDLE_GREY) - MIDDLE_GREY
@@ -132,18 +133,18 @@ def estimate_brightness(grey: Float[Array, "v n"], r: Residuals) -> Brightness:
 
 
 WHITE = 255.0
-"""Grey level of what is as bright as an image can show."""
+"""Largest grey level of an image."""
 MIDDLE_GREY = 128.0
-"""Grey levels that moments are taken about, so that they lose no digits."""
+"""Grey level that moments are taken about, to preserve precision."""
 LARGEST_GAIN = 1.8
-"""Estimates of the gain, and of its reciprocal, end here: a regression of one image on another that it does not match
-would have it at 0, which hides contrast."""
+"""Upper bound on the estimated gain and on its reciprocal: the regression of an image on one that does not match it
+would give 0, which hides contrast."""
 GAIN_PRIOR = 100.0
-"""Squared grey levels: the image contrast at which the estimated gain is half-way between 1 and the regression's."""
+"""Variance of the image, squared grey levels, at which the gain is half-way between 1 and the regression's."""
 LARGE_GREY_RESIDUAL = 12.0
-"""Grey levels: what noise and interpolation leave of a true match stays below, on all but edges and occlusions."""
+"""Grey levels above which a residual is large: a true match stays below, except at edges and occlusions."""
 LARGE_DEPTH_RESIDUAL = 0.03
-"""1/m: ten times the quantisation of a structured-light sensor."""
+"""1/m above which a residual is large: ten times the quantisation of a structured-light sensor."""
 
 
 class ExplainedShare(NamedTuple):
@@ -154,11 +155,12 @@ class ExplainedShare(NamedTuple):
 
 
 def explained_share(residuals: Residuals) -> ExplainedShare:
-    """How much of what both frames see a motion explains, 1 at best; points in view, with a reading, only. Not-a-number
-    where both see nothing.
+    """Return the share of residuals that a motion explains, over points in view with a reading.
+
+    It is NaN where there are no such points.
     """
     r = residuals
-    grey = jnp.where(r.lit > 0, r.grey, jnp.minimum(r.grey, 0.0))  # what was cut off may have been brighter
+    grey = jnp.where(r.lit > 0, r.grey, jnp.minimum(r.grey, 0.0))  # saturated pixels may have been brighter
 
     def share(residual: jax.Array, mask: jax.Array, large: float) -> jax.Array:
         return jnp.sum(mask * (jnp.abs(residual) < large)) / jnp.sum(mask)

@@ -1,4 +1,4 @@
-"""Losses: what a residual costs."""
+"""Robust losses: the cost of a residual."""
 
 from collections.abc import Callable, Hashable
 from functools import cache
@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from gavo_jax.errors import line_of
 
 Loss = Callable[[jax.Array], jax.Array]
-"""A cost of the squared normalised residual s = (r/σ)², never negative: any function with a finite derivative.
-A population searches without it; the last step, the covariance and the status take it."""
+"""Non-negative cost of the squared normalised residual s = (r/σ)²: any function with a finite derivative. Populations
+search without the derivative; the last step, the covariance and the status need it."""
 
 
 def l2(s: jax.Array) -> jax.Array:
@@ -41,12 +41,12 @@ def geman_mcclure(s: jax.Array) -> jax.Array:
 
 
 def truncated(s: jax.Array) -> jax.Array:
-    """min(s, 2.795²): squares up to 2.8 σ, constant beyond. A population needs no derivative there."""
+    """min(s, 2.795²): quadratic up to 2.8 σ, constant beyond. Populations need no derivative there."""
     return jnp.minimum(s, 2.795**2)
 
 
 def fault_of_loss(loss: Loss) -> str:
-    """Why a function is no loss, in words that go on from its name; empty where it is one."""
+    """Return why a function is not a loss, in words that continue its name; empty if it is one."""
     if not isinstance(loss, Hashable):
         return "must be hashable: a program is compiled for each loss"
     return "" if loss in LOSSES.values() else _fault_of_values(loss)
@@ -54,11 +54,11 @@ def fault_of_loss(loss: Loss) -> str:
 
 @cache
 def _fault_of_values(loss: Loss) -> str:
-    """What is wrong with what a function returns."""
+    """Return what is wrong with the values of a function; empty if nothing is."""
     s = jnp.array([0.0, 0.5, 4.0, 1e4], jnp.float32)
     try:
         value, slope = jax.jit(lambda s: jax.jvp(loss, (s,), (jnp.ones_like(s),)))(s)
-    except Exception as error:  # somebody else's code may fail in any way
+    except Exception as error:  # third-party code may fail in any way
         return f"cannot be used: {line_of(error)}"
     if not isinstance(value, jax.Array) or value.shape != s.shape or not jnp.issubdtype(value.dtype, jnp.floating):
         return "must return as many real numbers as it is given"

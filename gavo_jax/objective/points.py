@@ -1,4 +1,4 @@
-"""The points of a reference frame: how they are chosen, and how they are seen from elsewhere."""
+"""The points of a reference frame: their selection, and their transfer to other cameras and row times."""
 
 from typing import NamedTuple
 
@@ -15,13 +15,11 @@ from gavo_jax.image.shutter import row_time
 from gavo_jax.image.warp import Points, moved
 
 SATURATED = 250.0
-"""Grey level from which an image may have been cut off: what was seen was at least as bright."""
+"""Grey level from which a pixel counts as saturated: the scene was at least as bright."""
 
 
 class Reference(NamedTuple):
-    """What the objective keeps of a level of the reference frame: arrays of N points, with an axis of views before it
-    where several frames serve together.
-    """
+    """Points of one level of the reference frame, as arrays of N; with a leading axis of views for several frames."""
 
     points: Points
     grey: Float[Array, "*views n"]
@@ -34,18 +32,19 @@ class Reference(NamedTuple):
     facing: Float[Array, "*views n"]
     """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""
     row_time: Float[Array, "*views n"]
-    """When the point's row was exposed; see `Shutter`."""
+    """Time at which the point's row was exposed; see `Shutter`."""
     lit: Float[Array, "*views n"]
     """1 where the grey is below `SATURATED`, else 0."""
 
     def brightened(self, gain: Float[Array, "*#n"], bias: Float[Array, "*#n"] | float = 0.0) -> "Reference":
-        """The same points as of an image of another gain and bias."""
+        """Return the same points with another gain and bias of the image."""
         return self._replace(grey=gain * self.grey + bias, grey_u=gain * self.grey_u, grey_v=gain * self.grey_v)
 
 
 def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """∂/∂u and ∂/∂v by central differences of an image with a margin of one pixel; a neighbour that is `NO_PIXEL`
-    counts as the pixel itself.
+    """Return ∂/∂u and ∂/∂v of an image with a margin of one pixel, by central differences.
+
+    A neighbour that is `NO_PIXEL` is replaced by the pixel itself.
     """
     middle = grey[1:-1, 1:-1]
 
@@ -56,15 +55,15 @@ def central_gradient(grey: Float[Array, "h+2 w+2"]) -> tuple[Float[Array, "h w"]
 
 
 def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Reference:
-    """Points of some levels, [L, N]: one per square block of pixels, that of the steepest grey with a reading.
+    """Select points on some levels, [L, N]: per square block of pixels the one with a reading and the steepest grey.
 
-    The choice is stratified, so its cost in accuracy is small, and N is static. Shorter levels are filled up with
-    points without a reading.
+    The selection is stratified, so it costs little accuracy, and N is static. Shorter levels are padded with points
+    without a reading.
 
     Args:
-        pyramid: Of the reference frame.
-        camera: Of level 0.
-        levels: Which ones, in the order of the result.
+        pyramid: Pyramid of the reference frame.
+        camera: Camera of level 0.
+        levels: The levels, in the order of the result.
     """
     layout = levels.layout
     grey, inverse_depth = (image[:-1, :-1] for image in make_atlas([pyramid[number] for number in levels.numbers]))
@@ -90,7 +89,7 @@ def make_references(pyramid: Pyramid, camera: Camera, levels: Levels) -> Referen
 
 
 def _steepest_of_blocks(steepness: Float[Array, "h w"], cell: int) -> tuple[Integer[Array, "r c"], ...]:
-    """Column and row of the largest pixel of each cell x cell block, the first of equal ones."""
+    """Return the column and row of the largest pixel of each cell x cell block, the first of equal ones."""
     rows, columns = (size // cell for size in steepness.shape)
     blocks = steepness[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
     within = jnp.argmax(blocks.reshape(rows, columns, cell * cell), axis=-1)
@@ -98,15 +97,15 @@ def _steepest_of_blocks(steepness: Float[Array, "h w"], cell: int) -> tuple[Inte
 
 
 def move_reference(reference: Reference, camera_T_reference: Float[Array, "4 4"]) -> Reference:
-    """The same points as rays of another camera; what falls behind it loses its reading."""
+    """Return the points as rays of another camera; those behind it lose their reading."""
     return reference._replace(points=_rays(moved(reference.points, camera_T_reference), reference.points.q))
 
 
 def undo_rolling_shutter(reference: Reference, twist: Float[Array, " 6"]) -> Reference:
-    """Return the points where they were at their frame's moment instead of when their rows were exposed.
+    """Return the points where they were at their frame's timestamp instead of when their rows were exposed.
 
     Args:
-        reference: As the camera's rolling shutter saw it.
+        reference: Points as seen by the rolling shutter.
         twist: Motion of the points in the camera during one readout, small.
     """
     points = swept(reference.points, twist, -reference.row_time)
@@ -114,7 +113,7 @@ def undo_rolling_shutter(reference: Reference, twist: Float[Array, " 6"]) -> Ref
 
 
 def swept(points: Points, twist: Float[Array, " 6"], share: Float[Array, "*n"]) -> Points:
-    """Points moved along a share of a small twist, each along its own; to first order."""
+    """Move points by a share of a small twist, each by its own; to first order."""
     (v, w), (x, y, q) = (twist[:3], twist[3:]), points
     moved_by = (
         x + share * (w[1] - w[2] * y + v[0] * q),
@@ -126,23 +125,25 @@ def swept(points: Points, twist: Float[Array, " 6"], share: Float[Array, "*n"]) 
 
 @jax.jit
 def apply_rolling_shutter(reference: Reference, twist: Float[Array, " 6"], planes: ImagePlane) -> Reference:
-    """Return the points where their rows saw them: what `undo_rolling_shutter` by the same twist was given.
+    """Return the points where their rows saw them; the inverse of `undo_rolling_shutter` with the same twist.
 
     Args:
-        reference: With the rolling shutter undone, [L, N].
+        reference: Points with the rolling shutter undone, [L, N].
         twist: The same twist.
-        planes: Of its levels, [L].
+        planes: Planes of its levels, [L].
     """
     plane = jax.tree.map(lambda leaf: leaf[:, None], planes)
     seen = reference
-    for _ in range(2):  # the row that a point was seen in is only known from where it was seen
+    for _ in range(2):  # iterated, as a point's row depends on where it was seen
         row = row_time(to_pixels(plane, seen.points.x, seen.points.y)[1], plane)
         seen = undo_rolling_shutter(reference._replace(row_time=row), -twist)._replace(row_time=row)
     return seen
 
 
 def _rays(coordinates: tuple[jax.Array, jax.Array, jax.Array], q: jax.Array) -> Points:
-    """Points from their coordinates times their old inverse depth; those behind the camera lose their reading."""
+    """Make points from coordinates that are scaled by the old inverse depth; those behind the camera lose their
+    reading.
+    """
     before = (q > 0) & (coordinates[2] > 1e-3)
     depth = jnp.where(before, coordinates[2], 1.0)
     return Points(coordinates[0] / depth, coordinates[1] / depth, jnp.where(before, q / depth, 0.0))

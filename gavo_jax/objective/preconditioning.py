@@ -1,4 +1,4 @@
-"""Search coordinates in which a unit step in any direction changes the image alike."""
+"""Search coordinates in which a unit step in any direction changes the image equally."""
 
 import jax
 import jax.numpy as jnp
@@ -33,16 +33,16 @@ def reference_curvature(objective: Objective) -> Float[Array, "6 6"]:
 
 
 LARGEST_UNIT_STEP = 0.05
-"""Metres or radians: a direction that the image hardly constrains is not searched further than this a unit."""
+"""Largest size of a unit step in directions that the image hardly constrains, metres or radians."""
 
 
 def preconditioner(curvature: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """B with BᵀAB = identity, B = V Λ^(−1/2) of A = V Λ Vᵀ, limited where A is nearly singular."""
+    """Return B with BᵀAB = identity: B = V Λ^(−1/2) for A = V Λ Vᵀ, regularised where A is nearly singular."""
     ridge = jnp.eye(6) / LARGEST_UNIT_STEP**2
     values, vectors = jnp.linalg.eigh(curvature + ridge)
     return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-9))
 
 
 def unconditioner(basis: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """The inverse of a `preconditioner`, whose columns are at right angles."""
+    """Return the inverse of a `preconditioner`, whose columns are orthogonal."""
     return (basis / jnp.sum(basis**2, axis=0)).T

@@ -1,4 +1,4 @@
-"""An objective in search coordinates: what a solver is handed."""
+"""An objective in search coordinates, as solvers see it."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,36 +35,36 @@ class Problem:
     origin: Float[Array, "4 4"]
     basis: Float[Array, "6 6"]
     centre: Float[Array, "4 4"] | None = None
-    """Motion that the search is held about, and `reach`, the largest translation (m) and rotation (rad) from it; a
-    candidate further off is worthless. None: the solver's bounds alone hold it."""
+    """Motion at the centre of the search; `reach` is the largest translation (m) and rotation (rad) from it, beyond
+    which a candidate is invalid. None: only the solver's bounds limit the search."""
     reach: Float[Array, " 2"] | None = None
     searched: Bool[Array, ""] | bool = True
-    """Whether anything is to be found here; if not, no candidate is worth anything and none costs anything."""
+    """Whether to search at all; if not, every candidate is invalid and none costs anything."""
 
     def with_sway(self, twist: Float[Array, " 6"]) -> "Problem":
-        """The same with a target that sways; see `alignment.sway`."""
+        """Return the problem with a sway of the target; see `alignment.sway`."""
         return replace(self, objective=replace(self.objective, sway=twist))
 
     def transform(self, x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
-        """target_T_reference of search coordinates."""
+        """Return target_T_reference for search coordinates."""
         return self.origin @ exp(x @ self.basis.T)
 
     def score(
         self, x: Float[Array, "p 6"], counted: Bool[Array, " p"] | None = None
     ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Errors and overlaps of P candidates; not-a-number becomes +inf here, once for every population.
+        """Errors and overlaps of P candidates; NaN becomes +inf here, for every population.
 
-        Candidates that are not `counted` have an error of +inf and on a CPU cost nothing: a population that is smaller
-        on one level than on another leaves places empty.
+        Candidates that are not `counted` have an error of +inf and cost nothing on a CPU. They are the empty places of
+        a population that is smaller on one level than on another.
         """
-        # held back, or XLA would compute each motion anew for each of its 16 entries
+        # a barrier, or XLA would compute each motion anew for each of its 16 entries
         motions = jax.lax.optimization_barrier(self.transform(x))
         counted = jnp.ones(x.shape[0], bool) if counted is None else counted
         error, overlap = self.objective.score(motions, counted & self.searched)
         return jnp.where(jnp.isnan(error) | self.is_out_of_reach(motions), jnp.inf, error), overlap
 
     def is_out_of_reach(self, motions: Float[Array, "*p 4 4"]) -> Bool[Array, "*p"]:
-        """Which motions lie further from the centre than the search is held."""
+        """Whether motions lie beyond `reach` from the centre."""
         if self.centre is None or self.reach is None:
             return jnp.zeros(motions.shape[:-2], bool)
         offset = rigid_inverse(self.centre) @ motions
@@ -73,7 +73,7 @@ class Problem:
         return (jnp.linalg.norm(offset[..., :3, 3], axis=-1) > self.reach[0]) | (turned > farthest)
 
     def linearize(self, x: Float[Array, " 6"]) -> Linearization:
-        """E and its first two derivatives; image gradients are sampled, nothing is differentiated in reverse."""
+        """E and its first two derivatives, from sampled image gradients instead of reverse-mode differentiation."""
         motion, tangent = self._tangent(x)
         model = linearize(self.objective, motion, tangent)
         backward = self.objective.backward
@@ -85,19 +85,19 @@ class Problem:
         return Linearization(error, overlap, *(0.5 * (a + b) for a, b in zip(model[2:], other[2:], strict=True)))
 
     def linearize_residuals(self, r: Residuals) -> Linearization:
-        """E and its derivatives at x = 0, of which these are the residuals; from the reference to the target alone."""
+        """E and its derivatives at x = 0 from its residuals; from the reference to the target only."""
         return self.linearize_terms(r, weighted_terms(self.objective, self.objective.reference, r))
 
     def linearize_terms(self, r: Residuals, terms: list[Term]) -> Linearization:
-        """The same with each channel's Jacobian, residuals and weights known already."""
+        """E and its derivatives at x = 0 from its residuals and each channel's terms."""
         sums = self.objective.sums(self.objective.cost(r))
         return linearization(self.objective, self.tangent, sums, *normal_equations(terms))
 
     def scatter(self, r: Residuals, terms: list[Term]) -> Float[Array, "6 6"]:
-        """Covariance of E's gradient at x = 0; from the reference to the target alone.
+        """Covariance of E's gradient at x = 0; from the reference to the target only.
 
-        It comes from the gradient's spread over tiles of the target image: residuals of neighbouring pixels are
-        correlated, so pixels are no independent witnesses; tiles nearly are. With the Hessian on both sides this is the
+        It comes from the gradient's spread over tiles of the target image. Residuals of neighbouring pixels are
+        correlated, but tiles are nearly independent. With the inverse Hessian on both sides this gives the
         cluster-robust ("sandwich") covariance of an M-estimate.
         """
         objective, plane = self.objective, self.objective.plane
@@ -112,19 +112,17 @@ class Problem:
         return (by_tile @ by_tile.T) * used / jnp.maximum(used - 1, 1)
 
     def examine(self, r: Residuals) -> tuple[Linearization, Float[Array, "6 6"], list[Term]]:
-        """E's derivatives at x = 0, of which these are the residuals; the covariance of its gradient; and the channels'
-        terms that both are made of.
-        """
-        # held back, or XLA would compute them anew for each that uses them
+        """Return E's derivatives at x = 0 from its residuals, its gradient's covariance, and the channels' terms."""
+        # a barrier, or XLA would compute them anew for each use
         terms = jax.lax.optimization_barrier(weighted_terms(self.objective, self.objective.reference, r))
         return self.linearize_terms(r, terms), self.scatter(r, terms), terms
 
     @property
     def tangent(self) -> Float[Array, "6 6"]:
-        """J with transform(dx) ≈ exp(J dx) · origin."""
+        """Jacobian J with transform(dx) ≈ exp(J dx) · origin."""
         return adjoint(self.origin) @ self.basis
 
     def _tangent(self, x: Float[Array, " 6"]) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
-        """The motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
+        """Return the motion, and J with transform(x + dx) ≈ exp(J dx) · motion."""
         motion = self.transform(x)
         return motion, adjoint(motion) @ right_jacobian(self.basis @ x) @ self.basis

@@ -1,4 +1,4 @@
-"""Solvers: one protocol, one loop, four methods; and what the author of another one needs."""
+"""Solvers: one protocol, one loop, four methods; and what is needed to write another one."""
 
 from gavo_jax.objective.problem import Problem as Problem
 from gavo_jax.solvers.base import Best as Best

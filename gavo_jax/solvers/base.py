@@ -12,23 +12,23 @@ from gavo_jax.objective.problem import Problem
 
 
 def static(default: Any, least: float | None = None) -> Any:
-    """A dataclass field that shapes arrays or picks an operator: part of the program, not an input of it.
+    """Declare a dataclass field that shapes arrays or selects an operator: part of the program, not an input of it.
 
     Args:
-        default: Its value.
-        least: What a number must at least be, on the levels that are searched.
+        default: Default value.
+        least: Smallest allowed number, on levels that are searched.
     """
     return field(default=default, metadata={"static": True, "range": (least, None)})
 
 
 def within(default: Any, least: float, most: float | None = None, instead_of: str | None = None) -> Any:
-    """A dataclass field that is an input of the program, and the range of its numbers on levels that are searched.
+    """Declare a dataclass field that is an input of the program, with its range on levels that are searched.
 
     Args:
-        default: Its value.
-        least: What a number must at least be.
-        most: What it may at most be.
-        instead_of: Another field of the same solver, which has to be None for this one to count.
+        default: Default value.
+        least: Smallest allowed number.
+        most: Largest allowed number.
+        instead_of: Another field of the same solver, which must be None for this one to take effect.
     """
     return field(default=default, metadata={"range": (least, most), "instead_of": instead_of})
 
@@ -52,7 +52,7 @@ class Best(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """The candidates that a state holds, kept for the viewer and the figures of a search."""
+    """The candidates that a state holds, for the viewer and for figures of a search."""
 
     x: Float[Array, "p 6"]
     error: Float[Array, " p"]
@@ -64,8 +64,8 @@ class Solver(Protocol):
 
     Sizes (population, iterations) are static, every rate is a leaf: a sweep over rates is one `vmap` and never
     recompiles. A field that is a tuple holds one entry per pyramid level, level 0 first. One compiled program serves
-    every level, so arrays are made for the largest entry and what counts on a level is a number in the program:
-    `PerLevel` brings what that needs.
+    every level, so arrays have the size of the largest entry, and a level's own entry is an input. `PerLevel` provides
+    this.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -82,7 +82,7 @@ class Solver(Protocol):
 
     @property
     def progress(self) -> Schedule:
-        """Share of its best error that an iteration must exceed to be one with progress."""
+        """Smallest relative decrease of the best error that counts as progress."""
         ...
 
     @property
@@ -91,30 +91,30 @@ class Solver(Protocol):
         ...
 
     def at_level(self, level: Integer[Array, ""] | int) -> Self:
-        """The solver of one pyramid level."""
+        """Return the solver for one pyramid level."""
         ...
 
     def here(self, schedule: Schedule) -> Any:
-        """Entry of a schedule for that level."""
+        """Return the entry of a schedule for that level."""
         ...
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> Any:
-        """State before the first iteration, from G >= 1 guesses (the first is where the coarser level ended).
+        """Return the state before the first iteration, from G >= 1 guesses (the first is the coarser level's result).
 
         Nothing is evaluated yet: the best error is +inf until the first step.
         """
         ...
 
     def step(self, key: PRNGKeyArray, state: Any, problem: Problem) -> Any:
-        """One iteration: evaluate the candidates in waiting, then choose the next ones."""
+        """Run one iteration: evaluate the pending candidates, then choose the next ones."""
         ...
 
     def best(self, state: Any) -> Best:
-        """Best candidate that the state holds."""
+        """Return the best candidate that the state holds."""
         ...
 
     def candidates(self, state: Any) -> Candidates:
-        """All candidates that the state holds, the best one first where there is an order."""
+        """Return all candidates that the state holds, the best one first if they are ordered."""
         ...
 
 
@@ -123,8 +123,8 @@ class PerLevel:
     """Base of the solvers: resolves fields that hold an entry per level.
 
     Attributes:
-        progress: An iteration that lowers the best error by no more than this share counts as one without progress;
-            an entry per level.
+        progress: An iteration that lowers the best error by no more than this share makes no progress; an entry per
+            level.
         level: The level that is being searched; an input of the compiled program.
     """
 
@@ -132,11 +132,11 @@ class PerLevel:
     level: Integer[Array, ""] | int = field(default=0, repr=False)
 
     def at_level(self, level: Integer[Array, ""] | int) -> Self:
-        """The same solver on one level."""
+        """Return the same solver on one level."""
         return replace(self, level=level)
 
     def here(self, schedule: Schedule) -> Any:
-        """Entry of a schedule for the present level."""
+        """Return the entry of a schedule for the current level."""
         if not isinstance(schedule, tuple):
             return schedule
         if isinstance(self.level, int):
@@ -148,28 +148,28 @@ class PerLevel:
         """Levels with at least one iteration, coarsest first."""
         iterations: tuple[int, ...] = self.iterations  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(iterations, tuple):
-            with contextlib.suppress(TypeError):  # an entry that is no count
+            with contextlib.suppress(TypeError):  # an entry is not a number
                 return tuple(k for k in reversed(range(len(iterations))) if iterations[k] > 0)
-        return ()  # for `require_settings` to refuse
+        return ()  # refused by `require_settings`
 
 
 def largest(schedule: Schedule) -> int:
-    """Largest entry of a static schedule: the size of the arrays that serve every level."""
+    """Return the largest entry of a static schedule: the size of the arrays that serve every level."""
     return max(schedule) if isinstance(schedule, tuple) else schedule
 
 
 class Solution(NamedTuple):
-    """What a level's search ends with."""
+    """Result of a level's search."""
 
     x: Float[Array, " 6"]
     error: Float[Array, ""]
     history: Float[Array, " iterations"]
-    """Best error after each iteration; NaN from the one that the stagnation stop left out."""
+    """Best error after each iteration; NaN for iterations that were not run because of stagnation."""
     iterations: Integer[Array, ""]
     candidates: Candidates
     trail: Candidates | None = None
-    """All candidates after each iteration, where they were recorded: x [iterations, P, 6], error [iterations, P]; NaN
-    like `history`."""
+    """All candidates after each iteration, if recorded: x [iterations, P, 6], error [iterations, P]; NaN like
+    `history`."""
 
 
 def static_stop(count: Integer[Array, ""], iterations: Integer[Array, ""] | int) -> Bool[Array, ""]:
@@ -188,7 +188,7 @@ def stagnation(
     best_error: Float[Array, ""],
     progress: Float[Array, ""] | float,
 ) -> Integer[Array, ""]:
-    """Iterations in a row without progress, of which the last one ended with `error`: what `diversity_stop` asks for.
+    """Count consecutive iterations without progress, for `diversity_stop`; the last iteration ended with `error`.
 
     An iteration makes progress if it lowers the best error so far by more than the share `progress` of it.
     """
@@ -203,9 +203,9 @@ def solve(
     bounds: Bounds,
     record: bool = False,
 ) -> Solution:
-    """Run a solver on one level, to its number of iterations or to stagnation, and keep the best candidate seen.
+    """Run a solver on one level until its number of iterations or stagnation, and keep the best candidate seen.
 
-    With `record` (static) the candidates of every iteration are kept for people to look at.
+    With `record` (static) the candidates of every iteration are kept for inspection.
     """
     longest = largest(solver.iterations)
     keys = jax.random.split(key, longest + 1)

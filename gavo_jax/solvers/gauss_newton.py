@@ -1,4 +1,4 @@
-"""The classic energy-based method: Gauss-Newton on E with the loss's weights, the paper's second rival."""
+"""The classic energy-based method: Gauss-Newton on E with the loss's weights, the paper's second baseline."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class GaussNewtonState(NamedTuple):
 
 
 STEP_ACCEPTED, STEP_REFUSED = 0.3, 10.0
-"""Factors on the damping after a step that lowered E and after one that did not."""
+"""Factors on the damping after a step that lowered E, and after one that didn't."""
 
 
 @jax.tree_util.register_dataclass
@@ -36,7 +36,7 @@ class GaussNewton(PerLevel):
     Attributes:
         iterations: Largest number of steps (static, an entry per level; 0 skips the level).
         patience: Steps without progress that end a level (static).
-        damping: First damping, relative to the Hessian's diagonal.
+        damping: Initial damping, relative to the Hessian's diagonal.
     """
 
     iterations: tuple[int, ...] = static((0, 12, 12, 15, 20))
@@ -44,7 +44,7 @@ class GaussNewton(PerLevel):
     damping: float = within(1e-4, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GaussNewtonState:
-        """The first guess."""
+        """Start from the first guess."""
         del key, problem
         unknown = jnp.float32(jnp.inf)
         model = Linearization(unknown, jnp.float32(0.0), jnp.zeros(6), jnp.zeros((6, 6)))
@@ -64,9 +64,9 @@ class GaussNewton(PerLevel):
         return GaussNewtonState(x, model, trial, damping, state.bounds)
 
     def best(self, state: GaussNewtonState) -> Best:
-        """The iterate."""
+        """Return the iterate."""
         return Best(state.x, state.model.error)
 
     def candidates(self, state: GaussNewtonState) -> Candidates:
-        """The iterate alone."""
+        """Return only the iterate."""
         return Candidates(state.x[None], state.model.error[None])

@@ -1,11 +1,11 @@
 """The genetic algorithm of the paper, equations (9) to (14); its operators are in `operators`.
 
-With `surrogate`, `spread` and `mutation_step` left out it is the paper's: a population uniform within the bounds,
-fitness, a roulette wheel, 30 % mutants, intermediate crossover, parents and offspring merged and the best kept.
+Without `surrogate`, `spread` and `mutation_step` it is the paper's: a population uniform within the bounds, fitness, a
+roulette wheel, 30 % mutants, intermediate crossover, parents and offspring merged and the best kept.
 
-In preconditioned coordinates (`Problem`) E is close to a round bowl, so three things change. The population starts as a
-normal cloud. The mutation's step is a number of grey levels that falls within each level. One offspring a generation is
-bred from the whole population (`surrogate_minimum`).
+In preconditioned coordinates (`Problem`) E is close to isotropic, so three things change. The population starts as a
+normal cloud. The mutation step is in grey levels and decays within each level. One offspring per generation is bred
+from the whole population (`surrogate_minimum`).
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from gavo_jax.solvers.operators import (
 
 
 class GeneticState(NamedTuple):
-    """A population in the order of its errors, its offspring yet to be evaluated, and the mutation's present step."""
+    """A population sorted by error, its offspring yet to be evaluated, and the current mutation step."""
 
     population: Float[Array, "p 6"]
     error: Float[Array, " p"]
@@ -45,7 +45,7 @@ class GeneticAlgorithm(PerLevel):
     """The paper's genetic algorithm.
 
     Attributes:
-        population: Chromosomes (static, an entry per level).
+        population: Number of chromosomes (static, an entry per level).
         iterations: Largest number of generations (static, an entry per level; 0 skips the level).
         patience: Generations without progress that end a level (static).
         mutants: Share of the offspring that are mutants, 0.3 in the paper; the rest are crossed.
@@ -55,7 +55,7 @@ class GeneticAlgorithm(PerLevel):
         mutation_step: First standard deviation of a mutation, search units, an entry per level; None takes
             δ = mutation_rate (ξ^U − ξ^L), as the paper does.
         mutation_decay: Factor on the step from generation to generation; 1 in the paper.
-        mutation_rate: p_m, 0.1 in the paper; counts where `mutation_step` is None.
+        mutation_rate: p_m, 0.1 in the paper; used only if `mutation_step` is None.
         crossover_range: d of the intermediate `crossover`: α is uniform in [−d, 1 + d].
         pressure: Factor in the `fitness`, 8 in the paper.
     """
@@ -73,7 +73,7 @@ class GeneticAlgorithm(PerLevel):
     pressure: float = within(8.0, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GeneticState:
-        """The first population, which waits to be evaluated."""
+        """Make the first population, yet to be evaluated."""
         del problem
         places = largest(self.population)
         x = initial_population(key, places, self.here(self.spread), guess, bounds)
@@ -83,7 +83,7 @@ class GeneticAlgorithm(PerLevel):
         return GeneticState(x, jnp.full(places, jnp.inf), x, step, bounds)
 
     def step(self, key: PRNGKeyArray, state: GeneticState, problem: Problem) -> GeneticState:
-        """One generation: evaluate the offspring, let the best survive, then select, cross and mutate.
+        """Run one generation: evaluate the offspring, let the best survive, then select, cross and mutate.
 
         Places beyond the level's population stay empty: their error is +inf, and the wheel never draws them.
         """
@@ -96,7 +96,7 @@ class GeneticAlgorithm(PerLevel):
         parents = population[roulette(fitness(error, self.pressure), for_parents)]
         crossed = crossover(parents, for_genes, self.crossover_range)
         mutated = mutate(parents[:, 0], for_genes, state.mutation_step)
-        # the present places hold the crossed first, then the mutants, and in the last one what the fit breeds
+        # crossed offspring first, then the mutants, then in the last present place the one from the quadratic fit
         own, last = jnp.arange(places)[:, None], size - 1
         mutants = jnp.round(self.mutants * jnp.float32(size)).astype(jnp.int32)
         offspring = jnp.where(own > last - int(self.surrogate) - mutants, mutated, crossed)
@@ -106,10 +106,10 @@ class GeneticAlgorithm(PerLevel):
         return GeneticState(population, error, offspring, state.mutation_step * self.mutation_decay, state.bounds)
 
     def best(self, state: GeneticState) -> Best:
-        """The first of the sorted population."""
+        """Return the first of the sorted population."""
         return Best(state.population[0], state.error[0])
 
     def candidates(self, state: GeneticState) -> Candidates:
-        """The population, best first; NaN in the empty places."""
+        """Return the population, best first; NaN in the empty places."""
         present = jnp.arange(state.error.shape[0]) < self.here(self.population)
         return Candidates(jnp.where(present[:, None], state.population, jnp.nan), state.error)

@@ -14,7 +14,7 @@ from gavo_jax.solvers.base import Best, Bounds, Candidates, PerLevel, Schedule, 
 
 
 class GradientState(NamedTuple):
-    """The last evaluated iterate and its error, the next iterate, the optimiser's state and the present rate."""
+    """The last evaluated iterate and its error, the next iterate, the optimiser's state and the current rate."""
 
     x: Float[Array, " 6"]
     error: Float[Array, ""]
@@ -29,12 +29,12 @@ class GradientState(NamedTuple):
 class GradientDescent(PerLevel):
     """Descent along ∇E by any optax optimiser that takes a learning rate; Adam by default.
 
-    The gradient is that of the sampled images (`Problem.linearize`), not reverse-mode through the gather.
+    The gradient comes from sampled image gradients (`Problem.linearize`), not from reverse mode through the gather.
 
     Attributes:
         iterations: Largest number of steps (static, an entry per level; 0 skips the level).
         patience: Steps without progress that end a level (static).
-        learning_rate: First step in search units, an entry per level.
+        learning_rate: Initial rate, search units, an entry per level.
         decay: Factor on the rate from step to step.
         optimizer: optax's constructor, called with a learning rate of 1 (static).
     """
@@ -46,7 +46,7 @@ class GradientDescent(PerLevel):
     optimizer: Callable[[float], optax.GradientTransformation] = static(optax.adam)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> GradientState:
-        """The first guess."""
+        """Start from the first guess."""
         del key, problem
         x, unknown = guess[0], jnp.float32(jnp.inf)
         return GradientState(
@@ -63,9 +63,9 @@ class GradientDescent(PerLevel):
         return GradientState(x, model.error, trial, optimizer_state, state.rate * self.decay, state.bounds)
 
     def best(self, state: GradientState) -> Best:
-        """The iterate."""
+        """Return the iterate."""
         return Best(state.x, state.error)
 
     def candidates(self, state: GradientState) -> Candidates:
-        """The iterate alone."""
+        """Return only the iterate."""
         return Candidates(state.x[None], state.error[None])

@@ -1,11 +1,11 @@
-"""The genetic algorithm's operators: the paper's (9) to (14) as functions of plain arrays, and one that is not its own.
+"""The genetic algorithm's operators: the paper's (9) to (14) as functions of plain arrays, and one extension.
 
-In preconditioned coordinates (`Problem`) E is close to a round bowl, which two of them make use of. The first
-population may be a normal cloud (`initial_population`). One offspring of a generation may be bred from the whole
-population, at the minimum of a quadratic fitted to its errors (`surrogate_minimum`). That uses evaluations only, no
-derivative, and replaces the slow last third of a search (`benchmarks/ablation.py`).
+In preconditioned coordinates (`Problem`) E is close to isotropic, which two of them exploit. The first population may
+be a normal cloud (`initial_population`). One offspring of a generation may be bred from the whole population, at the
+minimum of a quadratic fitted to its errors (`surrogate_minimum`). That uses evaluations only, no derivatives, and
+replaces the slow last third of a search (`benchmarks/ablation.py`).
 
-No operator draws random numbers by itself: they are handed to it as `chance`, since a generation draws its own at once
+Operators do not draw random numbers: they are passed in as `chance`, as a generation draws all of its own at once
 (`draw`).
 """
 
@@ -17,11 +17,11 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 from gavo_jax.solvers.base import Bounds
 
 SMALLEST_CHANCE = 2.0**-24
-"""Smallest of the random numbers. With 0 a mutation would be of infinite size."""
+"""Smallest random number. A mutation from 0 would be infinite."""
 
 
 def draw(key: PRNGKeyArray, count: int) -> Float[Array, "p 8"]:
-    """Random numbers of P chromosomes, uniform from `SMALLEST_CHANCE` to 1: six for the genes and two for the parents.
+    """Draw the random numbers of P chromosomes, uniform from `SMALLEST_CHANCE` to 1: six for genes, two for parents.
 
     Genes are either crossed or mutated, so both operators may use the same six.
     """
@@ -37,8 +37,8 @@ def initial_population(
 ) -> Float[Array, "p 6"]:
     """First population, uniform within the bounds: ξ = ξ^L + rand (ξ^U − ξ^L). Equation (9).
 
-    The first G are the guesses themselves, since a level begins where the coarser one ended. With a `spread` the others
-    are a normal cloud about the guesses, of this standard deviation, which the paper does not have.
+    The first G are the guesses themselves, as a level begins where the coarser one ended. With a `spread`, which the
+    paper doesn't have, the others are a normal cloud about the guesses with this standard deviation.
     """
     about = guess[jnp.arange(count) % guess.shape[0]]
     chance = draw(key, count)[:, :6]
@@ -48,10 +48,10 @@ def initial_population(
 
 
 def fitness(error: Float[Array, " p"], pressure: Float[Array, ""] | float) -> Float[Array, " p"]:
-    """Fitness of a population in the order of its errors, f = exp(−8 E/E_min); 8 is the `pressure`. Equation (10).
+    """Fitness of a population sorted by error, f = exp(−8 E/E_min); 8 is the `pressure`. Equation (10).
 
-    All values are e⁸ times as large, so that the best one's is 1: the wheel asks for proportions only. A chromosome
-    without a finite error has a fitness of 0.
+    All values are multiplied by e⁸, so that the best is 1: only their proportions matter. A chromosome without a finite
+    error has a fitness of 0.
     """
     least = jnp.maximum(error[0], 1e-12)
     return jnp.where(jnp.isfinite(error), jnp.exp(-pressure * (error / least - 1.0)), 0.0)
@@ -60,8 +60,8 @@ def fitness(error: Float[Array, " p"], pressure: Float[Array, ""] | float) -> Fl
 def roulette(fitness: Float[Array, " p"], chance: Float[Array, "p n"]) -> Integer[Array, "p n"]:
     """Roulette wheel: indices drawn in proportion to the fitness, by its cumulative sum. Equation (11)."""
     up_to = np.triu(np.ones((fitness.shape[0],) * 2, np.float32))
-    wheel = fitness @ up_to  # a cumulative sum is many steps, this is one
-    # all compared at once: a binary search is a loop, whose turns cost more than they save on a population
+    wheel = fitness @ up_to  # one operation, where a cumulative sum takes many
+    # all compared at once: on a population a binary search's loop costs more than it saves
     places = jnp.searchsorted(wheel, chance * wheel[-1], method="compare_all")
     return jnp.minimum(places, fitness.shape[0] - 1)
 
@@ -107,15 +107,15 @@ def _randn(chance: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 _PAIRS = np.triu_indices(6, 1)
 RIDGE = 0.1
-"""How strongly the fit leans to a round bowl; the problem's coordinates make it nearly one."""
+"""Strength of the fit's shrinkage towards isotropy; the problem's coordinates make it nearly isotropic."""
 
 
 def surrogate_minimum(x: Float[Array, "p 6"], error: Float[Array, " p"]) -> Float[Array, " 6"]:
     """Minimum of a quadratic fitted to evaluated candidates, best first, by weighted ridge regression.
 
-    The bowl's mean curvature is fitted freely and its departures from roundness are shrunk, so that a population
-    smaller than the 28 coefficients still gives a sound step. Candidates far above the best weigh little, and the
-    step is held within four times the population's spread.
+    The mean curvature is fitted freely and anisotropy is shrunk, so that a population smaller than the 28 coefficients
+    still gives a sound step. Candidates far above the best have little weight, and the step is limited to four times
+    the population's spread.
     """
     finite = jnp.isfinite(error)
     counted = finite.astype(jnp.float32)

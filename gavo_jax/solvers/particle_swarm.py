@@ -1,4 +1,4 @@
-"""Particle swarm optimisation with Clerc's constriction, the paper's first rival."""
+"""Particle swarm optimisation with Clerc's constriction, the paper's first baseline."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,15 +29,15 @@ class ParticleSwarm(PerLevel):
     """Global-best particle swarm: v' = χ (v + c₁ r₁ (memory − x) + c₂ r₂ (best − x)).
 
     Attributes:
-        population: Particles (static, an entry per level).
+        population: Number of particles (static, an entry per level).
         iterations: Largest number of iterations (static, an entry per level; 0 skips the level).
         patience: Iterations without progress that end a level (static).
-        spread: Standard deviation of the first particles about the guess, search units; None draws them uniformly
-            within the bounds.
+        spread: Standard deviation of the initial particles about the guess, search units, an entry per level; None
+            draws them uniformly within the bounds.
         constriction: χ; Clerc and Kennedy 2002 give 0.7298 for c₁ + c₂ = 4.1.
         cognitive: c₁, the pull towards a particle's own best.
         social: c₂, the pull towards the swarm's best.
-        velocity_clamp: Largest velocity as a share of the bounds' width, or of 6 x spread where a spread is given.
+        velocity_clamp: Largest velocity as a share of the bounds' width, or of 6 x spread if there is a spread.
     """
 
     population: Schedule = static((0, 20, 24, 32, 64), least=4)
@@ -50,7 +50,7 @@ class ParticleSwarm(PerLevel):
     velocity_clamp: float = within(0.2, 0)
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> SwarmState:
-        """Particles about the guesses, at rest."""
+        """Place the particles about the guesses, at rest."""
         del problem
         places, spread = largest(self.population), self.here(self.spread)
         x = initial_population(key, places, spread, guess, bounds)
@@ -59,7 +59,7 @@ class ParticleSwarm(PerLevel):
         return SwarmState(x, jnp.zeros_like(x), x, unknown, bounds, self.velocity_clamp * width)
 
     def step(self, key: PRNGKeyArray, state: SwarmState, problem: Problem) -> SwarmState:
-        """Evaluate the particles, then move each once; one that meets a bound stops there.
+        """Evaluate the particles, then move each once; coordinates that reach a bound stop there.
 
         Places beyond the level's population stay empty: their error is +inf.
         """
@@ -79,11 +79,11 @@ class ParticleSwarm(PerLevel):
         return state._replace(x=x, velocity=velocity, memory=memory, memory_error=memory_error)
 
     def best(self, state: SwarmState) -> Best:
-        """The swarm's best memory."""
+        """Return the swarm's best memory."""
         leader = jnp.argmin(state.memory_error)
         return Best(state.memory[leader], state.memory_error[leader])
 
     def candidates(self, state: SwarmState) -> Candidates:
-        """The particles' memories; NaN in the empty places."""
+        """Return the particles' memories; NaN in the empty places."""
         present = jnp.arange(state.x.shape[0]) < self.here(self.population)
         return Candidates(jnp.where(present[:, None], state.memory, jnp.nan), state.memory_error)
