@@ -1,1 +1,1 @@
-"""What a recording does not say of its camera, found from its images: shutter, delay of depth, unit of depth, lens."""
+"""Calibration from a recording's images: rolling shutter, delay of depth, unit of depth, and intrinsics."""

@@ -1,12 +1,12 @@
-"""What a camera does not say of itself, from the images that it took: no pose, no truth, no pattern.
+"""Self-calibration of a camera from its images: no poses, no ground truth, no pattern.
 
-Two frames agree best if what is supposed of the camera is so. What of that shows where:
+Two frames agree best if the camera's parameters are right. Each parameter shows in certain residuals:
 
 - **Readout** of a rolling shutter: in the grey residuals, as the camera speeds up and slows down.
 - **Delay** of depth: in the depth residuals. The motion follows the images, and depth follows it late or early.
 - **Focal length** and **principal point**: in the grey residuals, as a turn moves the image's rim more than its middle.
-- **Depth scale**: in none of them. With depth registered to colour, a world twice as large is seen alike. Of a first
-  Kinect and its like the steps between depths tell (`datasets.depth_unit`); of other sensors nothing does.
+- **Depth scale**: in none of them. With depth registered to colour, a world twice as large looks the same. For a first
+  Kinect and similar sensors the steps between depths show it (`datasets.depth_unit`); for others nothing does.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,62 +29,61 @@ Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "princ
 ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")
 
 WINDOW = 45
-"""Frames of a stretch, a second and a half; enough for many a turn back and forth."""
+"""Number of frames of a stretch, a second and a half; enough for several turns back and forth."""
 WINDOWS = 2
-"""Stretches, those of most motion."""
+"""Number of stretches, those with the most motion."""
 LEAST_FRAMES = 12
 MOST_SEARCHED = 3000
-"""Frames among which the stretches are looked for."""
+"""Number of frames that are searched for stretches."""
 APART = 3
-"""Frames from one to the other of the pairs that tell the focal length and the principal point: what these change grows
-with the motion, and what the shutter changes does not.
-"""
+"""Distance in frames of the pairs that determine the focal length and the principal point. The effect of these grows
+with the motion, and that of the shutter doesn't."""
 EDGE = 2
-"""Pairs at either end of a stretch that do not count: the motion before and after them is not known."""
+"""Number of pairs at either end of a stretch that do not count, as the motion beyond them is unknown."""
 
 LONGEST_READOUT, LONGEST_DELAY = 0.05, 0.05
-"""Longest readout and longest delay of depth that are looked for, seconds."""
+"""Longest readout and longest delay of depth that are tried, seconds."""
 READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP = 0.004, 0.005, 0.015, 4.0
-"""Between the values of the last parabolas: seconds, seconds, share, pixels."""
+"""Spacing of the values that parabolas are fitted to: seconds, seconds, share, pixels."""
 FOCAL_RANGE, CENTRE_RANGE = 0.25, 40.0
-"""Either way of what the camera says, share and pixels."""
+"""Range that is tried on either side of the given camera's values, share and pixels."""
 ROUNDS = 2
-"""Each number is found while the others are held, so all are found again."""
+"""Number of passes: each parameter is estimated with the others fixed, so all are estimated again."""
 
 TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0}
-"""One standard deviation from which on a number is not determined: seconds, seconds, share, pixels."""
+"""Standard deviation from which a parameter counts as undetermined: seconds, seconds, share, pixels."""
 
 SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0}
-"""Deviation that all pairs share, so that their scatter tells nothing of it: how far off rendered frames of a known
-camera come out. Seconds, seconds, share, pixels."""
+"""Deviation common to all pairs, which their scatter doesn't show: the error on rendered frames of a known camera.
+Seconds, seconds, share, pixels."""
 
 STEPS_DEVIATION = 0.04
-"""Share by which cameras of that make differ in the factor of their steps."""
+"""Relative standard deviation of the depth steps' factor among cameras of that make."""
 SNAP = 0.08
-"""A unit that files commonly have is taken where the steps come so near to it."""
+"""Relative difference within which a common unit of files is preferred to the one that the steps give."""
 
 
 class Found(NamedTuple):
-    """One number of a camera."""
+    """Estimate of one parameter of a camera."""
 
     value: float | None
-    """None where the images do not determine it."""
+    """None if the images do not determine it."""
     deviation: float | None
-    """One standard deviation; None where it is a unit, or nothing is known."""
+    """Standard deviation; None if the value is a common unit or unknown."""
     unit: str
     why: str
-    """How it was found, or why it was not, in a few words."""
+    """How the value was found, or why it was not, in a few words."""
 
 
 @dataclass(frozen=True)
 class CameraEstimate:
-    """What was found, by name, and the camera with it.
+    """Estimated parameters by name, and the camera with them.
 
     Attributes:
-        found: readout, depth_delay, depth_scale (of the files) and, on wish, fx, fy, cx and cy.
-        camera: of the frames as they were given, with what was determined.
-        depth_delay: seconds; what the frames' own stamps say is not counted. 0 where it was not determined.
-        pairs: that told.
+        found: readout, depth_delay, depth_scale (of the files) and, on request, fx, fy, cx and cy.
+        camera: camera of the frames as they were given, with the parameters that were determined.
+        depth_delay: seconds, in addition to the delay by the frames' own stamps; 0 if it was not determined.
+        pairs: number of pairs that were used.
     """
 
     found: dict[str, Found]
@@ -95,7 +94,7 @@ class CameraEstimate:
 
 @dataclass
 class _Trial:
-    """Stretches, and what is supposed of the camera so far."""
+    """Stretches, with the current estimates of the camera and its motion."""
 
     stretches: list[Stretch]
     stamps: list[np.ndarray]
@@ -103,9 +102,9 @@ class _Trial:
     unknowns: Unknowns
     kinematics: list[Kinematics]
     edge: int = EDGE
-    """Pairs at either end of a stretch that do not count."""
+    """Number of pairs at either end of a stretch that do not count."""
     order: Integer[np.ndarray, " pairs"] | None = None
-    """Order in time of the pairs that count, as `scan` draws neighbours together; None where they are in order."""
+    """Order in time of the pairs that count, as `scan` draws neighbours together; None if they are in order."""
 
     def match(self, unknowns: Unknowns) -> list[Matched]:
         size = replace(self.camera.rectified(), fx=1.0, fy=1.0, cx=0.0, cy=0.0, readout=0.0, depth_scale=1.0)
@@ -114,12 +113,12 @@ class _Trial:
         return [match_pairs(stretch, moving, traced, camera=size) for stretch, moving in pairs]
 
     def settle(self) -> None:
-        """Find the camera's motion again, under what is supposed now."""
+        """Estimate the camera's motion again, with the current parameters."""
         matched = self.match(self.unknowns)
         self.kinematics = [Kinematics.of(stamps, m) for stamps, m in zip(self.stamps, matched, strict=True)]
 
     def apart(self, frames: int) -> "_Trial":
-        """The same stretches as several each, of every so many frames, without the ends."""
+        """Split each stretch, without its ends, into `frames` ones that take every `frames`-th frame."""
         trial, order = _Trial([], [], self.camera, self.unknowns, [], edge=0), []
         for stretch, stamps, kinematics in zip(self.stretches, self.stamps, self.kinematics, strict=True):
             count = (len(stamps) - 2 * EDGE) // frames
@@ -134,7 +133,7 @@ class _Trial:
         return trial
 
     def score(self, channel: Literal["grey", "depth"], change: Callable[[Unknowns, float], Unknowns]) -> Score:
-        """The pairs' residuals of one channel as a function of one number."""
+        """Return the pairs' residuals of one channel as a function of one parameter."""
 
         def joined(parts: list[np.ndarray]) -> np.ndarray:
             whole = np.concatenate([part[self.edge : len(part) - self.edge] for part in parts])
@@ -156,16 +155,16 @@ def estimate_camera(
     rounds: int = ROUNDS,
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> CameraEstimate:
-    """Find what a camera does not say of itself.
+    """Estimate unknown parameters of a camera from its frames.
 
     Args:
-        sequence: at least a dozen frames, of a camera that moves; a second or more of quick motion tells most.
-        wanted: the names of what is asked for.
-        rounds: how often each number is found, the others held.
-        on_progress: is told what is being found.
+        sequence: at least a dozen frames of a moving camera; a second or more of quick motion is best.
+        wanted: names of the parameters to estimate.
+        rounds: number of passes, each estimating every parameter with the others fixed.
+        on_progress: called with the name of what is being estimated.
 
     Raises:
-        GavoError: something else is wanted, too few frames can be read, or no two of them agree in any way.
+        GavoError: unknown parameter, too few readable frames, or too few pairs that can be aligned.
     """
     guessed = getattr(sequence, "times_guessed", "")
     sequence = without_distortion(sequence)
@@ -180,7 +179,7 @@ def estimate_camera(
     on_progress("looking for stretches of motion")
     stretches = [Stretch.of(frames, camera) for frames in _stretches(sequence)]
     unknowns = Unknowns.of(camera)
-    if "readout" in wanted:  # looked for from an even shutter on, whatever the camera says
+    if "readout" in wanted:  # searched from a global shutter on, whatever the camera says
         unknowns = unknowns._replace(readout=0.0)
     stamps = [np.asarray(stretch.stamps, float) for stretch in stretches]
     standing = [Kinematics.unknown(len(times)) for times in stamps]
@@ -226,7 +225,7 @@ def _find_delay(trial: _Trial, interval: float, is_first: bool) -> dict[str, Lea
 
 
 def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
-    """Both focal lengths by one factor: their ratio is the pixels', and better known than the images tell it."""
+    """Scale both focal lengths by one factor: their ratio is that of the pixels, which is known better beforehand."""
     del interval
     said, ratio = trial.camera.fx, trial.camera.fy / trial.camera.fx
 
@@ -265,7 +264,7 @@ _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Least]]] = {
     "focal_length": _find_focal,
     "principal_point": _find_centre,
 }
-"""In the order in which they are found: those that show most come first."""
+"""Stages in their order: parameters with the largest effect come first."""
 
 _KINDS: dict[str, tuple[str, str, str]] = {
     "readout": ("readout", "s", "grey residuals"),
@@ -278,13 +277,13 @@ _KINDS: dict[str, tuple[str, str, str]] = {
 
 
 def _judged(leasts: dict[str, Least], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
-    """Each number with its deviation, or why it is not determined.
+    """Return each parameter with its deviation, or why it is not determined.
 
     Args:
-        leasts: What was found, by name.
-        trial: What it was found from.
-        interval: Between two frames, seconds: no readout is longer.
-        guessed: What the stamps are taken from, where that is a guess; else empty.
+        leasts: Minima by name.
+        trial: Trial that they were found with.
+        interval: Time between two frames, seconds: no readout is longer.
+        guessed: Origin of the stamps if they are a guess; else empty.
     """
     found = {}
     for name, least in leasts.items():
@@ -302,7 +301,7 @@ def _judged(leasts: dict[str, Least], trial: _Trial, interval: float, guessed: s
 
 
 def _depth_scale(sequence: Sequence) -> Found:
-    """Find the unit of depth by the steps between depths, where the sensor is one of those."""
+    """Find the unit of depth by the steps between depths, if the sensor is like a first Kinect."""
     sample, _ = sample_sequence(sequence)
     camera, unit = sequence.camera, "units per metre"
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
@@ -318,7 +317,7 @@ def _depth_scale(sequence: Sequence) -> Found:
 
 
 def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
-    """The camera of the frames; a depth scale is found in units of the files, which frames may not have."""
+    """Return the frames' camera with what was found; the depth scale is converted from the files' units to theirs."""
     camera, unit = sequence.camera, getattr(sequence, "depth_unit", None)
     names = ("readout", "depth_scale", "fx", "fy", "cx", "cy")
     values = {name: found[name].value for name in names if name in found}
@@ -329,10 +328,10 @@ def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
 
 
 def _stretches(sequence: Sequence) -> list[list[Frame]]:
-    """The stretches of most motion, each of consecutive frames that can be read.
+    """Return the stretches with the most motion, each of consecutive readable frames.
 
     Raises:
-        GavoError: there is none of enough frames.
+        GavoError: none has enough frames.
     """
     too_few = GavoError(f"{sequence.name}: at least {LEAST_FRAMES} frames in a row that can be read are needed")
     if len(sequence) < LEAST_FRAMES:
@@ -355,7 +354,7 @@ def _stretches(sequence: Sequence) -> list[list[Frame]]:
 
 
 def _changes(sequence: Sequence, count: int) -> np.ndarray:
-    """How much each image differs from the one before, per contrast; where one cannot be read, nothing."""
+    """Difference of each image from the one before, relative to its contrast; 0 where one cannot be read."""
     if count <= WINDOW:
         return np.zeros(max(count - 1, 0))
     changes, before = np.zeros(count - 1), None
@@ -372,7 +371,7 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
 
 
 def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
-    """The longest run of frames that can be read, with stamps that go forward."""
+    """Return the longest run of readable frames with increasing stamps."""
     runs: list[list[Frame]] = [[]]
     for index in range(start, start + length):
         try:

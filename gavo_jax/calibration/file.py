@@ -1,4 +1,4 @@
-"""A calibration as a camera file of ours."""
+"""Writing of a calibration as this package's camera file."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from gavo_jax.errors import write_bytes
 
 
 def write_camera_file(path: str | Path, calibration: Calibration, comments: tuple[str, ...] = ()) -> None:
-    """Write what `load_calibration` reads back.
+    """Write a camera file that `load_calibration` reads back.
 
     Args:
         path: ends in .toml.
-        calibration: the cameras as they record.
-        comments: lines to stand above.
+        calibration: the cameras, with lens distortion.
+        comments: comment lines at the top.
 
     Raises:
         GavoError: the file cannot be written.

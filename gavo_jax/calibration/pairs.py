@@ -1,6 +1,6 @@
-"""How well consecutive frames agree if the camera were so: E of each pair at the motion that suits it best.
+"""How well consecutive frames agree under assumed camera parameters: each pair's residuals at its best motion.
 
-All that is asked for is a number of one compiled program, so that a search over it compiles nothing anew.
+The parameters are inputs of one compiled program, so that a search over them recompiles nothing.
 """
 
 from collections.abc import Iterable
@@ -33,17 +33,17 @@ SOLVER = GaussNewton(iterations=(6, 6, 8, 8, 0))
 OPTIONS = AlignmentOptions(
     points=(4800, 1200, 1200, 1200, 1200), views=(1,) * LEVELS, depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3)
 )
-"""Frame to frame: a keyframe would carry what was believed of the camera from pair to pair. Level 0 is that of images
-of half the size: what the odometry ends with."""
+"""Options for frame to frame alignment: a keyframe would carry assumptions about the camera from pair to pair. Level 0
+is that of half-size images, the odometry's finest."""
 
 
 class Unknowns(NamedTuple):
-    """What may be asked of a camera."""
+    """Parameters of a camera that can be estimated."""
 
     readout: Any
     """Seconds from the first row to the last."""
     delay: Any
-    """Seconds that depth was taken after what its stamp says, or the colour image's where it has none."""
+    """Seconds that depth was taken after its stamp, or after the colour image's if it has none."""
     fx: Any
     fy: Any
     cx: Any
@@ -51,11 +51,11 @@ class Unknowns(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> "Unknowns":
-        """What a camera says of itself."""
+        """Return a camera's own parameters."""
         return cls(camera.readout, 0.0, camera.fx, camera.fy, camera.cx, camera.cy)
 
     def on(self, camera: Camera) -> Camera:
-        """A camera with these values."""
+        """Return a camera with these parameters."""
         return replace(camera, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, readout=self.readout)
 
 
@@ -65,13 +65,13 @@ class Stretch(NamedTuple):
     grey: Float[Array, "f h w"]
     inverse_depth: Float[Array, "f h w"]
     stamps: Float[Array, " f"]
-    """Stamps of colour, seconds after the first one; those of an even clock where they are such with jitter."""
+    """Stamps of colour, seconds after the first one, with jitter removed; see `evened`."""
     delays: Float[Array, " f"]
     """Delays of depth after colour by the stamps, seconds."""
 
     @classmethod
     def of(cls, frames: Iterable[Frame], camera: Camera) -> "Stretch":
-        """Frames side by side, on the device."""
+        """Stack frames on the device."""
         levels, stamps, depth_stamps = [], [], []
         for frame in frames:
             levels.append(_half(frame.grey, frame.depth, camera.depth_scale))
@@ -83,19 +83,19 @@ class Stretch(NamedTuple):
         return cls(grey, inverse_depth, jnp.asarray(colour, jnp.float32), jnp.asarray(depth - colour, jnp.float32))
 
     def some(self, frames: Integer[np.ndarray, " n"]) -> "Stretch":
-        """Some of the frames, as if there were no others."""
+        """Return a stretch of only some of the frames."""
         return Stretch(*(leaf[frames] for leaf in self))
 
 
 MOST_JITTER = 0.3
-"""Share of the interval between two frames: stamps that are off an even clock by no more are taken as that clock's."""
+"""Largest deviation from an even clock that is removed as jitter, as a share of the interval between frames."""
 
 
 def evened(stamps: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-    """Stamps of an even clock, where these are such with jitter; frames may be missing.
+    """Remove the jitter of stamps that follow an even clock; frames may be missing.
 
-    A camera exposes evenly; a stamp says when an image arrived. A jitter of milliseconds, against 33 between frames,
-    would make the speed jump by a tenth from frame to frame, and so hide how the camera really speeds up.
+    A camera exposes at regular intervals, but a stamp says when an image arrived. A jitter of milliseconds, with 33
+    between frames, would make the speed jump by a tenth from frame to frame, which would hide the true acceleration.
     """
     intervals = np.diff(stamps)
     usual = np.median(intervals)
@@ -114,7 +114,7 @@ def _half(grey: Array, depth: Array, depth_scale: Array | float) -> PyramidLevel
 
 
 class Kinematics(NamedTuple):
-    """How the camera moves at the frames' moments: twists of the points in it, per second."""
+    """The camera's motion at the frames' timestamps: twists of the points in it, per second."""
 
     velocity: Float[Array, "f 6"]
     acceleration: Float[Array, "f 6"]
@@ -125,13 +125,13 @@ class Kinematics(NamedTuple):
 
     @classmethod
     def unknown(cls, frames: int) -> "Kinematics":
-        """Standing still."""
+        """Return the kinematics of a camera at rest."""
         zero = jnp.zeros((frames, 6))
         return cls(zero, zero, zero, jnp.tile(jnp.eye(4), (frames, 1, 1)))
 
     @classmethod
     def of(cls, stamps: np.ndarray, matched: "Matched") -> "Kinematics":
-        """Derive them from the motions between frames: central differences of fourth order, of second near the ends."""
+        """Derive kinematics from the motions between frames: fourth-order central differences, second near the ends."""
         seconds = np.diff(stamps)[:, None]
         between = np.nan_to_num(np.asarray(matched.xi)) / seconds
         velocity = np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
@@ -147,7 +147,7 @@ class Kinematics(NamedTuple):
         )
 
     def some(self, frames: Integer[np.ndarray, " n"], stamps: np.ndarray) -> "Kinematics":
-        """Select some frames: what the camera does at their moments, and what it has done from one to the next."""
+        """Return the kinematics of some frames: at their timestamps, and composed from one to the next."""
         steps, guesses = np.asarray(self.guesses, np.float64), np.tile(np.eye(4), (len(frames), 1, 1))
         for place, (first, last) in enumerate(pairwise(frames)):
             for step in steps[first:last]:
@@ -163,7 +163,7 @@ class Kinematics(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """Of each pair of consecutive frames what their best motion leaves."""
+    """Best motion of each pair of consecutive frames, with the residuals that it leaves."""
 
     grey: Float[Array, " pairs"]
     """Logarithm of the grey residuals' scale."""
@@ -176,13 +176,13 @@ class Matched(NamedTuple):
 
 @partial(jax.jit, static_argnames="camera")
 def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *, camera: Camera) -> Matched:
-    """Align each frame of a stretch with the one before it by Gauss-Newton, under what is supposed of the camera.
+    """Align each frame of a stretch with the one before it by Gauss-Newton, under assumed camera parameters.
 
     Args:
         stretch: Frames.
-        kinematics: How the camera moves, for what depends on it to first order: shutter and delay.
-        unknowns: What is supposed.
-        camera: Of the full images; only its size counts.
+        kinematics: The camera's motion, for the effects of shutter and delay.
+        unknowns: Assumed parameters.
+        camera: Camera of the full images; only its size matters.
     """
     seen = unknowns.on(camera).level(1)
     levels = levels_of(seen, SOLVER, OPTIONS)
@@ -203,8 +203,8 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
             jax.tree.map(lambda leaf: leaf[first], references),
             jax.tree.map(lambda leaf: leaf[first + 1], targets),
         )
-        # the target's rows are taken as moving on by the mean velocity; so the reference's move by as much less as the
-        # camera really gained between the two
+        # the target's rows are assumed to move at the mean velocity, so what the camera really gained in speed between
+        # the two frames is subtracted from the reference's velocity
         gained = kinematics.velocity[first + 1] - kinematics.velocity[first]
         reference = undo_rolling_shutter(reference, (kinematics.between[first] - gained) * unknowns.readout)
         share = unknowns.readout / (stretch.stamps[first + 1] - stretch.stamps[first])
@@ -221,19 +221,20 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
 
 
 ONE_SURFACE = 0.03
-"""Neighbouring readings whose inverse depths differ by no more, as a share, are interpolated."""
+"""Largest relative difference of neighbouring inverse depths that are interpolated."""
 
 
 def depth_moved(
     inverse_depth: Float[Array, "h w"], camera: Camera, depth_T_colour: Float[Array, "4 4"]
 ) -> Float[Array, "h w"]:
-    """Interpolate what `synchronise_depth` looks up at the nearest pixel: that does not change for moves of less than
-    half a pixel, and here it is the small changes that count.
+    """Warp depth as `synchronise_depth` does, but with interpolation.
+
+    Looking up the nearest pixel would not respond to moves of less than half a pixel, and here small changes matter.
 
     Args:
-        inverse_depth: 1/m, 0 = no reading, seen by the camera where it stood when depth was read.
+        inverse_depth: 1/m, 0 = no reading, seen from the camera's pose when depth was read.
         camera: camera of the image.
-        depth_T_colour: maps points of the camera at the colour image's moment into the camera at the depth image's.
+        depth_T_colour: maps points of the camera at the colour image's timestamp into that at the depth image's.
     """
     height, width = inverse_depth.shape
     x, y = to_ray(camera, jnp.arange(width), jnp.arange(height)[:, None])

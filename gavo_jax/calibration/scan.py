@@ -1,4 +1,4 @@
-"""The least of a rough function of one number: values of it alone, no derivatives, and how sure the least is."""
+"""Minimisation of a rough function of one variable without derivatives, with the minimum's uncertainty."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,39 +7,39 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 Score = Callable[[float], tuple[Float[np.ndarray, " pairs"], Bool[np.ndarray, " pairs"]]]
-"""Cost of each pair at a value, and which pairs count."""
+"""Returns the cost of each pair at a value, and which pairs count."""
 
 BLOCK = 5
-"""Consecutive pairs share their motion and their scene: they are drawn together."""
+"""Number of consecutive pairs that the bootstrap draws together, as they share their motion and scene."""
 DRAWS = 300
 POINTS = 5
-"""Values, evenly spaced about the least, to which the last parabola is fitted."""
+"""Number of evenly spaced values that a parabola is fitted to."""
 
 
 class Least(NamedTuple):
-    """Where a function is least."""
+    """Minimum of a function."""
 
     value: float
     deviation: float
-    """One standard deviation, by drawing blocks of pairs anew; infinite where the pairs leave it open."""
+    """Standard deviation, by a bootstrap over blocks of pairs; infinite if the pairs do not determine the value."""
 
 
 def coarse(score: Score, values: Float[np.ndarray, " n"]) -> float:
-    """The value of a grid at which the mean cost is least, over the pairs that count everywhere."""
+    """Return the value of a grid with the smallest mean cost, over the pairs that count everywhere."""
     costs, counted = _evaluate(score, values)
     return float(values[np.argmin(costs[:, counted].mean(axis=1))]) if counted.any() else float(np.median(values))
 
 
 def refine(score: Score, start: float, step: float, low: float, high: float, rounds: int = 3) -> Least:
-    """The least near a value, by parabolas through evenly spaced values that follow it.
+    """Find the minimum near a value, by parabolas through evenly spaced values that are re-centred on it.
 
     Args:
         score: the function.
-        start: where to look.
-        step: between the values; wide enough that the function's roughness is small against its rise.
-        low: no value below is tried,
-        high: and none above.
-        rounds: how often the values are moved to the least found, at most.
+        start: initial value.
+        step: spacing of the values; wide enough that the function's roughness is small against its rise.
+        low: smallest value that is tried.
+        high: largest value that is tried.
+        rounds: largest number of times that the values are re-centred.
     """
     reach = step * (POINTS // 2)
     middle, least = float(np.clip(start, low + reach, high - reach)), Least(start, np.inf)
@@ -62,20 +62,20 @@ def refine(score: Score, start: float, step: float, low: float, high: float, rou
 
 
 def _evaluate(score: Score, values: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Costs [n, pairs], and the pairs that count at every value."""
+    """Return the costs [n, pairs], and which pairs count at every value."""
     results = [score(float(value)) for value in values]
     return np.stack([costs for costs, _ in results]), np.all([counted for _, counted in results], axis=0)
 
 
 def _vertex(values: Float[np.ndarray, " n"], costs: Float[np.ndarray, " n"]) -> float | None:
-    """The least of the parabola through some values; None where it opens downwards."""
+    """Return the minimum of the parabola fitted to some values; None if it opens downwards."""
     unit = (values[-1] - values[0]) / 2
     curve, slope, _ = np.polyfit((values - values.mean()) / unit, costs, 2)
     return None if curve <= 0 else float(values.mean() - unit * slope / (2 * curve))
 
 
 def _deviation(values: Float[np.ndarray, " n"], costs: Float[np.ndarray, "n pairs"]) -> float:
-    """Scatter of the least over blocks of pairs drawn anew (the bootstrap), from the middle half of the draws."""
+    """Bootstrap standard deviation of the minimum over blocks of pairs, from the draws' interquartile range."""
     blocks = np.array_split(costs, max(1, costs.shape[1] // BLOCK), axis=1)
     sums = np.stack([block.sum(axis=1) for block in blocks])
     draws = np.random.default_rng(0).integers(len(blocks), size=(DRAWS, len(blocks)))

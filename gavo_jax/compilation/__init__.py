@@ -1,1 +1,1 @@
-"""Which JAX is fit, how its programs are made, where they are kept, and how long they are waited for."""
+"""Checks of JAX's version and modes, compiled programs and their cache, and the time spent waiting for them."""

@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between processes, so that only the first one on a machine waits for them."""
+"""The folder that keeps compiled programs between processes, so that only a machine's first process waits for them."""
 
 import os
 import stat
@@ -16,27 +16,27 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def cache_folder() -> Path | None:
-    """Return `GAVO_CACHE_DIR`, else the user's cache folder for this package; None where there is no home."""
+    """Return `GAVO_CACHE_DIR`, else the user's cache folder for this package; None if there is no home folder."""
     try:
         if named := os.environ.get("GAVO_CACHE_DIR"):
-            return Path(named).expanduser()  # files of variables have no shell that does it
+            return Path(named).expanduser()  # no shell expands it in environment files
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gavo-jax"
     except RuntimeError:
         return None
 
 
 def why_not_private(folder: Path) -> str | None:
-    """Make a folder that is this user's alone; of one that is there, say in which way others could write to it.
+    """Create a private folder if it is missing, and return how others could write to it.
 
     Returns:
-        Words that go on from its name; None where nobody else can.
+        Words that continue the folder's name; None if nobody else can write to it.
 
     Raises:
-        OSError: it cannot be made or looked at.
+        OSError: it cannot be created or examined.
     """
     for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
         missing.mkdir(mode=0o700, exist_ok=True)
-    if not hasattr(os, "geteuid"):  # Windows: a user's folders are closed to others, and modes tell nothing
+    if not hasattr(os, "geteuid"):  # Windows: a user's folders are closed to others, and modes say nothing
         return None
     top = folder.stat()
     if top.st_uid != os.geteuid():
@@ -60,19 +60,19 @@ def why_not_private(folder: Path) -> str | None:
 
 
 def enable_compilation_cache(folder: str | Path | None = None) -> None:
-    """Keep programs between processes: traced ones, and compiled ones by JAX.
+    """Keep programs between processes: traced ones, and those compiled by JAX.
 
-    The command `gavo` does so by itself; a program of one's own calls this once, before the first alignment. JAX's
-    configuration is the process's, so compiled programs of other packages are kept too. Each kind of processor has a
-    folder of its own: JAX would load what another one compiled, and could run into instructions that this one lacks.
+    The command `gavo` does so by itself; other programs call this once, before the first alignment. JAX's configuration
+    is global to the process, so compiled programs of other packages are kept too. Each kind of processor has its own
+    folder: JAX would load what another one compiled, and could meet instructions that this one lacks.
 
-    A kept program is run as it is found. So the folder has to be private: where it is another user's, or others can
-    write to it, a `GavoWarning` says so, and nothing is kept. An entry that cannot be read or written (torn by a kill,
-    a full disk) costs a compilation and no word.
+    A kept program is run as it is found, so the folder must be private. If it belongs to another user, or others can
+    write to it, a `GavoWarning` says so and nothing is kept. An entry that cannot be read or written (truncated by a
+    kill, a full disk) silently costs a compilation.
 
     Args:
-        folder: Where; by default `GAVO_CACHE_DIR`, else the user's cache folder for this package. JAX keeps its part
-            where `JAX_COMPILATION_CACHE_DIR` says, if that is set: who may write there is up to who sets it.
+        folder: The folder; by default `GAVO_CACHE_DIR`, else the user's cache folder for this package. If
+            `JAX_COMPILATION_CACHE_DIR` is set, JAX keeps its part there, and whoever sets it decides who may write.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
     folder = cache_folder() if folder is None else Path(folder)
@@ -89,7 +89,7 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether programs may be kept in a folder; where others could write to it, a warning says why not."""
+    """Whether programs may be kept in a folder; if others could write to it, a warning says why not."""
     try:
         fault = why_not_private(folder)
     except OSError:

@@ -1,9 +1,9 @@
-"""The compiler and the processor that it compiles for: is the one fit to use, and which is the other.
+"""Check of the compiler's version, and identification of the processor that it compiles for.
 
-`pyproject.toml` leaves out the versions of JAX that are known to compute wrong numbers, and names the reports. A
-version can still come in behind its back (`pip install --no-deps`, a frozen environment), so a process asks here.
+`pyproject.toml` excludes the versions of JAX that are known to compute wrong numbers, and names the reports. Such a
+version can still get installed (`pip install --no-deps`, a frozen environment), so each process checks here.
 
-Nothing here imports JAX: some of it has to happen before.
+Nothing here imports JAX, as some of it must happen before that.
 """
 
 import hashlib
@@ -21,19 +21,19 @@ from packaging.requirements import Requirement
 from gavo_jax.early import is_command
 
 COMPILERS = ("jax", "jaxlib")
-"""Packages that decide what numbers a compiled program gives."""
+"""Packages that determine the numbers that a compiled program computes."""
 
 
 class CompilerWarning(UserWarning):
-    """The installed JAX is one that this package rules out."""
+    """The installed JAX is a version that this package excludes."""
 
 
 @cache
 def unfit_compiler() -> str | None:
-    """One line about a JAX whose version this package rules out; None where there is nothing to say."""
+    """Return a line about an installed JAX whose version this package excludes; None if it is fine."""
     try:
         requirements = [Requirement(line) for line in requires("gavo-jax") or []]
-    except PackageNotFoundError:  # not installed, so nothing says what it allows
+    except PackageNotFoundError:  # not installed, so its requirements are unknown
         return None
     ours = [requirement for requirement in requirements if requirement.name in COMPILERS and not requirement.marker]
     unfit = [r.name for r in ours if not r.specifier.contains(version(r.name), prereleases=True)]
@@ -45,26 +45,26 @@ def unfit_compiler() -> str | None:
 
 
 def prepare_process() -> None:
-    """What has to happen before JAX is imported.
+    """Set up the process before JAX is imported.
 
-    XLA says, for every program that is loaded on some processors, that it was compiled for another one: it takes
-    settings such as `prefer-no-gather` for instructions (jax-ml/jax#38445). Programs of other processors are kept
-    apart (`processor_digest`), so its lines tell nothing and are not shown; faults come as exceptions all the same.
+    On some processors XLA reports, for every program that is loaded, that it was compiled for another one: it takes
+    settings such as `prefer-no-gather` for instructions (jax-ml/jax#38445). Programs of other processors are kept apart
+    (`processor_digest`), so these lines are meaningless and suppressed; errors still come as exceptions.
     """
     if "jax" not in sys.modules:
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    if not is_command() and (fault := unfit_compiler()):  # the command says it itself, as bad input
+    if not is_command() and (fault := unfit_compiler()):  # the command reports it itself, as bad input
         warnings.warn(fault, CompilerWarning, stacklevel=3)
 
 
 def processor() -> str:
-    """The processor's name, for people."""
+    """Return the processor's human-readable name."""
     return _cpuinfo().get("model name") or platform.processor() or platform.machine()
 
 
 @cache
 def processor_digest() -> str:
-    """A name for this kind of processor: the same for two machines only if they have the same instructions."""
+    """Return a name for this kind of processor: equal on two machines only if they have the same instructions."""
     described = _cpuinfo()
     told = [described.get(key, "") for key in ("vendor_id", "cpu family", "model", "model name", "flags", "Features")]
     if sys.platform == "darwin":
@@ -75,7 +75,7 @@ def processor_digest() -> str:
 
 @cache
 def _cpuinfo() -> dict[str, str]:
-    """What Linux says of the first core; empty elsewhere."""
+    """Return Linux's description of the first core; empty on other systems."""
     try:
         first, _, _ = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("\n\n")
     except OSError:

@@ -1,6 +1,6 @@
-"""JAX in 32 bits and its usual modes, whatever the program around it has chosen: what is compiled here needs them.
+"""JAX in 32 bits and its default modes, which the programs of this package need, whatever the caller has set.
 
-Whatever computes begins here, so here it is seen, too, whether it can.
+Every computation begins here, so forked processes, which cannot compute, are detected here, too.
 """
 
 import os
@@ -30,25 +30,25 @@ USUAL: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "jax_default_prng_impl": ("threefry2x32", jax.default_prng_impl),
     "jax_threefry_partitionable": (True, jax.threefry_partitionable),
 }
-"""Modes, what they are as JAX comes, and what sets them. Here not-a-number and infinity are no errors: they stand for
-what is not known, or worth nothing. Images come from the host, and what is found goes there. What a seed draws is up to
-the generator."""
+"""Modes with their default values and context managers. NaN and infinity are not errors here: they stand for unknown
+values and invalid candidates. Images come from the host, and results go there. The generator determines what a seed
+draws."""
 
 
 def choose_usual() -> None:
-    """Have every thread of this process in the usual modes: for the command, whose process it is. What environment
-    variables choose is for other programs.
+    """Set the usual modes for every thread of this process, overriding environment variables.
+
+    This is for the command, which owns its process.
     """
     for name, (usual, _) in USUAL.items():
         jax.config.update(name, usual)
 
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
-    """The function as it is in a process that has switched on neither JAX's 64 bits (`jax_enable_x64`) nor another mode
-    of `USUAL`.
+    """Make a function run with JAX in 32 bits (without `jax_enable_x64`) and in the other modes of `USUAL`.
 
-    The switches are those of each thread: what is handed to another one has to be wrapped, too. What it raises in a
-    process that was forked is `refuse_fork`'s.
+    Modes are per thread: functions that are passed to another thread must be wrapped, too. In a forked process the
+    function raises as `refuse_fork` does.
     """
 
     @wraps(function)
@@ -64,14 +64,14 @@ def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
 
 
 _process: int | None = None
-"""The one that came here first."""
+"""Id of the process that computed first."""
 
 
 def refuse_fork() -> None:
-    """Refuse a process that was forked from one that has computed.
+    """Refuse to compute in a process that was forked from one that has computed.
 
     Raises:
-        GavoError: it was. JAX's threads are not in it, and it would wait for them for ever.
+        GavoError: it was. JAX's threads do not exist in it, and it would wait for them for ever.
     """
     global _process
     _process = _process or os.getpid()

@@ -1,10 +1,10 @@
 """Large programs whose traced form is kept between processes.
 
-JAX's own cache keeps what XLA made of a program, but to look it up there the program is needed first: Python traces the
-function and lowers it, and for a frame's program that takes longer than all that follows (`benchmarks/footprint.py`).
-So the lowered form is kept too, as `jax.export` writes it. A file's name says which program it holds (function,
-settings, shapes, JAX's configuration), its seal what that was made from (this package's code, versions): once any of
-this has changed, the program is traced anew.
+JAX's own cache keeps what XLA compiled, but to look that up the function must first be traced and lowered. For a
+frame's program this takes longer than everything after it (`benchmarks/footprint.py`). So the lowered form is kept too,
+as serialised by `jax.export`. A file's name identifies the program (function, settings, shapes, JAX's configuration),
+and its seal what that was made from (this package's code, versions). If any of these changes, the program is traced
+anew.
 """
 
 import dataclasses
@@ -34,14 +34,14 @@ R = TypeVar("R")
 
 OURS = __name__.partition(".")[0]
 TRACED_WITH = ("jax", "jaxlib", "jaxlie", "numpy", "optax")
-"""Packages whose code is traced along with ours; their versions tell whether it has changed."""
+"""Packages whose code is traced along with ours; their versions show whether it has changed."""
 
 OPTIONS = tuple(
     name for name in sorted(jax.config.values) if hasattr(jax.config, name) and "transfer_guard" not in name
 )
-"""JAX's, by name, but for those of what may be copied: they are asked as a program runs, and are no part of it."""
+"""Names of JAX's options, except the transfer guards: these apply when a program runs and are not part of it."""
 _configuration = attrgetter(*OPTIONS)
-"""Of `jax.config` their values, as this thread has them."""
+"""Returns the values of `OPTIONS` in `jax.config`, as seen by this thread."""
 
 _folder: Path | None = None
 _loaded: dict[Any, Callable[..., Any]] = {}
@@ -50,7 +50,7 @@ _lock = threading.Lock()
 
 
 def keep_programs_in(folder: Path | None) -> None:
-    """Have every `CachedProgram` keep its traced forms in a folder; None, as at first: nowhere."""
+    """Set the folder where every `CachedProgram` keeps its traced forms; None, the default, keeps none."""
     global _folder
     if folder != _folder:
         _loaded.clear()
@@ -58,17 +58,17 @@ def keep_programs_in(folder: Path | None) -> None:
 
 
 class Kind(NamedTuple):
-    """What a program needs to know of an input."""
+    """Shape and type of an input, which a program is compiled for."""
 
     shape: tuple[int, ...]
     type: Any
-    """Type of the numbers: NumPy's or JAX's, or a Python number's own."""
+    """Number type of NumPy or JAX, or a Python number's own."""
     weak: bool
-    """Whether the type gives way to others', as a Python number's does."""
+    """Whether the type is weak, as a Python number's."""
 
     @classmethod
     def of(cls, leaf: Any) -> "Kind":
-        """An array's, or a number's."""
+        """Return the kind of an array or a number."""
         if type(leaf) in (bool, int, float):
             return cls((), type(leaf), True)
         return cls(leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False))
@@ -78,15 +78,15 @@ class Kind(NamedTuple):
 
 
 class CachedProgram(Generic[P, R]):
-    """A function as `jax.jit` makes it, with its traced form kept where `keep_programs_in` says.
+    """A function compiled as by `jax.jit`, whose traced form is kept in the folder of `keep_programs_in`.
 
-    Somebody else's code among the settings (a loss, a solver) is not known to be the same the next time: with it, and
-    inside another program, this is `jax.jit` and nothing else.
+    Third-party code in the settings (a loss, a solver) may have changed by the next time. With it, and inside another
+    program, this is just `jax.jit`.
 
     Args:
-        function: Of trees of arrays and numbers by position, and of `static` arguments by keyword.
+        function: Takes trees of arrays and numbers by position, and `static` arguments by keyword.
         static: Names of keyword arguments that are part of the program.
-        returns: The NamedTuples in what it returns; those in their fields are found by their types.
+        returns: The NamedTuples that it returns; those in their fields are found by their types.
     """
 
     def __init__(self, function: Callable[P, R], static: tuple[str, ...] = (), returns: tuple[type, ...] = ()):
@@ -96,7 +96,7 @@ class CachedProgram(Generic[P, R]):
         update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Run it."""
+        """Run the program."""
         leaves, structure = jax.tree.flatten(args)
         is_traced = any(isinstance(leaf, Tracer) for leaf in leaves)
         if is_traced or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
@@ -109,16 +109,16 @@ class CachedProgram(Generic[P, R]):
                 return program(*leaves)
             with _lock:
                 loading = _loading.setdefault(signature, threading.Lock())
-            with counted_wait(), loading:  # once, whoever asks for it meanwhile; others side by side
+            with counted_wait(), loading:  # each program is loaded once, different ones concurrently
                 program = _loaded.get(signature)
                 if program is None:
                     program = _loaded[signature] = self._load(leaves, structure, kinds, kwargs)
-                return program(*leaves)  # which compiles it, where `_load` did not
-        except ValueError:  # what is kept is for the usual device, and these inputs may lie on another
+                return program(*leaves)  # compiles it, if `_load` did not
+        except ValueError:  # a kept program is for the default device, and these inputs may be on another
             return self._jitted(*args, **kwargs)
 
     def is_kept(self, *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Whether a call would find its program, here or in the folder, and trace nothing."""
+        """Whether a call would find its program, in memory or in the folder, and trace nothing."""
         if _folder is None:
             return False
         leaves, structure = jax.tree.flatten(args)
@@ -131,11 +131,11 @@ class CachedProgram(Generic[P, R]):
             return False
 
     def _signature(self, structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]) -> Any:
-        """What tells a program from the others of this process."""
+        """Return what identifies a program in this process."""
         return self._function, structure, kinds, tuple(static.items()), _configuration(jax.config)
 
     def _path(self, folder: Path, structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]) -> Path:
-        """The file of a program; raise Foreign where it has none."""
+        """Return the file of a program; raise Foreign if it cannot be kept."""
         settings = identify((jax.tree.unflatten(structure, kinds), static))
         function = self._function
         configuration = list(zip(OPTIONS, _configuration(jax.config), strict=True))
@@ -146,8 +146,9 @@ class CachedProgram(Generic[P, R]):
     def _load(
         self, leaves: list[Any], structure: Any, kinds: tuple[Kind, ...], static: dict[str, Any]
     ) -> Callable[..., R]:
-        """The program as a function of the leaves: from its file, or traced and written there; where none is kept, as
-        `jax.jit` makes it.
+        """Return the program as a function of the leaves.
+
+        It is read from its file, or traced and written there; if it cannot be kept, it is a plain `jax.jit`.
         """
 
         def of_leaves(*leaves: Any) -> R:
@@ -164,27 +165,27 @@ class CachedProgram(Generic[P, R]):
         if data is None:
             try:
                 data = bytes(export.export(jitted)(*leaves).serialize())
-            except (NotImplementedError, ValueError):  # an operation of this backend that JAX does not export
+            except (NotImplementedError, ValueError):  # an operation that JAX cannot export on this backend
                 return jitted
             _write(path, data)
-        # JAX sets LAPACK up when it lowers a call of it, and some versions at no other time: jax-ml/jax#29610
+        # some versions of JAX set up LAPACK only when they lower a call of it: jax-ml/jax#29610
         jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
-        # compiled here, as a call of the jitted form would compile once more when it is given its own results; for the
-        # kinds of its inputs, as what XLA made is found again by how it was asked for, on the host or on the device
+        # compiled here, as the jitted form would compile again when it is called with its own results; and for abstract
+        # inputs, as the key in JAX's cache depends on whether inputs are on the host or on the device
         return jax.jit(export.deserialize(bytearray(data)).call).lower(*map(_abstract, leaves)).compile()
 
 
 def _abstract(leaf: Any) -> Any:
-    """What a program is compiled for: an array without its place and its values, or a Python number."""
+    """Return what a program is compiled for: an array without its device and values, or a Python number."""
     kind = Kind.of(leaf)
     return leaf if kind.shape == () and kind.weak else jax.ShapeDtypeStruct(kind.shape, kind.type, weak_type=kind.weak)
 
 
 def _register(node: type) -> None:
-    """Tell JAX how to write down a NamedTuple, and those in it: of one that it doesn't know no program can be kept."""
+    """Register a NamedTuple, and those in it, for serialisation; without it no program with one can be kept."""
     try:
         export.register_namedtuple_serialization(node, serialized_name=f"{node.__module__}.{node.__qualname__}")
-    except ValueError:  # another program returns it too
+    except ValueError:  # registered already, by another program
         return
     for hint in get_type_hints(node).values():
         for part in (hint, *get_args(hint)):
@@ -193,14 +194,14 @@ def _register(node: type) -> None:
 
 
 class Foreign(Exception):
-    """Code of which nothing tells whether it has changed."""
+    """Code that may have changed undetected."""
 
 
 def identify(value: Any) -> Any:
-    """Settings as text, in every process the same.
+    """Describe settings by nested texts that are the same in every process.
 
     Raises:
-        Foreign: There is something among them that is neither known code nor a plain value.
+        Foreign: They contain something that is neither known code nor a plain value.
     """
     if isinstance(value, Kind | str | bool | int | float | None):
         return repr(value)
@@ -219,7 +220,7 @@ def identify(value: Any) -> Any:
 
 
 def _known(code: Any) -> str:
-    """Full name of a class or function that a module of this package, or of those it is traced with, has by it."""
+    """Return the full name of a class or function of this package or of those it is traced with; else raise Foreign."""
     module = sys.modules.get(code.__module__)
     may_be_known = code.__module__.partition(".")[0] in (OURS, *TRACED_WITH)
     if not may_be_known or getattr(module, code.__name__, None) is not code:
@@ -229,7 +230,7 @@ def _known(code: Any) -> str:
 
 @cache
 def _made_from() -> bytes:
-    """Digest of this package's code and of what it is traced with."""
+    """Return a digest of this package's code and of the versions that it is traced with."""
     digest = hashlib.sha256(repr([platform.python_version(), *map(version, TRACED_WITH)]).encode())
     folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
@@ -242,7 +243,7 @@ def _seal(data: bytes) -> bytes:
 
 
 def _read(path: Path) -> bytes | None:
-    """What the same code wrote to a file; None where the file is missing, stale or damaged."""
+    """Return what the same code wrote to a file; None if the file is missing, stale or damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -252,7 +253,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file, whole, if that can be done: whether it is there decides about time alone."""
+    """Write a file atomically, ignoring failures: without it only time is lost."""
     with suppress(OSError, GavoError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, _seal(data) + data)

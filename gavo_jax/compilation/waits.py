@@ -1,4 +1,4 @@
-"""How long a thread has waited for compiled programs: that is told, and does not count as the work's own time."""
+"""Time that a thread has waited for compiled programs, which is reported and excluded from the work's own time."""
 
 import threading
 import time
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class _Waits(threading.local):
-    """Of each thread its own."""
+    """Waiting time and callback of each thread."""
 
     seconds = 0.0
     tell: Callable[[], None] | None = None
@@ -30,7 +30,7 @@ def counted_wait() -> Iterator[None]:
 
 @contextmanager
 def told_of_waits(tell: Callable[[], None]) -> Iterator[None]:
-    """Have a function called whenever this thread begins to wait, while the block runs."""
+    """Call a function whenever this thread begins to wait while the block runs."""
     before, _waits.tell = _waits.tell, tell
     try:
         yield
@@ -39,17 +39,17 @@ def told_of_waits(tell: Callable[[], None]) -> Iterator[None]:
 
 
 class Stopwatch:
-    """Time of this thread since the watch was made."""
+    """Measures this thread's time since the watch was made."""
 
     def __init__(self) -> None:
         self._start, self._waited = time.perf_counter(), _waits.seconds
 
     @property
     def waited(self) -> float:
-        """Seconds that it waited for programs."""
+        """Seconds spent waiting for programs."""
         return _waits.seconds - self._waited
 
     @property
     def seconds(self) -> float:
-        """All others."""
+        """Seconds not spent waiting."""
         return time.perf_counter() - self._start - self.waited

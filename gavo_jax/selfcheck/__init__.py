@@ -1,1 +1,1 @@
-"""The compiled kernels against their equations in float64, at the sizes that are used."""
+"""Comparison of the compiled kernels with their equations in float64, at the sizes in use."""

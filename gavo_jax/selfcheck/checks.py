@@ -1,8 +1,8 @@
-"""Compiled kernels at the sizes in use against `equations`: a list of checks, one per kernel, and long as such.
+"""Checks of the compiled kernels, one each, against `equations` at the sizes in use.
 
-Does JAX compute right numbers on this machine? A compiler may be right for small arrays and wrong for large ones, or
-right for one operation and wrong where it fuses two. So each check compiles a kernel as the presets call it, for as
-many rows, and compares with float64.
+Does JAX compute correct numbers on this machine? A compiler may be right for small arrays and wrong for large ones, or
+right for one operation and wrong where it fuses two. So each check compiles a kernel as the presets call it, with as
+many rows, and compares it with float64.
 """
 
 import time
@@ -34,24 +34,24 @@ from gavo_jax.solvers.genetic import GeneticAlgorithm, GeneticState
 from gavo_jax.solvers.operators import SMALLEST_CHANCE
 
 BORDERS = tuple(2**k + offset for k in range(11, 15) for offset in (-1, 0, 1))
-"""Rows about powers of two, where compilers change from one way of writing a loop to another."""
+"""Numbers of rows around powers of two, where compilers switch between forms of a loop."""
 ENDS = (BORDERS[0], BORDERS[2], BORDERS[-1])
-"""A few of them, for kernels that take long to compile."""
+"""A few of `BORDERS`, for kernels that are slow to compile."""
 
 
 class Check(NamedTuple):
-    """A kernel at some sizes beside its equation."""
+    """Comparison of a kernel with its equation at some sizes."""
 
     words: str
-    """What is computed, with a place for the size."""
+    """What is computed, with a placeholder for the size."""
     deviation: Callable[[int], float]
-    """Run the kernel at a size: the largest deviation from float64, infinite where a number is missing."""
+    """Runs the kernel at a size: the largest deviation from float64, infinite if a number is missing."""
     tolerance: float
-    """What float32 arithmetic may deviate by, several times what it does."""
+    """Deviation allowed to float32 arithmetic, several times the usual one."""
     sizes: tuple[int, ...]
-    """Those of the presets, the largest one last."""
+    """Sizes of the presets, the largest one last."""
     borders: tuple[int, ...]
-    """Further sizes at which a fault would show."""
+    """Further sizes at which a fault may show."""
 
     def run(self, size: int) -> "Outcome":
         """Compare at one size."""
@@ -59,7 +59,7 @@ class Check(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a check found."""
+    """Result of a check."""
 
     name: str
     deviation: float
@@ -67,12 +67,12 @@ class Outcome(NamedTuple):
 
     @property
     def is_right(self) -> bool:
-        """Whether the kernel computed what it should."""
+        """Whether the kernel computed the right numbers."""
         return self.deviation <= self.tolerance
 
 
 def largest_deviation(found: Any, expected: Any, unit: float = 1.0) -> float:
-    """Largest difference, in a unit; infinities have to be in the same places, and NaN is never right."""
+    """Return the largest difference, in a unit; infinities must be in the same places, and NaN is never right."""
     numbers, truth = np.asarray(found, np.float64), np.asarray(expected, np.float64)
     with np.errstate(invalid="ignore"):
         difference = np.where(numbers == truth, 0.0, np.abs(numbers - truth))
@@ -84,11 +84,11 @@ def _all_presets() -> list[Settings]:
 
 
 FULL_IMAGE = Camera.preset("fr1")
-"""A camera of the size that presets are made for."""
+"""A camera of the size that the presets are made for."""
 
 
 def preset_points(merged: bool = False) -> tuple[int, ...]:
-    """Points of a view that presets take of a level, or of all its views together."""
+    """Return the numbers of points of a view, or of all views of a level, in the presets."""
     counts = set()
     for settings in _all_presets():
         views = max(settings.alignment.views) if merged and settings.odometry.reference == "keyframe" else 1
@@ -97,24 +97,24 @@ def preset_points(merged: bool = False) -> tuple[int, ...]:
 
 
 def _populations(settings: Settings) -> tuple[int, int]:
-    """Islands, and candidates of each."""
+    """Return the number of islands, and of candidates on each."""
     return max(settings.alignment.islands), largest(getattr(settings.solver, "population", 1))
 
 
 def preset_candidates() -> tuple[int, ...]:
-    """Motions that presets score at once: populations, those of all islands, scouts."""
+    """Return the numbers of motions that presets score at once: populations of all islands, and scouts."""
     counts = {settings.alignment.scouts for settings in _all_presets()}
     counts |= {islands * population for islands, population in map(_populations, _all_presets())}
     return tuple(sorted(counts - {0, 1}))
 
 
 def preset_islands() -> tuple[int, ...]:
-    """Populations that presets search at once."""
+    """Return the numbers of populations that presets search at once."""
     return tuple(sorted({islands for islands, _ in map(_populations, _all_presets())}))
 
 
 def preset_scouts() -> tuple[int, ...]:
-    """Motions of which presets choose the best distinct ones."""
+    """Return the numbers of motions from which presets choose the best distinct ones."""
     return tuple(sorted({settings.alignment.scouts for settings in _all_presets()} - {0}))
 
 
@@ -123,7 +123,7 @@ WIDE = preset("ga", "wide")
 
 
 def _given(arrays: Any) -> Any:
-    """What a kernel is given: arrays, or a tree of them, on the device."""
+    """Put a kernel's inputs, an array or a tree of arrays, on the device."""
     return jax.device_put(arrays)
 
 
@@ -141,7 +141,7 @@ best_distinct = jax.jit(modes.best_distinct, static_argnames="count")
 
 @jax.jit
 def examine(problem: Problem) -> Any:
-    """Examine as a search ends: the points of all views in one row."""
+    """Examine a motion as at the end of a search, with the points of all views in one array."""
     problem = replace(problem, objective=problem.objective.merged())
     return problem.examine(problem.objective.residuals(problem.origin))[:2]
 
@@ -167,7 +167,7 @@ def inverse_deviation(rows: int) -> float:
 ORIGIN = np.array([0.03, -0.02, 0.04, 0.02, -0.03, 0.05], np.float32)
 """Twist of the motion that a search starts from."""
 BASIS = (np.diag([0.01, 0.01, 0.02, 0.005, 0.005, 0.01]) + 0.002).astype(np.float32)
-"""Search coordinates in which the image changes by some grey levels a unit."""
+"""Search coordinates in which the image changes by some grey levels per unit."""
 
 
 def _origin() -> np.ndarray:
@@ -184,17 +184,17 @@ def transform_deviation(rows: int) -> float:
 
 
 LEVEL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
-"""Camera of a pyramid's middle level."""
+"""Camera of a middle pyramid level."""
 WEIGHING = equations.Weighing(5.0, 0.01, 0.3, 1.0, WIDE.alignment.min_overlap)
-"""Scales as they are found in tracking."""
+"""Scales as typical of tracking."""
 
 
 def _scene(points: int) -> equations.Scene:
-    """Points on a grid, as near to square as may be, the last row cut short."""
+    """Make a scene with points on a grid that is as near to square as possible, the last row incomplete."""
     columns = max(1, round((points * LEVEL.width / LEVEL.height) ** 0.5))
     row, column = np.divmod(np.arange(points), columns)
     step_u, step_v = (LEVEL.width - 1) / columns, (LEVEL.height - 1) * columns / points
-    # to a 64th of a pixel, so that float32 holds places and inverse depths without loss
+    # rounded to 1/64 pixel, so that float32 holds positions and inverse depths exactly
     u, v = (np.round(64 * (place + 0.5) * step) / 64 for place, step in ((column, step_u), (row, step_v)))
     return equations.plane_scene(LEVEL, u, np.minimum(v, LEVEL.height - 1))
 
@@ -213,7 +213,7 @@ def _points(scene: equations.Scene) -> Points:
 
 
 def _objective(scene: equations.Scene) -> Objective:
-    """E with robust loss and depth term, as a level's search has it: one view, its points counted."""
+    """Make E with robust loss and depth term as in a level's search: one view, with its number of points."""
     nothing = np.zeros_like(scene.q)
     leaves = (scene.grey, *[nothing] * 4, scene.facing, nothing, np.ones_like(scene.q))
     points, leaves = _given(jax.tree.map(lambda leaf: leaf[None], ([scene.x, scene.y, scene.q], leaves)))
@@ -234,7 +234,7 @@ def _objective(scene: equations.Scene) -> Objective:
 
 
 def warp_deviation(points: int) -> float:
-    """Return the deviation of `warp`, pixels; of inverse depth, 1/m, a hundred times as much."""
+    """Return the deviation of `warp`, pixels; that of inverse depth (1/m) counts a hundredfold."""
     scene, motion = _scene(points), _origin()
     found = jax.device_get(warp_points(_points(scene), motion, LEVEL))
     expected = equations.warp(scene, motion.astype(np.float64))
@@ -246,13 +246,14 @@ def warp_deviation(points: int) -> float:
 
 
 SPREAD = np.repeat([0.05, 0.1], 3)
-"""Metres and radians of the motions that are scored; many leave the view in part, some nearly all of it."""
+"""Spread of the motions that are scored, metres and radians; many move part of the points out of view, some nearly
+all."""
 REFERENCE_EVALUATIONS = 1_000_000
-"""Pixels times candidates that the reference is asked for; of more candidates some are compared."""
+"""Largest number of points times candidates that the reference evaluates; beyond, only some candidates are compared."""
 
 
 def spread_rows(rows: int, most: int) -> np.ndarray:
-    """Return at most so many indices of rows, evenly spread and, as far as they fit, next to powers of two."""
+    """Return at most `most` indices of rows, evenly spread and, as far as they fit, next to powers of two."""
     powers = 2 ** np.arange(3, 31)[::-1]
     near = (powers[:, None] + np.array([0, -1])).ravel()
     near = near[near < rows][: most // 2]
@@ -269,12 +270,12 @@ def score_deviation(candidates: int, points: int) -> float:
 
 
 def _deviation_of_row(scene: equations.Scene, motion: np.ndarray, error: float, overlap: float) -> float:
-    """Compare one motion's error as a share of E, and its overlap, beyond what points on the image's border change."""
+    """Compare one motion's error, as a share of E, and overlap, beyond the effect of points on the image's border."""
     r = equations.residuals(scene, motion)
     true_error, true_overlap = equations.error(scene, r, WEIGHING)
     on_border = int(np.count_nonzero(r.warped.on_border))
     least = on_border / np.count_nonzero(scene.q > 0)
-    if abs(true_overlap - WEIGHING.min_overlap) <= least:  # whether it counts at all is open
+    if abs(true_overlap - WEIGHING.min_overlap) <= least:  # whether it is valid at all is undecided
         return 0.0
     cost = float(equations.geman_mcclure(1e9)) * (1.0 + WEIGHING.depth_weight)
     doubt = WEIGHING.grey**2 * cost * on_border / equations.divisor(scene, r, WEIGHING)
@@ -290,16 +291,17 @@ def _scored_motions(count: int) -> np.ndarray:
 
 
 LEAST_POINTS = min(Levels.of(FULL_IMAGE, (level,)).most_points for level in WIDE.solver.levels)
-"""Points of the coarsest level, on which scouts are scored."""
+"""Number of points of the coarsest level, on which scouts are scored."""
 POPULATION = max(population for _, population in map(_populations, _all_presets()))
-"""Candidates of the largest population."""
+"""Number of candidates of the largest population."""
 ISLAND = _populations(WIDE)[1]
-"""Chromosomes of a population where there are many."""
+"""Number of chromosomes of an island, where there are many."""
 
 
 def _derivatives(points: int) -> tuple[Problem, equations.Slope, tuple[float, float]]:
-    """A problem at x = 0 and what is true there; points that land on an edge of a pixel have no reading, as a slope is
-    another on the other side of it.
+    """Make a problem with its true derivatives and error at x = 0.
+
+    Points that land on a pixel's edge get no reading, as slopes are discontinuous there.
     """
     scene, motion = _scene(points), _origin().astype(np.float64)
     warped = equations.warp(scene, motion)
@@ -311,7 +313,7 @@ def _derivatives(points: int) -> tuple[Problem, equations.Slope, tuple[float, fl
 
 
 def _deviation_of_model(model: Any, expected: equations.Slope, error: tuple[float, float]) -> float:
-    """Compare each part with what is expected, as a share of its largest entry."""
+    """Return the deviation of each part from its expectation, as a share of its largest entry."""
     pairs = ((model.error, error[0]), (model.gradient, expected.gradient), (model.hessian, expected.hessian))
     shares = [largest_deviation(found, truth, float(np.max(np.abs(truth)))) for found, truth in pairs]
     return max(*shares, largest_deviation(model.overlap, error[1]))
@@ -334,7 +336,7 @@ def examine_deviation(points: int) -> float:
 
 
 class Table(NamedTuple):
-    """A problem whose errors are known: distinct numbers, so that no rounding decides which candidate is better."""
+    """A problem with given errors, distinct enough that rounding never decides which candidate is better."""
 
     error: jax.Array
 
@@ -346,7 +348,7 @@ class Table(NamedTuple):
 
 @jax.jit
 def breed(solver: GeneticAlgorithm, seed: int, states: GeneticState, newcomers: jax.Array) -> Any:
-    """A generation of every island, and the random numbers that it draws."""
+    """Run a generation on every island; return it with the random numbers that it draws."""
     keys = jax.random.split(jax.random.key(seed), newcomers.shape[0])
 
     def one(key: jax.Array, state: GeneticState, error: jax.Array) -> tuple[GeneticState, jax.Array]:
@@ -358,7 +360,7 @@ def breed(solver: GeneticAlgorithm, seed: int, states: GeneticState, newcomers: 
 
 
 HALF_WIDTH = 4.0
-"""Half-width of the box that generations are bred in, search units; a few offspring meet it."""
+"""Half-width of the box that generations are bred in, search units; a few offspring reach it."""
 
 
 def generation_deviation(islands: int, population: int) -> float:
@@ -385,7 +387,7 @@ def generation_deviation(islands: int, population: int) -> float:
 
 
 def _distinct(errors: np.ndarray) -> np.ndarray:
-    """Nearly the same errors [I, n], at least a 256th apart."""
+    """Change errors [I, n] slightly, so that they are at least 1/256 apart."""
     order = np.argsort(errors, axis=1)
     steps = np.arange(errors.shape[1])
     apart = np.maximum.accumulate(np.rint(np.take_along_axis(errors, order, 1) * 256) - steps, axis=1) + steps
@@ -395,9 +397,9 @@ def _distinct(errors: np.ndarray) -> np.ndarray:
 
 
 def distinct_deviation(rows: int) -> float:
-    """Return the deviation of the errors of those that `modes.best_distinct` chooses: 0 where they are the right ones.
+    """Return the deviation of the errors of motions chosen by `modes.best_distinct`: 0 if they are the right ones.
 
-    Motions lie in clusters that are clearly narrower than a mode and clearly further apart.
+    Motions lie in clusters that are clearly narrower than a mode, and clearly further apart than that.
     """
     rng = np.random.default_rng(rows)
     places = 1.7 * rng.integers(-2, 3, (rows, 6)) + rng.uniform(-0.1, 0.1, (rows, 6))
@@ -442,19 +444,19 @@ def _checks() -> dict[str, Check]:
 
 
 CHECKS = _checks()
-"""By name, cheap ones first."""
+"""Checks by name, cheap ones first."""
 CONTAINED = ("log", "derivatives")
-"""Checks whose kernel another one's contains: `distinct` compares places that are logarithms, and the covariance is
-made of the derivatives' terms."""
+"""Checks whose kernel is part of another check's: `distinct` compares logarithms, and the covariance is computed from
+the derivatives' terms."""
 
 
 def full_size() -> Iterator[Outcome]:
-    """Every check that no other one contains, at the largest size of any preset."""
+    """Run every check that is not `CONTAINED` in another one, at the largest size of any preset."""
     return (_at_full_size(check) for name, check in CHECKS.items() if name not in CONTAINED)
 
 
 def _at_full_size(check: Check) -> Outcome:
-    """A check's outcome, with the fault where the kernel does not even run."""
+    """Return a check's outcome, with the error if the kernel does not run at all."""
     size = check.sizes[-1]
     try:
         return check.run(size)
@@ -463,13 +465,13 @@ def _at_full_size(check: Check) -> Outcome:
 
 
 REPETITIONS = 3
-"""Measurements of the speed, of which the median counts."""
+"""Number of speed measurements, whose median counts."""
 RECORDED_NANOSECONDS = {"AMD EPYC": 2.3, "Intel Xeon": 5.3}
-"""Per pixel and candidate of the same on 2 cores: `benchmarks/kernel.py`, "score, robust + depth" of 640x480."""
+"""`scoring_nanoseconds` on 2 cores, from `benchmarks/kernel.py`, "score, robust + depth" of 640x480."""
 
 
 def scoring_nanoseconds() -> float:
-    """Time of `Objective.score` with robust loss and depth, per pixel and candidate, on the largest image."""
+    """Measure `Objective.score` with robust loss and depth on the largest image: ns per point and candidate."""
     points = CHECKS["points"].sizes[-1]
     given = jax.device_put((_objective(_scene(points)), _scored_motions(POPULATION)))
     jax.block_until_ready(score(*given))

@@ -1,7 +1,7 @@
-"""The equations of the compiled kernels once more, in float64 NumPy: what `selfcheck` holds the kernels against.
+"""The equations of the compiled kernels in float64 NumPy: the reference that `selfcheck` compares the kernels with.
 
-Nothing here knows of JAX. Each function is written from the equations for many rows at once and shares no code with the
-kernel that it judges.
+Nothing here uses JAX. Each function is written from the equations for many rows at once, and shares no code with the
+kernel that it checks.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ Rows = np.ndarray
 
 
 def cross_matrix(a: np.ndarray) -> np.ndarray:
-    """[a]× of vectors [..., 3]: [a]× b is a × b."""
+    """[a]× of vectors [..., 3], with [a]× b = a × b."""
     x, y, z = np.moveaxis(np.asarray(a, np.float64), -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
@@ -39,7 +39,7 @@ def exp(twists: Rows) -> Rows:
 
 
 def adjoint(motion: np.ndarray) -> np.ndarray:
-    """A of [6, 6] with motion · exp(δ) = exp(A δ) · motion."""
+    """A [6, 6] with motion · exp(δ) = exp(A δ) · motion."""
     rotation, shift = motion[:3, :3], motion[:3, 3]
     return np.block([[rotation, cross_matrix(shift) @ rotation], [np.zeros((3, 3)), rotation]])
 
@@ -53,27 +53,27 @@ class Scene(NamedTuple):
     plane: tuple[float, float, float]
     """Coefficients a, b, c of the target's inverse depth a + b u + c v, 1/m and 1/m per pixel."""
     x: np.ndarray
-    """[n] of the points' rays (x, y, 1), float32 like all that the kernels are given."""
+    """[n] coordinate of the points' rays (x, y, 1), as y; float32 like all inputs of the kernels."""
     y: np.ndarray
     q: np.ndarray
     """[n] inverse depth, 1/m; 0 = no reading."""
     grey: np.ndarray
-    """[n] of the reference, grey levels."""
+    """[n] grey levels of the reference."""
     facing: np.ndarray
     """[n] cosine of the surface's inclination."""
 
 
 PLANE = (0.5, 1 / 4096, -1 / 4096)
-"""Plane of a target; packed without loss, so that its inverse depth is continuous from block to block."""
+"""Plane of a target; it packs without loss, so that its inverse depth is continuous from block to block."""
 
 
 def texture(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """A smooth image: 128 ± 90 grey levels, waves of some 20 to 40 pixels."""
+    """Return a smooth image: 128 ± 90 grey levels, waves of some 20 to 40 pixels."""
     return 128.0 + 60.0 * np.sin(u / 5.9) * np.cos(v / 4.6) + 30.0 * np.sin((u + 2.0 * v) / 8.3)
 
 
 def plane_scene(camera: Camera, u: np.ndarray, v: np.ndarray) -> Scene:
-    """A plane of which the reference has points at pixels (u, v), every eleventh without a reading."""
+    """Make a scene with reference points at pixels (u, v), every eleventh without a reading."""
     rows, columns = np.mgrid[: camera.height, : camera.width]
     a, b, c = PLANE
     inverse_depth = a + b * u + c * v
@@ -91,17 +91,17 @@ class Warped(NamedTuple):
     depth: np.ndarray
     """Metres."""
     inside: np.ndarray
-    """Whether the point has a reading, lies before the camera and has four pixels about it."""
+    """Whether the point has a reading, lies in front of the camera and has four pixels around it."""
     on_border: np.ndarray
-    """Whether it lies so near to the image's border that float32 may see it on the other side."""
+    """Whether it lies so near to the image's border that float32 may put it on the other side."""
 
 
 BORDER = 1e-4
-"""Pixels."""
+"""Distance from the image's border within which a point is `on_border`, pixels."""
 
 
 def points_of(scene: Scene) -> np.ndarray:
-    """P⁻¹(p) of the points with a reading, as `Camera.back_project`, metres: [n, 3]; 1 m off where there is none."""
+    """P⁻¹(p) of the points, as `Camera.back_project`, metres: [n, 3]; at 1 m depth where there is no reading."""
     x, y, q = (np.asarray(array, np.float64) for array in (scene.x, scene.y, scene.q))
     depth = 1.0 / np.where(q > 0, q, 1.0)
     return np.stack([x * depth, y * depth, depth], axis=-1)
@@ -120,7 +120,7 @@ def warp(scene: Scene, target_T_reference: np.ndarray) -> Warped:
 
 
 class Weighing(NamedTuple):
-    """What turns residuals into E: scales σ and τ, depth's weight λ, the cost of points out of view, least overlap."""
+    """Parameters of E: scales σ and τ, depth's weight λ, the cost of points out of view, the smallest overlap."""
 
     grey: float
     depth: float
@@ -130,7 +130,7 @@ class Weighing(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """`Objective.residuals` of the points inside, [m] each, and where they are."""
+    """`Objective.residuals` of the points inside, [m] each, with all warped points."""
 
     grey: np.ndarray
     """Grey levels."""
@@ -144,7 +144,7 @@ class Residuals(NamedTuple):
 
 
 def residuals(scene: Scene, target_T_reference: np.ndarray) -> Residuals:
-    """Bilinear intensity less the reference's, and the plane's inverse depth less the point's own."""
+    """Bilinear intensity minus the reference's, and the plane's inverse depth minus the point's own."""
     warped = warp(scene, target_T_reference)
     u, v, depth = (array[warped.inside] for array in warped[:3])
     column, row = np.floor(u).astype(int), np.floor(v).astype(int)
@@ -192,7 +192,7 @@ class Slope(NamedTuple):
 
 
 def slope(scene: Scene, motion: np.ndarray, basis: np.ndarray, by: Weighing, tiles: tuple[int, int]) -> Slope:
-    """Derivatives of E at motion · exp(basis · x) by x, at x = 0, through the point: ∂r/∂P [I, −[P]×]."""
+    """Derivatives of E(motion · exp(basis · x)) with respect to x at x = 0, through the point: ∂r/∂P [I, −[P]×]."""
     r, camera = residuals(scene, motion), scene.camera
     inside = r.warped.inside
     u, v, depth = (array[inside] for array in r.warped[:3])
@@ -223,22 +223,22 @@ class Generation(NamedTuple):
     """I populations of P chromosomes after a generation of the genetic algorithm."""
 
     population: np.ndarray
-    """[I, P, 6] in the order of `error`."""
+    """[I, P, 6], sorted by `error`."""
     error: np.ndarray
     """[I, P]"""
     offspring: np.ndarray
     """[I, P, 6]"""
     certain: np.ndarray
-    """[I, P, 6], whether float32 must arrive at the same gene: no parent was drawn at the edge of its share of the
-    wheel, and no random number lies in a tail where float32 tells few apart."""
+    """[I, P, 6], whether float32 must compute the same gene: no parent was drawn at the edge of its share of the wheel,
+    and no random number lies in a tail where float32 is coarse."""
 
 
 class Breeding(NamedTuple):
-    """What the operators are set to."""
+    """Parameters of the operators."""
 
     pressure: float
     mutants: int
-    """Rows of the offspring."""
+    """Number of mutants among the offspring."""
     crossover_range: float
     mutation_step: float
     half_width: float
@@ -246,7 +246,7 @@ class Breeding(NamedTuple):
 
 
 EDGE, TAIL = 1e-5, 1e-3
-"""Share of the wheel, and of the random numbers, within which a gene is not certain."""
+"""Shares of the wheel and of the random numbers within which a gene is not `certain`."""
 
 
 def generation(x: np.ndarray, errors: np.ndarray, chance: np.ndarray, by: Breeding) -> Generation:
@@ -254,9 +254,9 @@ def generation(x: np.ndarray, errors: np.ndarray, chance: np.ndarray, by: Breedi
 
     Args:
         x: [I, 2P, 6] parents and newcomers.
-        errors: [I, 2P] of them, all different.
+        errors: [I, 2P] their errors, all different.
         chance: [I, P, 8] uniform random numbers: six for the genes, two for the parents.
-        by: Settings.
+        by: Parameters.
     """
     places = chance.shape[1]
     order = np.argsort(errors, axis=1)[:, :places]
@@ -278,7 +278,7 @@ def generation(x: np.ndarray, errors: np.ndarray, chance: np.ndarray, by: Breedi
 
 
 def surrogate_minimum(x: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Minimum of a quadratic fitted to each of I populations [I, P, 6], best first: ridge regression, [I, 6]."""
+    """Minimum [I, 6] of a quadratic fitted by ridge regression to each of I populations [I, P, 6], best first."""
     offset = x - x[:, :1]
     radius = np.sqrt(np.mean(offset**2, axis=(1, 2), keepdims=True)) + 1e-6
     z = offset / radius
@@ -305,9 +305,9 @@ def surrogate_minimum(x: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def best_distinct(places: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the `count` smallest errors [n] of which no two lie less than 1 apart in places [n, 6], best first.
+    """Indices of the `count` smallest errors [n] with no two less than 1 apart in places [n, 6], best first.
 
-    There have to be so many.
+    There must be that many.
     """
     left, chosen = errors.astype(np.float64), []
     for _ in range(count):
