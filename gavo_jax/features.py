@@ -68,7 +68,7 @@ def detect(grey: UInt8[np.ndarray, "h w"], depth: Depth, camera: Camera, kind: F
 
     Args:
         grey: Grey image.
-        depth: Depth registered to it, in units of `camera.depth_scale` a metre, 0 = no reading.
+        depth: Depth registered to it, in units of `camera.depth_scale` per metre, 0 = no reading.
         camera: Camera of the image.
         kind: Detector and descriptor.
     """
@@ -143,7 +143,7 @@ def feature_motion(
 
     Args:
         reference: Grey and depth, uint8 and uint16 of [H, W], without lens distortion; depth in units of
-            `camera.depth_scale` a metre, 0 = no reading.
+            `camera.depth_scale` per metre, 0 = no reading.
         target: The other frame, likewise.
         camera: Their camera.
         kind: Detector and descriptor.

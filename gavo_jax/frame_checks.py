@@ -81,8 +81,8 @@ BLACK, WHITE = 5, 250
 MAX_CLIPPED = 0.75
 """Share of clipped pixels above which an image is blank or saturated."""
 MAX_CLIPPED_JUMP = 0.3
-"""Rise of that share above the usual one which makes an image blank: twice what the TUM clips show within half a second
-(a lamp, a window)."""
+"""Rise of the clipped share above the usual one from which an image is blank: twice what the TUM clips show within half
+a second (a lamp, a window)."""
 MIN_CORRELATION = 0.7
 """Correlation of neighbouring pixels below which an image is noise. Scenes have 0.93 and more at a width of 160 pixels;
 noise has 0, or up to 0.5 once undistortion has interpolated it."""
@@ -92,8 +92,8 @@ RANGE_QUANTILES = (25.0, 50.0, 75.0)
 """Percentiles of depth that are compared. Other units scale all of them; a near body changes the lower ones alone.
 Higher ones would often be at the end of the sensor's number range."""
 MAX_RANGE_RATIO = 2.5
-"""Factor from a frame to the next, at all of these percentiles, above which depth is in other units; handheld motion
-stays within 1.4 a frame."""
+"""Factor between consecutive frames, at all `RANGE_QUANTILES`, above which depth is in other units; handheld motion
+stays within 1.4."""
 RANGE_AGE = 0.1
 """Seconds between two frames beyond which the logarithm of `MAX_RANGE_RATIO` grows with the time."""
 MAX_DUPLICATE_DIFFERENCE = 2
@@ -103,7 +103,7 @@ MIN_FROZEN_PART = 0.2
 unchanged and as large a share has changed. Half-frozen real images have 0.26 and more, clean clips at most 0.01, or
 0.11 if rendered without noise."""
 MIN_SEEN = 40
-"""Smallest number of pixels beside edges, out of some 1200, for that test."""
+"""Smallest number of pixels beside edges, out of some 1200, for a part to count as frozen."""
 MIN_FAR = 0.8
 """Depth in metres that the highest percentile must exceed for the units to count as known. Millimetres misread as
 units of 1/5000 m exceed it only beyond 4 m."""
@@ -275,7 +275,7 @@ def is_one_number(readings: np.ndarray) -> bool:
 
 
 def _is_depth_frozen(frame: Frame, history: History) -> tuple[bool, History]:
-    """Whether depth repeats the last frame's, though it claims to be of another moment.
+    """Whether depth repeats the last frame's, though it claims another timestamp.
 
     An empty depth image doesn't count, nor does a flat wall that an exact sensor has faced since the first frame.
     """

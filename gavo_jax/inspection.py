@@ -43,12 +43,12 @@ def unit_of(source: Facts) -> str:
 
 
 def left_out(sequence: Sequence) -> list[str]:
-    """List what in the source makes no frame, and why, a line each."""
+    """List what the source contains that yields no frame, and why, a line each."""
     return list(getattr(sequence, "left_out", ()))
 
 
 def left_out_in_short(sequence: Sequence) -> str | None:
-    """Summarise in a line how much of the source makes no frame; None if everything does."""
+    """Summarise in a line how much of the source yields no frame; None if all of it does."""
     counts = ", ".join(line.partition(": ")[0] for line in left_out(sequence))
     return f"left out: {counts}" if counts else None
 

@@ -19,7 +19,7 @@ MOST_BLOCKS = 100_000
 LOOKED_AT = 4
 """Stride, along either axis, of the pixels that Open3D samples to find a frame's blocks."""
 MOST_ENLARGED = 16
-"""Largest factor by which an image is enlarged for that."""
+"""Largest factor by which an image is enlarged so that no block lies between samples."""
 
 
 def image_for_blocks(

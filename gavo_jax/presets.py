@@ -35,17 +35,16 @@ PAPER_OBJECTIVE = AlignmentOptions(
     bounds=(0.06, 0.06),
     bounds_factor=0.5,
 )
-"""The paper's error on every pixel, searched in ξ itself. The paper leaves open what is fixed here: a candidate must
-keep half of the points in view, and the bounds are ±6 cm and ±0.06 rad (3.4°) per gene. They hold about the guess at
-level 4, and are halved at each finer level about the last level's best."""
+"""The paper's error on every pixel, searched in ξ itself. Two choices are not given in the paper. A candidate must keep
+half of the points in view. The bounds are ±6 cm and ±0.06 rad (3.4°) per gene about the guess at level 4, halved at
+each finer level about the last level's best."""
 
 
 def _paper_solver(method: str) -> Any:
     """Return a method's solver as in the paper, on pyramid levels 4 to 0.
 
-    The paper leaves open what is fixed here: 40 chromosomes; 40 generations at level 4 falling to 8 at level 0; 8
-    generations without progress end a level; half-width 0.25 of the crossover's extra range. The swarm gets as many
-    evaluations.
+    Not given in the paper: 40 chromosomes; 40 generations at level 4 falling to 8 at level 0; 8 generations without
+    progress end a level; half-width 0.25 of the crossover's extra range. The swarm gets as many evaluations.
     """
     population, iterations, patience = (40,) * 5, (8, 12, 20, 30, 40), 8
     if method == "ga":
@@ -116,7 +115,7 @@ most evidence go on to level 3 and 4 are refined, beside the motions that a sing
 of view costs as much as a typical one in view, so that leaving the view is neither rewarded nor punished. Exposure
 changes over such motions, so residuals are taken about their mean. Close to a mode grey alone separates motions badly,
 so depth counts as much; at the finest levels, which decide the accuracy, less. Over a wide baseline one frame may be
-blurred and each sees what the other doesn't, so both directions count, on more points than tracking takes."""
+blurred and each sees what the other doesn't, so both directions count, on more points than in tracking."""
 
 
 _registered: dict[str, Settings] = {}

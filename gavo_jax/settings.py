@@ -41,12 +41,12 @@ class AlignmentOptions:
             (static); None takes every pixel.
         estimation_points: Largest number of points per view from which brightness, scales and curvature are estimated
             before a level is searched (static); None takes all.
-        views: Largest number of reference frames whose points are scored together, an entry per level (static); of a
-            run's two, 1 takes the previous frame alone.
+        views: Largest number of reference frames whose points are scored together, an entry per level (static); of the
+            two in a run, 1 uses only the previous frame.
         islands: Independent populations, an entry per level (static); the best ones go on to the next level.
         depth_weight: Weight λ of the depth cost against the grey one, both in units of their own scales, an entry per
             level.
-        doubt_depth: Whether depth loses up to two thirds of that weight, from the second level on, where whole surfaces
+        doubt_depth: Whether depth loses up to two thirds of its weight, from the second level on, where whole surfaces
             have wrong depth residuals (static); see `objective.estimates.depth_trust`.
         last_step: Whether the motion that the search ends with takes one more Newton step, with the gradient and
             Hessian of E that also give its covariance (static); Le Cam's one-step estimate. Sampled candidates end

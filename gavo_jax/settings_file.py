@@ -148,7 +148,7 @@ def name_of(function: Any) -> str | None:
 
 
 def refuse_unknown(place: str, keys: Iterable[str], known: Iterable[str], what: str = "key") -> None:
-    """Raise GavoError for the first unknown key (or `what` the keys are), suggesting the nearest known one."""
+    """Raise GavoError for the first unknown key, suggesting the nearest known one; `what` is the word for a key."""
     known = tuple(known)
     for key in keys:
         if key not in known:

@@ -61,7 +61,7 @@ class Held(NamedTuple):
 
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
-    """Return the evidence for one motion from both directions of an objective, whatever its scales and brightness."""
+    """Return the evidence for one motion from both directions of an objective, ignoring its scales and brightness."""
     sums = _sums(objective, target_T_reference, points)
     if objective.backward is not None:
         sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference), points)

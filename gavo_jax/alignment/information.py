@@ -50,8 +50,8 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_bo
     """Measure the frames' information at the problem's origin, given its residuals and `weighted_terms`.
 
     Information from a few steep points has a large variance, which could mask that of depth. For a body, grey and depth
-    are therefore also tested each alone. Not for the whole image: where grey settles on a wrong match, depth that
-    determines the other directions would confirm it.
+    are therefore also tested separately. For the whole image they are not: where grey settles on a wrong match, depth
+    that determines the other directions would confirm it.
     """
     objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // ENOUGH)
     factor = 2.0 * every / objective.divisor(jnp.sum(r.inside))

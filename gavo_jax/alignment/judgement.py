@@ -70,7 +70,7 @@ class Part(NamedTuple):
 
 
 class Winner(NamedTuple):
-    """What a search ended with."""
+    """Result of a search."""
 
     motion: Float[Array, "4 4"]
     rival: Float[Array, ""]

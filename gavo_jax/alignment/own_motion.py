@@ -124,7 +124,7 @@ class _Side(NamedTuple):
         return cls(pixels, seconds, depth, filled_inverse_depth(depth, camera)[row, column], camera, delay)
 
     def points(self, twist: Float64[np.ndarray, " 6"]) -> _Points:
-        """Return the corners in space, with depth looked up where they are, given that velocity, when it is read."""
+        """Return the corners in space, looking up depth where they were when it was read, given their velocity."""
         u, v = self.pixels.T
         along_u, along_v, away = pixel_flow(self.camera, u, v, self.usual, twist)
         column, row = _nearest(self.pixels + self.delay * np.stack([along_u, along_v], axis=-1), self.camera)

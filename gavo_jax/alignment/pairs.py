@@ -174,7 +174,7 @@ def align(
 
     Args:
         reference: Frame t: a `Frame`, or a pair of arrays (grey, depth) of [H, W]; depth in units of
-            `camera.depth_scale` a metre, 0 = no reading.
+            `camera.depth_scale` per metre, 0 = no reading.
         target: Frame t + 1.
         camera: Their camera. Any lens distortion is removed first.
         settings: Solver and objective; a solver alone stands for the default settings with that solver.
@@ -187,8 +187,8 @@ def align(
         `Alignment`; the camera's own motion is the inverse of its `target_T_reference`.
 
     Raises:
-        GavoError: The images are not of the camera's size or do not hold grey levels, the key is not a key, the guess
-            is not a rigid motion, or the call is traced, by `jax.jit` for instance.
+        GavoError: The images are not of the camera's size or do not hold grey levels; the key is not a key; the guess
+            is not a rigid motion; or the call is traced, by `jax.jit` for instance.
     """
     require_untraced(reference, target, camera, settings, solver, key, guess)
     settings = as_settings(settings, solver, alignment=options)

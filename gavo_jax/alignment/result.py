@@ -17,7 +17,7 @@ MAX_ROTATION_DEVIATION = 0.05
 
 
 class Alignment(NamedTuple):
-    """The motion between two frames, with what is known about it.
+    """The motion between two frames, with its covariance, status and statistics.
 
     A batch holds the same fields with a leading axis, and `status` as an integer array.
     """

@@ -94,7 +94,7 @@ class Frames(NamedTuple):
 
 
 class SearchState(NamedTuple):
-    """What one level hands on to the next."""
+    """State passed from one level to the next."""
 
     islands: Float[Array, "i 4 4"]
     """Motions, the best one first."""
@@ -107,7 +107,7 @@ class SearchState(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """What the searches of a pair ended with."""
+    """Result of a pair's searches."""
 
     search: SearchState
     centre: Float[Array, "4 4"] | None
@@ -291,8 +291,8 @@ def _search_level(
 ) -> tuple[SearchState, tuple[Float[Array, " iterations"], Population | None]]:
     """Search one level, from the islands of the last one, in the paper's five steps.
 
-    Take the reference's points (given by the visit), estimate brightness and noise, choose search coordinates, let the
-    solver minimise E on every island, and pass the best distinct motions on to the next level.
+    Take the reference's points (given by the visit), estimate brightness and noise, and choose search coordinates. Then
+    let the solver minimise E on every island, and pass the best distinct motions on to the next level.
     """
     (target, options, exchanged), places = frames, search.islands.shape[0]
     level, keys = visit

@@ -51,7 +51,7 @@ def stacked_pairs(
 def typed_keys(keys: Any, shape: tuple[int, ...]) -> PRNGKeyArray:
     """Return random keys of a given shape, () for one, in the type that `jax.random.key` makes.
 
-    Keys of `jax.random.PRNGKey` are converted, as the search would be compiled anew for their type.
+    Keys of `jax.random.PRNGKey` are converted, as their type would make the search recompile.
 
     Raises:
         GavoError: They are not keys, or of another shape.
@@ -90,7 +90,7 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
 def stacked_sides(references: Any, targets: Any, camera: Camera) -> list[Images]:
     """Stack both sides as `stacked_images` does, in bytes and 16 bits, or in float32 throughout.
 
-    For any other combination of types the search would be compiled anew.
+    Any other combination of types would make the search recompile.
     """
     sides = [stacked_images(side, camera) for side in (references, targets)]
     if all((side.grey.dtype, side.depth.dtype) == (np.uint8, np.uint16) for side in sides):

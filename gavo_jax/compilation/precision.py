@@ -1,4 +1,4 @@
-"""JAX in 32 bits and its default modes, which the programs of this package need, whatever the caller has set.
+"""Use of JAX in 32 bits and its default modes, which this package's programs need, whatever the caller has set.
 
 Every computation begins here, so forked processes, which cannot compute, are detected here, too.
 """

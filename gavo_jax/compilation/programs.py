@@ -2,9 +2,9 @@
 
 JAX's own cache keeps what XLA compiled, but to look that up the function must first be traced and lowered. For a
 frame's program this takes longer than everything after it (`benchmarks/footprint.py`). So the lowered form is kept too,
-as serialised by `jax.export`. A file's name identifies the program (function, settings, shapes, JAX's configuration),
-and its seal what that was made from (this package's code, versions). If any of these changes, the program is traced
-anew.
+as serialised by `jax.export`. A file's name identifies the program (function, settings, shapes, JAX's configuration);
+its seal identifies what that was made from (this package's code, versions). If either changes, the program is traced
+again.
 """
 
 import dataclasses

@@ -69,7 +69,7 @@ def compensate_motion(
 def pixel_flow(
     camera: Camera, u: np.ndarray, v: np.ndarray, q: np.ndarray, twist: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flow of each pixel along u and v, pixels a second, and the rotation's part in the relative rate of its depth."""
+    """Flow of each pixel along u and v, pixels per second, and the rotation's part in its depth's relative rate."""
     x, y = to_ray(camera, u, v)
     (a, b, c), (wx, wy, wz) = twist[:3], twist[3:]
     forward = wx * y - wy * x

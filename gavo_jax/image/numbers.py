@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 Depth = UInt16[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
-"""Depth in 16 bits, or in float32 if it came in any other type, such as metres."""
+"""Depth in 16 bits, or in float32 if it came in any other type (it may be in metres)."""
 
 
 def is_real(kind: Any) -> bool:

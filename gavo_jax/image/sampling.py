@@ -19,7 +19,7 @@ INVERSE_DEPTH_STEP = 1.0 / 8192.0
 SAME_SURFACE = 0.1
 """Neighbouring readings whose inverse depths differ by less than this share are of one surface."""
 SLOPE_STEP = 1.0 / 4096.0
-"""Unit of packed inverse-depth slopes (signed 8 bits), 1/m a pixel."""
+"""Unit of packed inverse-depth slopes (signed 8 bits), 1/m per pixel."""
 
 
 class Target(NamedTuple):
@@ -44,7 +44,7 @@ def pack_grey(grey: Float[Array, "h+1 w+1"]) -> UInt32[Array, "h w"]:
 def inverse_depth_slopes(
     inverse_depth: Float[Array, "h+2 w+2"],
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Return ∂(1/z)/∂u and ∂(1/z)/∂v, 1/m a pixel, from neighbours on the same surface; 0 where there are none.
+    """Return ∂(1/z)/∂u and ∂(1/z)/∂v, 1/m per pixel, from neighbours on the same surface; 0 where there are none.
 
     Args:
         inverse_depth: 1/m, 0 = no reading, with a margin of one pixel.
@@ -118,7 +118,7 @@ def look_up(target: Target, warped: Warped, plane: ImagePlane) -> Words:
 
 
 class GreySample(NamedTuple):
-    """Bilinear intensity at the warped points and its exact derivative along u and v (grey levels a pixel)."""
+    """Bilinear intensity at the warped points and its exact derivative along u and v (grey levels per pixel)."""
 
     value: Float[Array, "*n"]
     along_u: Float[Array, "*n"]
@@ -140,7 +140,7 @@ def sample_grey(words: Words, warped: Warped) -> GreySample:
 
 
 class DepthSample(NamedTuple):
-    """Inverse depth at the warped points (1/m), its slopes (1/m a pixel), and whether there is a reading (0 or 1)."""
+    """Inverse depth at the warped points (1/m), its slopes (1/m per pixel), and whether there is a reading (0 or 1)."""
 
     value: Float[Array, "*n"]
     along_u: Float[Array, "*n"]

@@ -1,1 +1,1 @@
-"""The photometric error E(ξ): losses, points, the error of a population, its derivatives, what is estimated for it."""
+"""The photometric error E(ξ): losses, points, the error of a population, its derivatives, estimates from the data."""

@@ -24,10 +24,10 @@ class Reference(NamedTuple):
     points: Points
     grey: Float[Array, "*views n"]
     grey_u: Float[Array, "*views n"]
-    """Intensity gradient along u (grey levels a pixel), and `grey_v` along v."""
+    """Intensity gradient along u (grey levels per pixel), and `grey_v` along v."""
     grey_v: Float[Array, "*views n"]
     slope_u: Float[Array, "*views n"]
-    """Inverse-depth slope along u (1/m a pixel), and `slope_v` along v."""
+    """Inverse-depth slope along u (1/m per pixel), and `slope_v` along v."""
     slope_v: Float[Array, "*views n"]
     facing: Float[Array, "*views n"]
     """Cosine of the surface's inclination: turns a residual along the ray into a point-to-plane distance."""

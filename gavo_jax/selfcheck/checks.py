@@ -1,8 +1,8 @@
 """Checks of the compiled kernels, one each, against `equations` at the sizes in use.
 
 Does JAX compute correct numbers on this machine? A compiler may be right for small arrays and wrong for large ones, or
-right for one operation and wrong where it fuses two. So each check compiles a kernel as the presets call it, with as
-many rows, and compares it with float64.
+wrong only where it fuses two operations. So each check compiles a kernel as the presets call it, with as many rows, and
+compares it with float64.
 """
 
 import time

@@ -137,7 +137,7 @@ class Residuals(NamedTuple):
     depth: np.ndarray
     """1/m, along the normal of the reference's surface."""
     grey_u: np.ndarray
-    """Slope of the target along u, grey levels a pixel; `grey_v` along v."""
+    """Slope of the target along u, grey levels per pixel; `grey_v` along v."""
     grey_v: np.ndarray
     warped: Warped
     """All points, warped."""

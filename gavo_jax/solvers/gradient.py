@@ -34,7 +34,7 @@ class GradientDescent(PerLevel):
     Attributes:
         iterations: Largest number of steps (static, an entry per level; 0 skips the level).
         patience: Steps without progress that end a level (static).
-        learning_rate: Initial rate, search units, an entry per level.
+        learning_rate: Initial learning rate (Adam's first step) in search units, an entry per level.
         decay: Factor on the rate from step to step.
         optimizer: optax's constructor, called with a learning rate of 1 (static).
     """
