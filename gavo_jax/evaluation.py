@@ -32,7 +32,7 @@ class ErrorSeries:
     Attributes:
         values: one error per pair of poses, or per pose.
         timestamps: stamps of the estimate's poses (of each pair's first pose), seconds.
-        unit: of the values: "m" or "deg".
+        unit: unit of the values: "m" or "deg".
         definition: what each value is, in a sentence.
     """
 
@@ -87,7 +87,7 @@ class RelativePoseError:
         translation: metres.
         rotation: angles, degrees.
         delta: how far apart the poses of a pair are.
-        unit: of `delta`.
+        unit: unit of `delta`.
     """
 
     translation: ErrorSeries

@@ -46,7 +46,7 @@ class Features(NamedTuple):
 
 
 class FeatureMotion(NamedTuple):
-    """The motion that most matches agree with."""
+    """The motion with the most inliers among the matches."""
 
     target_T_reference: Float64[np.ndarray, "4 4"]
     """Maps points of the reference camera into the target camera, metres."""

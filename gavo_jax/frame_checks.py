@@ -133,7 +133,7 @@ def check_frame(
         history: What is remembered of earlier frames; `History()` at first.
 
     Returns:
-        The finding, and what to remember from now on.
+        The finding, and the updated history.
     """
     late = _check_timestamp(frame, timestamp, history)
     if late.use is Use.NOTHING:

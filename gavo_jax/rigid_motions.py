@@ -27,7 +27,7 @@ def exp(xi: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
 def interpolate(
     start: Float64[np.ndarray, "4 4"], end: Float64[np.ndarray, "4 4"], share: float
 ) -> Float64[np.ndarray, "4 4"]:
-    """The pose at a share of the way from one pose to another, along the screw that joins them."""
+    """Return the pose at a share of the way between two poses, along the screw that joins them."""
     return start @ exp(share * log(inverse(start) @ end))
 
 
@@ -43,7 +43,7 @@ def adjoint(a_T_b: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
 def transport_covariance(
     a_T_b: Float64[np.ndarray, "4 4"], covariance: Float64[np.ndarray, "6 6"]
 ) -> Float64[np.ndarray, "6 6"]:
-    """The covariance A Σ Aᵀ in a of a step δ in b whose covariance is Σ; A is the adjoint of a_T_b."""
+    """Transport the covariance Σ of a step δ from frame b to frame a: A Σ Aᵀ, where A is the adjoint of a_T_b."""
     step = adjoint(a_T_b)
     return step @ covariance @ step.T
 

@@ -21,7 +21,7 @@ QUALITY = 0.005
 LEAST_SLOPE = 2.0
 """Smallest gradient of a corner in every direction, grey levels per pixel; noise has about one."""
 RESPONSE = 64.0 * 9.0 / (12.0 * 255.0) ** 2
-"""OpenCV's response to one grey level a pixel in every direction: sums of its Sobel filter over 3 x 3 pixels."""
+"""OpenCV's response to one grey level per pixel in every direction: sums of its Sobel filter over 3 x 3 pixels."""
 SPACING = 1 / 80
 """Smallest distance of two corners, as a share of the image's width."""
 WINDOW = 1 / 30

@@ -31,7 +31,7 @@ LEAST = 0.01
 
 
 class Information(NamedTuple):
-    """Six directions δ of a step on the reference's side, at right angles in the flow that they cause."""
+    """Six directions δ of a step on the reference's side, orthogonal in the optical flow that they cause."""
 
     directions: Float[Array, "6 6"]
     """The directions as columns; metres and radians."""
@@ -105,7 +105,7 @@ def _steepness(slopes: Slopes) -> Float[Array, "*n"]:
 
 
 def _whitening(possible: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """W with Wᵀ A W = identity for a positive semi-definite A, limited where it is singular."""
+    """Return W with Wᵀ A W = identity for a positive semi-definite A, regularised where it is singular."""
     size = jnp.sqrt(jnp.maximum(jnp.diag(possible), 1e-12))  # metres and radians on one footing
     values, vectors = jnp.linalg.eigh(possible / jnp.outer(size, size))
     return vectors * jax.lax.rsqrt(jnp.maximum(values, 1e-5)) / size[:, None]

@@ -169,7 +169,7 @@ class Examination(NamedTuple):
     inside: Float[Array, ""]
     """Number of points that both frames see."""
     model: Linearization
-    """E and its derivatives by a step on the reference's side."""
+    """E and its derivatives with respect to a step on the reference's side."""
     scatter: Float[Array, "6 6"]
     """Covariance of E's gradient."""
     information: Information

@@ -18,7 +18,7 @@ def _niches(motions: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
 
 
 def _near(places: Float[Array, "n 6"], index: Integer[Array, ""]) -> Bool[Array, " n"]:
-    """Which motions share the mode of one of them."""
+    """Whether motions share the mode of the one with the given index."""
     return jnp.sum((places - places[index]) ** 2, axis=1) < 1.0
 
 

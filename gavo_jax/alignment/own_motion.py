@@ -30,7 +30,7 @@ UNSHUTTERED = (0.04, 0.04)
 NOISE = 1.0
 """Lower bound on the reprojection error's scale, pixels."""
 INDEPENDENT = 4.0
-"""Largest effective number of independent corners, as whole surfaces share their errors (depth, blur)."""
+"""Largest effective number of independent corners per frame, as whole surfaces share their errors (depth, blur)."""
 FEWEST = 20
 """Smallest number of corners for a result."""
 ROUNDS = 8
@@ -180,7 +180,7 @@ def _velocity(twist: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _by_twist(points: np.ndarray) -> np.ndarray:
-    """Derivative of a point's velocity by the twist, [n, 3, 6]."""
+    """Derivative of a point's velocity with respect to the twist, [n, 3, 6]."""
     x, y, z = points.T
     o = np.zeros_like(x)
     i = o + 1.0

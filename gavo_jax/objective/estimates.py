@@ -66,7 +66,7 @@ LEAST_DEPTH_TRUST = 1 / 3
 
 
 def depth_trust(objective: Objective, target_T_reference: Float[Array, "4 4"], scales: Scales) -> Float[Array, ""]:
-    """Factor on depth's weight: 1, falling to a third where whole surfaces share their depth residuals."""
+    """Factor on depth's weight: 1, falling to a third where depth residuals, more than grey's, are correlated."""
     r = objective.residuals(target_T_reference)
     depth = _independent_share(r.depth, r.depth_valid, scales.depth, objective.columns)
     grey = _independent_share(r.grey, lit_in_both(r), scales.grey, objective.columns)
