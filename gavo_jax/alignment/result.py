@@ -63,8 +63,8 @@ class Alignment(NamedTuple):
         """Directions of motion that the images of a `LOW_TEXTURE` pair leave undetermined, in words; else empty.
 
         They are some of the six axes of ξ, in the reference camera, joined by "with" if only their mixture is
-        undetermined. An axis is named if its share of the undetermined directions is large, or if that share alone
-        exceeds the tolerable deviation.
+        undetermined. An axis is named if its share of the undetermined directions is large, or if its own deviation
+        along them exceeds the tolerable one.
         """
         covariance = np.asarray(self.covariance, np.float64)
         if AlignmentStatus.LOW_TEXTURE not in self.statuses or not np.isfinite(covariance).all():

@@ -38,7 +38,7 @@ from gavo_jax.solvers.base import Bounds, Candidates, Solver, solve
 from gavo_jax.solvers.gauss_newton import GaussNewton
 
 REFINER = GaussNewton(iterations=(8, 12, 12, 15, 20))
-"""Solver that refines the islands' motions. Islands are small and widely spread, which finds a basin but not its
+"""Solver that refines competing motions. Islands are small and widely spread, which finds a basin but not its
 minimum: on pairs 15 frames apart their results are up to 10° from the refined ones."""
 FINALISTS = 4
 """Number of islands, those with the most evidence, whose motions are refined."""

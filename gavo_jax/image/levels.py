@@ -1,6 +1,6 @@
 """Geometry of the levels, from the image's size, the levels that are searched and the number of points.
 
-It is made once per search and passed along. It is static: it shapes the compiled programs and is no input of them.
+`Levels` is made once per search and passed along. It is static, as it shapes programs; an `ImagePlane` is their input.
 """
 
 from collections.abc import Sequence
