@@ -1,1 +1,1 @@
-"""Where frames come from: the sequence protocol and its implementations."""
+"""Sources of frames: the sequence protocol and its implementations."""

@@ -1,4 +1,4 @@
-"""From decoded images to a `Frame`: intensities to 8 bits, depth to the frame's units and to the colour camera."""
+"""Assembly of a `Frame` from decoded images: 8-bit intensities, depth in frame units, registered to colour."""
 
 import warnings
 from collections.abc import Iterable
@@ -19,43 +19,43 @@ from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.image.numbers import NO_READING, Depth
 
 FINE, COARSE = 5000.0, 1000.0
-"""Units per metre of frames whose files hold floats: the finer as long as it reaches far enough."""
+"""Units per metre of frames whose files hold floats; the finer one is used if its range suffices."""
 
 FARTHEST_FINE = 12.0
-"""Metres: where the farthest readings lie beyond, 16 bits of the finer unit do not hold them."""
+"""Farthest readings, metres, for which the finer unit is used: 16 bits hold 13.1 m of it."""
 
 MUCH = 0.02
-"""Share of an image that may lie beyond its scale without a word."""
+"""Share of an image that may exceed its scale without a warning."""
 
 METRES, MILLIMETRES = 1.0, 1000.0
 
 FINER = 2
-"""Columns of colour for each of depth that are left at least where colour is read coarser than it was recorded."""
+"""Fewest columns of binned colour per column of depth."""
 
 METRE_MEDIANS, MILLIMETRE_MEDIANS = (0.05, 30.0), (300.0, 60000.0)
-"""Median depth of a file of floats that is taken as one of metres, or of millimetres; between them lie centimetres."""
+"""Ranges of the median of float depth that is taken for metres, or for millimetres; centimetres lie between them."""
 
 Z_BUFFER = 0.9
 """Floats that all lie from here to 1 are what a renderer keeps to tell what is in front: 1 - near / z, nearly."""
 
 STATED_MEDIANS = (0.05, 60.0)
-"""Metres: a median depth that confirms the unit that a camera file says."""
+"""Range of the median depth, metres, that confirms the depth scale of a camera file."""
 
 
 class DepthUnit(NamedTuple):
-    """What depth is counted in, per metre."""
+    """Depth units per metre."""
 
     file: float
-    """In the files."""
+    """Units per metre in the files."""
     frame: float
-    """In frames: their camera's `depth_scale`."""
+    """Units per metre in frames: their camera's `depth_scale`."""
     of_floats: bool | None = None
-    """Whether this is the unit of fractions, or of whole numbers, alone; None where it is of both, as somebody said, or
-    where nothing tells."""
+    """Whether the unit holds for fractions only (True) or for whole numbers only (False); None where it was given for
+    both, or is unknown."""
 
 
 def recorded_as(sequence: Any) -> dict[str, Any]:
-    """How a sequence's images were recorded, where it tells: what its frames come of, beside their own camera."""
+    """Describe the cameras and depth scale that a sequence was recorded with; empty if it has no `calibration`."""
     calibration: Calibration | None = getattr(sequence, "calibration", None)
     if calibration is None:
         return {}
@@ -77,16 +77,16 @@ class DepthImage(NamedTuple):
 
 
 def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: float | None) -> DepthUnit:
-    """The units of files of floats, which a camera's `depth_scale` seldom speaks of: metres, mostly.
+    """The unit of float depth, which is usually metres whatever the camera's `depth_scale`.
 
     Args:
         samples: depth images of the sequence, as stored.
-        calibration: its `depth_scale` counts where the values are neither metres nor millimetres.
-        given: units per metre, if somebody says so.
+        calibration: its `depth_scale` is used if a camera file states it and it gives a plausible median.
+        given: units per metre, if the user gave them.
 
     Raises:
-        GavoError: the values are no depth in metres, in millimetres or by the camera's `depth_scale`, or were scaled to
-            the farthest; or some images hold whole numbers, which may be in another unit.
+        GavoError: the values fit neither metres, millimetres nor the camera's `depth_scale`, or were normalised to the
+            farthest; or some images hold whole numbers, which may be in another unit.
     """
     samples = list(samples)
     clean = [without_invalid(image.raw) for image in samples]
@@ -103,19 +103,19 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
 
 
 def _is_of_floats(readings: np.ndarray) -> bool | None:
-    """Whether depth is in fractions; None where it has no reading. Whole numbers beyond 16 bits come as floats, too."""
+    """Whether depth has fractions (integers beyond 16 bits are stored as floats, too); None if it has no reading."""
     if not readings.any():
         return None
     return readings.dtype != np.uint16 and bool((readings % 1).any())
 
 
 def _states_unit(calibration: Calibration) -> bool:
-    """Whether a camera says the unit; that of a preset is of its own files."""
+    """Whether a camera states the unit; a preset's holds for its own dataset only."""
     return calibration.preset is None and calibration.states_depth_scale
 
 
 def _likely_unit(readings: Float[np.ndarray, " n"], calibration: Calibration, name: str) -> float:
-    """The unit that readings are probably in; `name` is of a file, for messages."""
+    """The likely unit of the readings, per metre; `name` of a file is for messages."""
     is_stated, median = _states_unit(calibration), float(np.median(readings)) if readings.size else METRES
     if not is_stated and readings.size and Z_BUFFER < readings.min() < readings.max() <= 1:
         raise GavoError(
@@ -143,14 +143,14 @@ def _is_within(value: float, bounds: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True)
 class FrameAssembler:
-    """Makes frames of one source's images.
+    """Makes frames from the images of one source.
 
     Attributes:
-        calibration: of the images as recorded.
-        unit: of depth.
+        calibration: the cameras as they record.
+        unit: depth units of files and frames.
         white: full scale of 16-bit intensities.
-        color: whether frames carry RGB beside grey. Grey is the same either way.
-        undistort: whether lens distortion is taken out.
+        color: whether frames have RGB beside grey. Grey is the same either way.
+        undistort: whether to remove lens distortion.
     """
 
     calibration: Calibration
@@ -162,21 +162,21 @@ class FrameAssembler:
 
     @cached_property
     def binning(self) -> int:
-        """How many columns and rows of colour become one: as many as leave it finer than depth still, by `FINER`.
+        """Factor by which colour is binned, such that it stays at least `FINER` times as fine as depth.
 
-        What is finer than that has no depth of its own.
+        Finer pixels would have no depth of their own.
         """
         color, depth = self.calibration.color, self.calibration.depth
         return 1 if depth is None else max(1, int(color.fx / depth.fx / FINER))
 
     @cached_property
     def recorded(self) -> Camera:
-        """The colour camera as it records, at the size of frames and with their depth scale."""
+        """The distorted colour camera, at the size of frames and with their depth scale."""
         return replace(self.calibration.color.binned(self.binning), depth_scale=self.unit.frame)
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames as they come."""
+        """Camera of the returned frames."""
         return self.recorded.rectified() if self.undistort else self.recorded
 
     def frame(
@@ -190,11 +190,11 @@ class FrameAssembler:
         """Make a frame.
 
         Args:
-            bgr: the colour image, 8 or 16 bits.
-            depth: raw, as in the file.
-            name: of the colour image, for messages.
-            timestamp: of the colour image, seconds.
-            depth_timestamp: of the depth image, where it is known.
+            bgr: colour image, 8 or 16 bits.
+            depth: raw depth, as in the file.
+            name: name of the colour image, for messages.
+            timestamp: stamp of the colour image, seconds.
+            depth_timestamp: stamp of the depth image, seconds, if known.
 
         Raises:
             FrameError: an image is not of its camera's size.
@@ -241,7 +241,7 @@ class FrameAssembler:
         return in_frame_units(depth.raw, self.unit)
 
     def _tell_once(self, what: str, name: str, so: str) -> None:
-        """Warn of the first image of which the scale of the whole source holds a part."""
+        """Warn once per kind of fault, for the first image that exceeds the scale of the source."""
         if what not in self._told:
             self._told.add(what)
             warnings.warn(f"{name}: {what}: {so}", GavoWarning, stacklevel=4)
@@ -254,13 +254,13 @@ class FrameAssembler:
 
     @cached_property
     def _with_grey(self) -> np.ndarray:
-        """Pixels of an undistorted image that hold what was recorded, and not a border that was drawn on."""
+        """Mask of the pixels of an undistorted image that were recorded, not extended into the border."""
         everywhere = np.ones((self.recorded.height, self.recorded.width), np.uint16)
         return self.recorded.undistort_depth(everywhere) > 0
 
 
 def in_frame_units(raw: np.ndarray, unit: DepthUnit) -> UInt16[np.ndarray, "h w"]:
-    """Raw depth as frames have it: 16 bits, 0 = no reading, `unit.frame` units to a metre."""
+    """Convert raw depth to that of frames: 16 bits, 0 = no reading, `unit.frame` units per metre."""
     clean = without_invalid(raw)
     if clean.dtype == np.uint16 and unit.file == unit.frame:
         return clean
@@ -269,7 +269,7 @@ def in_frame_units(raw: np.ndarray, unit: DepthUnit) -> UInt16[np.ndarray, "h w"
 
 
 def _binned(image: np.ndarray, pixels: int) -> np.ndarray:
-    """The image of `Camera.binned`."""
+    """Average blocks of pixels × pixels, as `Camera.binned` expects."""
     if pixels == 1:
         return image
     height, width = (side // pixels for side in image.shape[:2])
@@ -278,7 +278,7 @@ def _binned(image: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def common_white(images: Iterable[np.ndarray]) -> int:
-    """Full scale that holds all of some images' intensities."""
+    """The smallest full scale that covers the intensities of all images."""
     return max((white_of(image) for image in images if image.dtype != np.uint8), default=255)
 
 

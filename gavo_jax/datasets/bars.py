@@ -1,6 +1,6 @@
-"""Black bars at the sides of images: they stay put as the scene moves, as a body would that goes with the camera.
+"""Removal of black bars at the sides of images: they would look like a body that moves with the camera.
 
-Each image is judged by itself.
+Each image is treated on its own.
 """
 
 from typing import Any
@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 
 DARKEST = 20
-"""Grey levels of the brightest bar."""
+"""Grey level of the brightest bar."""
 ALIKE = 1
-"""Grey levels by which the pixels of a bar differ at most."""
+"""Largest difference of the pixels in a bar, grey levels."""
 LEAST = 4
-"""Pixels of the width of a bar."""
+"""Minimum width of a bar, pixels."""
 MOST = 0.5
-"""Share of a side that bars may take: beyond, the image is blank."""
+"""Largest share of a side that bars may take; beyond it the image is taken for blank and left as it is."""
 RIM = 4
-"""Pixels beside a bar that coding or scaling has mixed with it."""
+"""Pixels beside a bar that compression or scaling has blended with it."""
 
 
 def without_bars(grey: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Replace bars by the rows and columns beside them, as the rim of an image without distortion is, without depth.
+    """Replace bars by the rows and columns beside them, and clear their depth, as at the rim of undistorted images.
 
-    The same objects come back where there are none.
+    Returns the same objects where there are no bars.
 
     Args:
         grey: [h, w], grey levels.
@@ -39,14 +39,14 @@ def without_bars(grey: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _inside(image: Any) -> slice:
-    """Rows that lie between bars, and off their rims."""
+    """Rows between the bars and their rims."""
     size = len(image)
     first, last = _margin(image), _margin(image[::-1])
     return slice(0, size) if first + last > MOST * size else slice(first, size - last)
 
 
 def _margin(image: Any) -> int:
-    """How many rows are a bar and its rim, from the first one on; what is dark behind the rim belongs to it."""
+    """Number of rows of a bar and its rim, from the first row on; dark rows after the rim belong to the bar."""
     searched = image[: int(MOST * len(image)) + 1]
     end = _bar(searched)
     if end < LEAST:
@@ -57,10 +57,10 @@ def _margin(image: Any) -> int:
 
 
 def _bar(image: Any) -> int:
-    """How many rows, from the first one on, are all of one dark level."""
+    """Number of leading rows that are uniformly dark."""
     darkest, brightest = np.inf, -np.inf
     for count, row in enumerate(image):
         darkest, brightest = min(darkest, float(np.min(row))), max(float(np.max(row)), brightest)
-        if not (brightest <= DARKEST and brightest - darkest <= ALIKE):  # not-a-number is no bar
+        if not (brightest <= DARKEST and brightest - darkest <= ALIKE):  # NaN is no bar
             return count
     return len(image)

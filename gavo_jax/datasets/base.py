@@ -1,4 +1,4 @@
-"""What every source of frames offers: `Frame` and the `Sequence` protocol."""
+"""The interface of every source of frames: `Frame` and the `Sequence` protocol."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ from gavo_jax.trajectory import Trajectory
 
 
 class FrameError(GavoError):
-    """A single frame that cannot be read: a fault of that frame, not of the whole sequence."""
+    """A single frame cannot be read; the rest of the sequence may be fine."""
 
 
 TRACED = "gavo_jax looks at its numbers on the host: call it outside jax.jit, jax.vmap and jax.grad"
 
 
 def require_image(name: str, image: Any, size: tuple[int, ...]) -> None:
-    """Refuse what is no image of real numbers of a size.
+    """Refuse anything but an image of real numbers of the given size.
 
     Raises:
         FrameError: It is of another shape, holds something else, or is being traced.
@@ -37,15 +37,15 @@ def require_image(name: str, image: Any, size: tuple[int, ...]) -> None:
 
 
 BRIGHTEST = 400.0
-"""Grey levels: sharpening and cubic interpolation reach no further; images of ten bits and more do."""
+"""Highest grey level that sharpening and cubic interpolation can reach; images of ten bits or more exceed it."""
 
 
 def require_grey_levels(grey: Any) -> None:
-    """Refuse grey images whose levels reach to 1, far beyond 255, or as far below 0 as above.
+    """Refuse grey images whose levels don't span 0 to 255 but 0 to 1, far more than 255, or far below 0.
 
     Raises:
         FrameError: They are floats, none above 1, and not all black; or some are above `BRIGHTEST`; or the least is
-            below 0 by more than half of the greatest, which sharpening does not do.
+            below 0 by more than half of the greatest, which sharpening does not cause.
     """
     values = np.asarray(grey)
     if values.dtype == np.uint8:
@@ -63,43 +63,43 @@ def require_grey_levels(grey: Any) -> None:
 
 
 def as_seconds(name: str, stamp: Any) -> float:
-    """A time in seconds as a number of its own: an array may hold the next one soon.
+    """Copy a time in seconds to a plain number, since an array may be overwritten later.
 
     Raises:
-        GavoError: It is no single number, but text, a date.
+        GavoError: It is not a single number but, say, text or a date.
     """
     return as_number(name, stamp, "seconds are needed, a number")
 
 
 def index_at(timestamps: Float[np.ndarray, " n"], stamp: float) -> int:
-    """The frame whose colour stamp is nearest to one; the stamps need not rise."""
+    """Index of the frame whose colour stamp is nearest to `stamp`; the stamps need not increase."""
     return int(np.argmin(np.abs(timestamps - stamp)))
 
 
 YEAR = 365.25 * 86400
-"""Seconds."""
+"""Length of a year, seconds."""
 LATEST = 1e11
-"""Seconds: no clock shows more, and milliseconds since 1970 are more."""
+"""Largest stamp of any clock, seconds; milliseconds since 1970 exceed it."""
 
 
 def require_begin_in_seconds(stamp: float) -> None:
-    """Refuse the first stamp of a stream where it counts milliseconds, microseconds or nanoseconds since 1970.
+    """Refuse the first stamp of a stream if it counts milliseconds, microseconds or nanoseconds since 1970.
 
     Raises:
-        FrameError: It is, in seconds, thousands of years from now.
+        FrameError: It exceeds `LATEST`: as seconds it would be thousands of years.
     """
     if LATEST < abs(stamp) < np.inf:
         raise FrameError(f"timestamp: seconds are needed, and {stamp:.0f} of them are {stamp / YEAR:.0f} years")
 
 
 class TimestampError(FrameError):
-    """A frame whose time is in doubt."""
+    """The timestamp of a frame is in doubt."""
 
 
 SAME_STAMP = 1e-6
-"""Seconds by which a stamp changes as it is written."""
+"""Largest change of a stamp by writing it to a file, seconds."""
 MOST_DELAY = 0.1
-"""Seconds: depth that is further from its colour image has a stamp that tells nothing."""
+"""Largest plausible delay between colour and depth, seconds; a depth stamp further off is ignored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +136,10 @@ class Frame:
         return delay if abs(delay) <= MOST_DELAY else 0.0
 
     def at(self, timestamp: float) -> "Frame":
-        """The same images with another stamp, depth as long after it as before. Where only the last digits of the stamp
-        differ depth keeps its own, as several frames may share one depth image.
+        """The same images with another stamp; depth keeps its delay, unless beyond `MOST_DELAY`.
+
+        Where the stamps differ by less than `SAME_STAMP`, depth keeps its stamp, as several frames may share one depth
+        image.
         """
         if timestamp == self.timestamp:
             return self
@@ -148,16 +150,16 @@ class Frame:
 
 
 TRACKED = ("camera", "timestamps", "__len__", "__getitem__")
-"""What tracking needs of a `Sequence`."""
+"""Members of `Sequence` that tracking needs."""
 RUN = (*TRACKED, "name", "ground_truth", "check")
-"""What a run needs."""
+"""Members of `Sequence` that a run needs."""
 
 
 def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
-    """Refuse what is no sequence (a list of frames, a generator, a path), and one of somebody's own that lacks a part.
+    """Refuse anything but a sequence (a list of frames, a generator, a path), and a custom one that is incomplete.
 
     Raises:
-        GavoError: It lacks what is needed of a `Sequence`.
+        GavoError: It lacks a needed member of `Sequence`.
     """
     kind = type(sequence).__name__
     lacking = [name for name in needed if not hasattr(sequence, name)]
@@ -171,9 +173,9 @@ def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
 class Sequence(Protocol):
     """Frames in the order of their stamps, read one at a time.
 
-    `sequence[i]` decodes frame i (negative i counts from the end) and raises IndexError outside and `FrameError`
-    where that frame cannot be read; `sequence[start:stop:stride]` is a sequence again, with the same name, camera and
-    ground truth. Iteration goes through `[i]`.
+    `sequence[i]` decodes frame i (negative i counts from the end). It raises IndexError if i is out of range, and
+    `FrameError` if that frame cannot be read. `sequence[start:stop:stride]` is again a sequence, with the same name,
+    camera and ground truth. Iteration goes through `[i]`.
     """
 
     @property
@@ -183,7 +185,7 @@ class Sequence(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """The camera of the frames as they come: without distortion where the sequence undistorts them."""
+        """The camera of the returned frames: without distortion if the sequence undistorts them."""
         ...
 
     @property
@@ -210,7 +212,7 @@ class Sequence(Protocol):
         ...
 
     def check(self) -> None:
-        """Refuse, before a run, what is wrong with the sequence as a whole.
+        """Refuse, before a run, a sequence that is faulty as a whole.
 
         Raises:
             GavoError: names the file and the fault.
@@ -219,7 +221,7 @@ class Sequence(Protocol):
 
 
 def require_parts(sequence: Sequence) -> None:
-    """Refuse a sequence of somebody's own whose camera, stamps or ground truth are of another kind.
+    """Refuse a custom sequence whose camera, stamps or ground truth have the wrong type or shape.
 
     Raises:
         GavoError: names the part.

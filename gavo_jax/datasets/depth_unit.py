@@ -1,8 +1,8 @@
-"""Whether depth is counted in the units that its camera says: a scale wrong by 5 or 1000 gives a trajectory as wrong.
+"""Check of the depth scale: a scale wrong by 5 or 1000 gives a trajectory wrong by as much.
 
-A median alone does not tell: scenes of 0.4 m and of 8 m are both real. What tells is the sensor. The first Kinect and
-its like measure disparity, so that the steps between the depths that they can return grow with the square of depth, by
-the same factor in every such camera: `KINECT_STEP`. And they see nothing nearer than `KINECT_NEAREST`.
+The median depth alone does not decide: scenes of 0.4 m and of 8 m are both real. The sensor does. The first Kinect and
+similar cameras measure disparity, so the steps between the depths that they return grow with the square of depth, by
+the same factor in every such camera: `KINECT_STEP`. They also see nothing nearer than `KINECT_NEAREST`.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,58 +16,58 @@ from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.images import without_invalid
 
 COMMON = (5000.0, 1000.0, 1.0)
-"""Units per metre of files: of the TUM benchmark, millimetres, metres."""
+"""Common depth scales, units per metre: the TUM benchmark's, millimetres, metres."""
 
 SHIFTED, TENTHS = 8000.0, 10000.0
-"""Units per metre: SUN3D's millimetres moved up by three bits; tenths of a millimetre. Only steps speak for these."""
+"""Units per metre: SUN3D's eighths of a millimetre; tenths of a millimetre. Proposed only if the depth steps match."""
 
 CENTIMETRES = 100.0
-"""Units per metre that nothing but a much too small median speaks for."""
+"""Centimetres, in units per metre: proposed only if the steps match or the median is implausible."""
 
 LOOKED_AT = 3
-"""Number of frames that are looked at."""
+"""Number of frames that are sampled."""
 
 KINECTS = ("fr1", "fr2", "fr3", "bonn")
-"""Presets of such cameras."""
+"""Presets of Kinect-like cameras."""
 
 KINECT_STEP = 2.85e-3
-"""1/m: the step between two depths that such a camera returns at 1 m, an eighth of a pixel of disparity at a baseline
-of 75 mm and a focal length of 585 pixels."""
+"""Step between two neighbouring depths of a Kinect over depth squared, 1/m: an eighth of a pixel of disparity at a
+baseline of 75 mm and a focal length of 585 pixels."""
 
 KINECT_NEAREST = 0.35
-"""Metres: a Kinect reads nothing nearer."""
+"""Nearest depth that a Kinect measures, metres."""
 
 KINECT_VIEW = (0.76, 0.93)
-"""Focal length over the image's width of such cameras."""
+"""Range of a Kinect's focal length over its image width."""
 
 PLAUSIBLE = (0.15, 150.0)
-"""Metres: a median depth outside is hardly that of a scene."""
+"""Plausible median depth of a scene, metres."""
 
 DEPTH_RANGE = (0.4, 15.0)
-"""Metres: a median depth outside is hardly that of an RGB-D camera (a Kinect sees nothing nearer), unless it became so
-without a jump. Millimetres that are read as fifths of one put a scene nearer than 2 m there."""
+"""Plausible median depth of an RGB-D camera, metres, unless depth left the range gradually. Millimetres read as fifths
+of a millimetre put any scene nearer than 2 m below it."""
 
 USUAL = (0.2, 10.0)
-"""Metres: a median depth that a unit has to lead to if it is to be proposed for one that is not plausible."""
+"""Range of the median depth, metres, that a unit has to give to replace one whose median is implausible."""
 
 USUAL_MEDIAN = 1.5
-"""Metres: of several such units the one that leads nearest to it is proposed."""
+"""Most typical median depth, metres: of several possible units the one that comes nearest to it is proposed."""
 
 STEP_TOLERANCE = 0.15
-"""How far the unit that the steps speak of may be off a common one."""
+"""Relative tolerance between the scale estimated from the steps and a common one."""
 
 LEAST_STEP = 3.5
-"""Raw units: rounding hides the law of smaller steps."""
+"""Smallest step used, raw units: rounding hides the law in smaller ones."""
 
 HALVES = (0x2E66, 0x7C00)
-"""Whole numbers whose bits are those of floats of 16 bits from 0.1 to infinity, as Mid-Air keeps depth in PNG."""
+"""Range of the integers whose bits are those of 16-bit floats from 0.1 to infinity: Mid-Air stores depth so in PNG."""
 
 LEAST_STEPS, SPREAD = 40, 0.35
-"""Steps that have to be seen, and how far the middle half of them may differ, to be taken for a law."""
+"""Minimum number of steps, and largest interquartile range relative to their median, for the steps to follow a law."""
 
 
 class DepthSample(NamedTuple):
-    """What the raw depth of a few frames says, in its own units."""
+    """Statistics of the raw depth of a few frames, in its own units."""
 
     near: float
     """First percentile of the raw depth."""
@@ -75,13 +75,13 @@ class DepthSample(NamedTuple):
     far: float
     """99th percentile of the raw depth."""
     kinect_scale: float | None
-    """Units per metre by the steps, if the sensor were such a camera; None where the steps follow no law."""
+    """Units per metre estimated from the steps, if the sensor is Kinect-like; None where the steps follow no law."""
     is_whole: bool = False
-    """Whether it is whole numbers of 16 bits."""
+    """Whether all images are 16-bit integers."""
 
 
 def sample_depth(images: Sequence[np.ndarray]) -> DepthSample | None:
-    """Look at the raw depth of a few frames; None where there is no reading."""
+    """Compute the statistics of a few raw depth images; None where there is no reading."""
     clean = [without_invalid(image) for image in images]
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     if readings.size == 0:
@@ -103,13 +103,13 @@ def _kinect_scale(readings: np.ndarray) -> float | None:
 
 
 def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: bool = False) -> float | None:
-    """The unit, per metre, that depth is probably counted in, if that is not `scale`; None where nothing speaks for it.
+    """The likely depth scale, units per metre, if it differs from `scale`; None if there is no evidence for another.
 
     Args:
-        sample: of a few frames.
-        scale: units per metre as the camera says.
-        camera: of the images.
-        is_kinect: whether the camera is known to be one of those.
+        sample: statistics of a few frames.
+        scale: units per metre according to the camera.
+        camera: the camera of the images.
+        is_kinect: whether the camera is known to be Kinect-like.
     """
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
     every = (*COMMON, SHIFTED, TENTHS, CENTIMETRES)
@@ -123,7 +123,7 @@ def better_scale(sample: DepthSample, scale: float, camera: Camera, is_kinect: b
 
 
 def _nearest_to_steps(sample: DepthSample, units: list[float]) -> float | None:
-    """That of some units which the steps of the depth speak for."""
+    """The unit that matches the depth steps; None if none does."""
     by_steps = sample.kinect_scale
     if by_steps is None or not units:
         return None
@@ -132,16 +132,16 @@ def _nearest_to_steps(sample: DepthSample, units: list[float]) -> float | None:
 
 
 def _most_usual(sample: DepthSample, units: list[float]) -> float | None:
-    """That of some units in which the depth is as far away as is usual."""
+    """The unit that makes the median depth most typical; None if none makes it usual."""
     usual = [unit for unit in units if sample.median / unit > USUAL[0]]
     likely = [unit for unit in usual if unit in COMMON] or [unit for unit in usual if unit == CENTIMETRES]
     return min(likely, key=lambda unit: abs(np.log(sample.median / unit / USUAL_MEDIAN)), default=None)
 
 
 def fault_of_scale(sequence: FrameSequence) -> str | None:
-    """What is probably wrong with the depth scale of a sequence and what to set instead; None where nothing is.
+    """Describe a probably wrong depth scale of a sequence and what to set instead; None if it looks right.
 
-    Its first frames tell; ones that cannot be read are left out.
+    Judged by its first frames, except those that cannot be read.
     """
     sample, scale = sample_sequence(sequence)
     calibration = getattr(sequence, "calibration", None)
@@ -156,7 +156,7 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
 
 
 def doubt_of_scale(sequence: FrameSequence) -> str | None:
-    """What another common unit would make of depth that is nearer or farther than is usual; None where it is not."""
+    """Describe a median depth that is unusual, and what it is in another unit; None where it is usual."""
     sample, scale = sample_sequence(sequence)
     if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
         return None
@@ -173,7 +173,7 @@ def doubt_of_scale(sequence: FrameSequence) -> str | None:
 
 
 def _as_halves(sample: DepthSample) -> str:
-    """What depth is if whole numbers are the bits of floats; empty where they cannot be."""
+    """Describe the median depth if the integers are bits of 16-bit floats; empty where they cannot be."""
     if not (sample.is_whole and HALVES[0] <= sample.near and sample.far <= HALVES[1]):
         return ""
     metres = float(np.uint16(sample.median).view(np.float16))
@@ -188,7 +188,7 @@ def _as_shares(sample: DepthSample, scale: float) -> str:
 
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:
-    """Why a sequence is of no use, where not one of a few frames, its first, its middle and its last, has a reading."""
+    """Describe why a sequence has no depth; None if any of its first, middle and last frames has a reading."""
     read = _reader_of(sequence)
     places = sorted({*range(min(LOOKED_AT, len(sequence))), len(sequence) // 2, len(sequence) - 1})
     looked = recorded = 0
@@ -211,12 +211,12 @@ def lack_of_depth(sequence: FrameSequence) -> str | None:
 
 
 def _reader_of(sequence: FrameSequence) -> Callable[[int], np.ndarray]:
-    """What gives a frame's depth: as it is stored, where the sequence tells."""
+    """A function from a frame's index to its depth, as stored where the sequence gives that."""
     return getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
 
 
 def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
-    """What the first frames' depth says, as it is stored where the sequence tells, and the units per metre it has."""
+    """Statistics of the first frames' depth, as stored where the sequence gives that, and its units per metre."""
     read = _reader_of(sequence)
     unit = getattr(sequence, "depth_unit", None)
     images = []
@@ -236,9 +236,9 @@ NAMES = {
     TENTHS: "tenths of a millimetre",
     CENTIMETRES: "centimetres",
 }
-"""Common units in words."""
+"""Names of common units, by their number per metre."""
 
 
 def name_of_unit(scale: float) -> str:
-    """A unit in words."""
+    """The name of a unit for messages."""
     return NAMES.get(scale, f"{scale:g} to a metre")

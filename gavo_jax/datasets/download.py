@@ -1,4 +1,4 @@
-"""Sequences of the TUM RGB-D benchmark: resumed where a download broke off, checked by size, unpacked safely."""
+"""Download of TUM RGB-D sequences: resumed after interruptions, checked by size, and unpacked safely."""
 
 import difflib
 import gzip
@@ -26,26 +26,26 @@ SEQUENCES = {
     "sitting_xyz structure_notexture_far structure_notexture_near structure_texture_far structure_texture_near teddy "
     "walking_halfsphere walking_rpy walking_static walking_xyz",
 }
-"""Names by camera."""
+"""Names of the sequences, by camera."""
 ATTEMPTS, PAUSE = 5, 1.0
-"""Tries to get the whole file, each going on where the last one ended, and seconds between them."""
+"""Number of attempts, each resuming where the last one ended, and seconds between them."""
 TIMEOUT = (10.0, 30.0)
-"""Seconds without a connection, and without a byte, after which a try has failed."""
+"""Timeouts of connecting and of reading, seconds."""
 CHUNK = 2**18
 DAMAGED = (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error)
-"""What readers of a broken archive raise."""
+"""Exceptions that reading a damaged archive raises."""
 SIZE = "[0-9]{1,18}"
-"""A number of bytes in a server's words; what is none tells nothing."""
+"""A number of bytes in a response header; anything else is ignored."""
 
 Progress = Callable[[int, int | None], None]
-"""Called with the bytes that are there and the bytes that there will be, where the server says."""
+"""Called with the number of bytes received and the total; None where the server does not state it."""
 
 
 def folder_of(name: str) -> str:
     """Name of a sequence's folder, from `fr1_xyz`, `freiburg1_xyz` or the folder's name itself.
 
     Raises:
-        GavoError: no such sequence; the nearest one is named.
+        GavoError: no such sequence; the message suggests the closest name.
     """
     known = [f"fr{camera}_{rest}" for camera, names in SEQUENCES.items() for rest in names.split()]
     short = re.sub(r"^(rgbd_dataset_)?freiburg", "fr", name.strip())
@@ -56,20 +56,21 @@ def folder_of(name: str) -> str:
 
 
 def download(name: str, to: str | Path, server: str = SERVER, progress: Progress = lambda *_: None) -> Path:
-    """Get a sequence and unpack it; nothing is done where its folder is there already.
+    """Download a sequence and unpack it, unless its folder exists already.
 
     Args:
         name: As in `folder_of`.
-        to: Folder that receives the sequence's folder. A part of the archive that an earlier call left is gone on with.
-        server: Address below which the benchmark's files lie.
-        progress: Hears of the bytes that are there.
+        to: Folder in which the sequence's folder is created. A partial download left there by an earlier call is
+            resumed.
+        server: Base URL of the benchmark's files.
+        progress: Called as data arrives.
 
     Returns:
         The sequence's folder.
 
     Raises:
-        GavoError: unknown name, no connection, the server refuses or breaks off again and again, the archive is damaged
-            or would write outside its folder, the disk is full; pooch is missing.
+        GavoError: unknown name, no connection, the server refuses or keeps breaking off, the archive is damaged or would
+            write outside its folder, the disk is full, or pooch is missing.
     """
     folder = folder_of(name)
     target = Path(to) / folder
@@ -89,7 +90,7 @@ def download(name: str, to: str | Path, server: str = SERVER, progress: Progress
 
 
 def _retrieve(url: str, to: Path, progress: Progress) -> Path:
-    """Return the whole archive in `to`."""
+    """Download the archive to `to`."""
     try:
         import pooch
         import requests
@@ -100,7 +101,7 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
     partial = to / f"{name}.part"
 
     def fetch(url: str, output_file: Any, pooch: Any, check_only: bool | None = False) -> None:
-        """Pooch's downloader: whatever a try brings stays in `partial`."""
+        """Downloader for pooch that keeps partial data in `partial`."""
         _fetch_patiently(url, partial, progress)
         os.replace(partial, output_file)
 
@@ -115,7 +116,7 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
 
 
 def _told(error: Exception, url: str, kept: str) -> str:
-    """Why a download came to nothing; `kept` says what is there of it."""
+    """Describe why a download failed; `kept` says what remains of it."""
     import requests
 
     words = line_of(error)
@@ -133,7 +134,7 @@ def _told(error: Exception, url: str, kept: str) -> str:
 
 
 def _fetch_patiently(url: str, partial: Path, progress: Progress) -> None:
-    """Some tries, each going on from what the one before has brought."""
+    """Make up to `ATTEMPTS` attempts, each resuming where the last one ended."""
     import requests
 
     for attempt in range(ATTEMPTS):
@@ -149,7 +150,7 @@ def _fetch_patiently(url: str, partial: Path, progress: Progress) -> None:
 
 
 def _fetch(url: str, partial: Path, progress: Progress) -> None:
-    """One try: go on after what is there already, if the server can, else from the start; the size has to be right."""
+    """Make one attempt: resume the partial file if the server supports it, else start over, and check the size."""
     import requests
 
     have = partial.stat().st_size if partial.exists() else 0
@@ -178,16 +179,16 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
 
 
 def _unpack(archive: Path, target: Path) -> None:
-    """Unpack beside the target and rename: its folder is there whole or not at all."""
+    """Unpack beside the target and rename, so that its folder is complete or absent."""
     scratch = target.with_name(f".unpacking-{target.name}")
-    shutil.rmtree(scratch, ignore_errors=True)  # left by a kill
+    shutil.rmtree(scratch, ignore_errors=True)  # left by a killed process
     scratch.mkdir()
     try:
         with gzip.open(archive) as stream:
             with tarfile.open(fileobj=stream, mode="r:") as tar:
                 for member in tar:
                     _unpack_member(tar, member, scratch, target.name)
-            while stream.read(CHUNK):  # to its end, where the checksum of all stands
+            while stream.read(CHUNK):  # up to the checksum at its end
                 pass
         if not (scratch / target.name / "rgb.txt").is_file():
             raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
@@ -200,7 +201,7 @@ def _unpack(archive: Path, target: Path) -> None:
 
 
 def _unpack_member(tar: tarfile.TarFile, member: tarfile.TarInfo, scratch: Path, folder: str) -> None:
-    """Unpack a file or a folder below `folder`, nothing else; the filters of `tarfile` are not in every Python 3.11."""
+    """Unpack a file or folder below `folder`, nothing else; not every Python 3.11 has the filters of `tarfile`."""
     if not (member.isfile() or member.isdir()):
         raise tarfile.ReadError(f"{member.name}: neither a file nor a folder")
     name = os.path.normpath(member.name)

@@ -1,4 +1,4 @@
-"""Sequences whose frames lie as image files."""
+"""Sequences of image files."""
 
 import os
 import re
@@ -26,22 +26,22 @@ from gavo_jax.image.numbers import Depth
 from gavo_jax.trajectory import Trajectory
 
 SAMPLED = 3
-"""Frames, from the first to the last, that show what kind of images a sequence has."""
+"""Number of frames, spread over a sequence, that are sampled to find out the kind of its images."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a source is to be read; what is left out, it says itself, or is found out.
+    """How to read a source; what is left out comes from the source itself or is detected.
 
     Attributes:
-        camera: a camera, a calibration, what `load_calibration` takes, or "auto": what the source brings.
+        camera: a camera, a calibration, what `load_calibration` takes, or "auto" for the source's own.
         depth_scale: raw depth units per metre.
         rate: frames per second, where there are no stamps.
-        color: whether frames carry RGB beside grey.
-        undistort: whether lens distortion is taken out.
+        color: whether frames have RGB beside grey.
+        undistort: whether to remove lens distortion.
         max_difference: colour and depth stamps at least this far apart, in seconds, are not of one frame.
-        color_topic: of a recording.
-        depth_topic: of a recording.
+        color_topic: colour topic of a recording.
+        depth_topic: depth topic of a recording.
     """
 
     camera: Camera | Calibration | str = "auto"
@@ -54,7 +54,7 @@ class Reading:
     depth_topic: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are none, or not above 0."""
+        """Refuse values that are not numbers above 0."""
         for name in ("depth_scale", "rate", "max_difference"):
             value = getattr(self, name)
             if value is None and name != "max_difference":
@@ -64,11 +64,11 @@ class Reading:
 
     @property
     def is_auto(self) -> bool:
-        """Whether the source has to bring its camera."""
+        """Whether the source has to provide its own camera."""
         return isinstance(self.camera, str) and self.camera == "auto"
 
     def given(self) -> list[str]:
-        """Options of the command that say how a source is read, as far as they are given."""
+        """Names of the command-line options for reading a source that are given."""
         values = {
             "--depth-scale": self.depth_scale,
             "--rate": self.rate,
@@ -84,13 +84,13 @@ class Reading:
         depth_scale: float = DEPTH_SCALE,
         is_rectified: bool = False,
     ) -> Calibration:
-        """The calibration that is named, else the source's own.
+        """The calibration given by `camera`, else the source's own.
 
         Args:
-            own: reads what the source brings.
-            size: finds out width and height of the images, for a file that does not say it.
-            depth_scale: of a kind of source, for a file that does not say it.
-            is_rectified: as of `load_calibration`.
+            own: reads the source's own calibration.
+            size: finds width and height of the images, for a file that does not state them.
+            depth_scale: the source's usual depth units per metre, for a file that does not state them.
+            is_rectified: as in `load_calibration`.
 
         Raises:
             GavoError: as `load_calibration`.
@@ -100,7 +100,7 @@ class Reading:
         if isinstance(self.camera, Calibration):
             return self.camera
         if isinstance(self.camera, Camera):
-            # a camera always has a scale: TUM's, where nobody said one
+            # a Camera always has a depth scale: TUM's by default
             if self.camera.depth_scale != DEPTH_SCALE or depth_scale == DEPTH_SCALE:
                 return Calibration(self.camera)
             return Calibration(replace(self.camera, depth_scale=depth_scale), states_depth_scale=False)
@@ -113,28 +113,28 @@ class Entry(NamedTuple):
     stamp: float
     """Stamp of the colour image, seconds."""
     color: Path
-    """A file, or a frame's place in a film."""
+    """An image file, or a frame's path in a film."""
     depth: Path | None
     depth_stamp: float | None = None
     doubt: str = ""
-    """Why the frame's time cannot be trusted."""
+    """Why the frame's timestamp cannot be trusted; empty if it can."""
 
 
 class FileSequence:
-    """Frames that lie as pairs of image files, decoded one by one when asked for; nothing of them is kept.
+    """Frames stored as pairs of image files, decoded one by one on access and not cached.
 
     Attributes:
-        name: of the folder.
+        name: name of the folder.
         ground_truth: the true trajectory, or None.
         entries: files of each frame, in the order of their stamps.
         calibration: the cameras as they record.
-        times_guessed: what the frames' times are taken from, where that is a guess; else empty.
+        times_guessed: what the frames' times are guessed from; empty if they are known.
     """
 
     kind: ClassVar[str] = "image files"
     times_guessed: str = ""
     scale_is_open: ClassVar[bool] = False
-    """Whether the kind of source leaves the unit of depth open: what depth looks like decides, if nobody says it."""
+    """Whether this kind of source has no fixed depth unit, so that it is guessed from the depth unless it is given."""
 
     def __init__(
         self,
@@ -145,15 +145,15 @@ class FileSequence:
         reading: Reading = Reading(),
         left_out: Sequence[str] = (),
     ) -> None:
-        """Take note of the files; none is read yet.
+        """Store the paths of the files; none is read yet.
 
         Args:
             name: for tables and folders.
-            entries: in the order of their stamps.
+            entries: files of each frame, in the order of their stamps.
             calibration: the cameras as they record.
-            ground_truth: with its own stamps.
-            reading: `depth_scale`, `color` and `undistort` count.
-            left_out: what lies there and is not used, and why, a line each.
+            ground_truth: the true trajectory, with its own stamps.
+            reading: only `depth_scale`, `color` and `undistort` are used.
+            left_out: files that are not used, and why, one line each.
         """
         self.name, self.ground_truth, self.left_out = name, ground_truth, tuple(left_out)
         self.entries = list(entries)
@@ -170,7 +170,7 @@ class FileSequence:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames as they come: without distortion when they are undistorted, else as recorded."""
+        """Camera of the returned frames: without distortion when they are undistorted, else as recorded."""
         return self._images.assembler.camera
 
     @property
@@ -180,12 +180,12 @@ class FileSequence:
 
     @property
     def unit_is_assumed(self) -> bool:
-        """Whether nothing says the unit of depth, so that it is the usual one that depth looks most like."""
+        """Whether the depth unit is not stated anywhere, but guessed from the depth."""
         return self.scale_is_open and not self.calibration.states_depth_scale
 
     @property
     def files(self) -> list[tuple[Path, ...]]:
-        """Images of each frame."""
+        """Files of each frame's images."""
         return [(file_of(entry.color), *filter(None, (entry.depth,))) for entry in self.entries]
 
     def __len__(self) -> int:
@@ -220,7 +220,7 @@ class FileSequence:
         )
 
     def raw_depth(self, index: int) -> np.ndarray:
-        """The depth image of a frame as it is stored; raises `FrameError` as reading the frame does."""
+        """The depth image of a frame as stored; raises `FrameError` where the frame cannot be read."""
         entry = self.entries[index]
         if entry.depth is None:
             raise TimestampError(entry.doubt)
@@ -228,7 +228,7 @@ class FileSequence:
 
     @classmethod
     def depth_in(cls, file: Path) -> Depth:
-        """`read_depth`, as this kind of source has its files."""
+        """Read a depth file the way this kind of source stores it, see `read_depth`."""
         return read_depth(file)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -236,7 +236,7 @@ class FileSequence:
         return (self[index] for index in range(len(self)))
 
     def check(self) -> None:
-        """Refuse what can be known before a run: a missing image among these frames, an unusable first frame.
+        """Refuse faults that can be found before a run: a missing image, or an unusable first frame.
 
         Raises:
             GavoError: names the image and the fault.
@@ -256,20 +256,20 @@ CAMERA_FILES = (
     *("camera-intrinsics.txt", "camera_intrinsics.txt", "camera_intrinsic.txt", "intrinsics.txt", "calibration.txt"),
     *("intrinsics_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic_color.txt", "colorIntrinsics.txt"),
 )
-"""Names by which a camera file in a folder, or in the one above, is known."""
+"""Names by which a camera file in a folder, or in its parent, is recognised."""
 
 SCANS, OF_A_SCAN = ("info.txt", "_info.txt"), b"m_calibrationColorIntrinsic"
-"""Names of the file that comes with a scan, and what stands in it: others call theirs so, too."""
+"""Names of a scan's info file, and a key that it contains: other programs use the same names."""
 
 EXPORTED_CAMERA_FILES = (
     *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
     *("calibration.json", "camera_matrix.csv", "transforms.json", "metadata.json"),
 )
-"""Names that other programs give their cameras, which may be estimates: asked where nothing else tells the camera."""
+"""Names of camera files exported by other programs, which may be estimates: used only if there is no other camera."""
 
 
 def told_in(file: Path) -> dict[str, Any]:
-    """The names and values that a file of JSON beside the images holds; none where it is something else."""
+    """The JSON object in a file beside the images; empty if it cannot be read as one."""
     try:
         return read_json_object(file, MAX_JSON_BYTES)
     except GavoError:
@@ -277,10 +277,10 @@ def told_in(file: Path) -> dict[str, Any]:
 
 
 def own_camera_file(folder: Path) -> Path | None:
-    """The camera file that lies in a folder, if one does.
+    """The camera file in a folder; None if there is none.
 
     Raises:
-        GavoError: it is that of colour, and the one of depth beside it says something else.
+        GavoError: it is that of colour, and the depth camera's file beside it differs.
     """
     file = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
     if file is None:
@@ -295,13 +295,13 @@ def own_camera_file(folder: Path) -> Path | None:
 
 
 def info_of_scan(folder: Path) -> Path | None:
-    """The file that comes with a scan and holds both cameras, if it lies in a folder."""
+    """The info file of a scan, with both cameras, in a folder; None if there is none."""
     files = (folder / name for name in SCANS)
     return next((file for file in files if file.is_file() and OF_A_SCAN in read_bytes(file)), None)
 
 
 def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calibration:
-    """The preset that a folder's name speaks of, else a camera that another program has exported to it.
+    """The preset that a folder's name implies, else a camera file exported to it by another program.
 
     Raises:
         GavoError: there is neither, or the file cannot be read.
@@ -317,10 +317,10 @@ def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calib
 
 
 def preset_by_name(folder: Path) -> Calibration:
-    """The preset that a folder's name speaks of, or the trajectory in it.
+    """The preset implied by a folder's name, or by a trajectory of ICL-NUIM in it.
 
     Raises:
-        GavoError: it speaks of none; the message says what would help.
+        GavoError: no preset is implied; the message says what would help.
     """
     try:
         return load_calibration(preset_for_sequence(folder.resolve().name))
@@ -331,10 +331,10 @@ def preset_by_name(folder: Path) -> Calibration:
 
 
 def size_of_most(entries: Sequence[Entry]) -> Size:
-    """Width and height of most of the few colour images that are looked at, from the first to the last.
+    """The most common width and height of a few colour images, sampled over the sequence.
 
     Raises:
-        FrameError: why the first of them cannot be read, where none can.
+        FrameError: none of them can be read; the message is that of the first.
     """
     images = [entry.color for entry in entries]
     is_film = bool(images) and film_of(images[0]) is not None
@@ -342,12 +342,12 @@ def size_of_most(entries: Sequence[Entry]) -> Size:
 
 
 def depth_size_of_most(entries: Sequence[Entry]) -> Size:
-    """The same of depth."""
+    """The most common width and height of a few depth images, see `size_of_most`."""
     return _size_of_most([entry.depth for entry in entries if entry.depth is not None], read_depth)
 
 
 def _color(place: Path) -> np.ndarray:
-    """`read_color`, also of a frame in a film."""
+    """Read a colour image from a file or a film."""
     return read_color(place) if film_of(place) is None else read_frame(place)
 
 
@@ -366,22 +366,22 @@ def _size_of_most(images: Sequence[Path], read: Callable[[Path], np.ndarray]) ->
 
 
 def places_of_a_few(count: int) -> list[int]:
-    """Numbers of a few frames of a sequence, from the first to the last: by them its images are scaled."""
+    """Indices of a few frames spread over a sequence; samples of its images are taken there."""
     return sorted({round(share * (count - 1)) for share in np.linspace(0, 1, SAMPLED)}) if count else []
 
 
 def _instead(path: Path) -> str:
-    """What is there in the place of an image, which is no file."""
-    if os.path.islink(path):  # which a name that is too long is not, nor does it raise here
+    """Describe what is at the path of an image that is not a file."""
+    if os.path.islink(path):  # False, without raising, for a name that is too long
         return f"a link to {os.readlink(path)[:200]}, which is missing"
     return "not a file" if os.path.exists(path) else "image is missing"
 
 
 def resolve_folder(folder: Path) -> Path:
-    """The folder's true place.
+    """The folder's resolved path.
 
     Raises:
-        GavoError: there is none.
+        GavoError: there is no such folder, or its path is unusable.
     """
     try:
         resolved = folder.resolve()
@@ -393,7 +393,7 @@ def resolve_folder(folder: Path) -> Path:
 
 
 class _Images:
-    """What kind of images a whole sequence has, found out from a few of them once; its slices share it."""
+    """The kind of a sequence's images, found once from a few of them and shared by its slices."""
 
     def __init__(self, entries: list[Entry], calibration: Calibration, reading: Reading, scale_is_open: bool):
         self._entries, self._calibration, self._reading = entries, calibration, reading
@@ -405,12 +405,12 @@ class _Images:
         for at in places_of_a_few(len(self._entries)):
             entry = self._entries[at]
             try:
-                if film_of(entry.color) is None:  # those of a film have 8 bits
+                if film_of(entry.color) is None:  # a film's have 8 bits
                     colors.append(read_color(entry.color))
                 if entry.depth is not None:
                     depths.append(DepthImage(read_depth(entry.depth), str(entry.depth)))
             except FrameError:
-                continue  # told of when the frame itself is read
+                continue  # raised when the frame itself is read
         scale = self._calibration.color.depth_scale
         if self._scale_is_open and not self._calibration.states_depth_scale:
             sample = sample_depth([depth.raw for depth in depths])
@@ -426,15 +426,15 @@ class _Images:
 def open_pair(
     images: Sequence[tuple[str | Path, str | Path]], calibration: Calibration, reading: Reading = Reading()
 ) -> FileSequence:
-    """A few frames that belong together, each of a colour and a depth image.
+    """Open a few frames given as pairs of a colour and a depth image.
 
     Args:
-        images: paths of colour and depth, for each frame.
-        calibration: of all of them.
-        reading: as of `FileSequence`.
+        images: paths of colour and depth for each frame.
+        calibration: the cameras of all frames.
+        reading: as in `FileSequence`.
 
     Raises:
-        GavoError: one file is given as colour and as depth.
+        GavoError: one file is given as both colour and depth.
     """
     for color, depth in images:
         if Path(color) == Path(depth):

@@ -1,7 +1,6 @@
-"""Colour that was recorded as a film beside images of depth: a frame's place is FILM/000012, as if it were a folder.
+"""Colour recorded as a film beside depth images: a frame has the path FILM/000012, as if the film were a folder.
 
-Frames come in the order of their numbers: one that lies behind is sought from the beginning, as no film tells for sure
-where to find it.
+Frames are decoded in sequence. To go back, the film is decoded from its beginning, as seeking is not reliable in films.
 """
 
 import os
@@ -17,31 +16,31 @@ from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.quiet import without_log
 from gavo_jax.errors import GavoError
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once: it would write on standard error, by its own threads
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once; else FFmpeg's threads write to stderr
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg")
-"""Endings of films; whether one can be decoded, only opening it tells."""
+"""Suffixes of films; whether one can be decoded only shows when it is opened."""
 
 MOST_FRAMES = 10**6
-"""Frames of nine hours: a film that claims more is taken for one of none."""
+"""Frames of nine hours; a film that claims more is treated as having none."""
 
 _READING = threading.Lock()
-"""Held while a frame is decoded: a film is read by one at a time."""
+"""Held while a frame is decoded: only one thread may read a film at a time."""
 
 
 def film_of(place: Path) -> Path | None:
-    """The film that a frame lies in; None for an image that is a file of its own."""
+    """The film that contains a frame; None for an image file."""
     film = place.parent
     return film if film.suffix.lower() in FILMS and film.is_file() else None
 
 
 def file_of(place: Path) -> Path:
-    """The file that an image lies in, be it a film."""
+    """The file that holds an image: the film or the image file itself."""
     return film_of(place) or place
 
 
 def frames_of(film: Path) -> list[Path]:
-    """Places of the frames that a film claims to have; none where it cannot be decoded."""
+    """Paths of the frames that a film claims to have; none where it cannot be decoded."""
     try:
         with _READING:
             count = _opened(film).count
@@ -51,7 +50,7 @@ def frames_of(film: Path) -> list[Path]:
 
 
 def rate_of(film: Path) -> float:
-    """Frames per second that a film claims to have; 0 where it does not say it.
+    """Frames per second according to the film; 0 where it does not say.
 
     Raises:
         GavoError: it cannot be decoded.
@@ -61,10 +60,10 @@ def rate_of(film: Path) -> float:
 
 
 def read_frame(place: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode a frame, BGR, as it was recorded: what says that it is to be turned is left aside, as depth lies like it.
+    """Decode a frame, BGR, as it was recorded: a rotation tag is ignored, as depth isn't rotated either.
 
     Raises:
-        FrameError: the film cannot be decoded, or not as far as that.
+        FrameError: the film cannot be decoded, or not up to that frame.
     """
     film = place.parent
     with _READING:
@@ -82,9 +81,7 @@ def _opened(film: Path) -> "_Film":
 
 
 def _written(film: Path) -> tuple[int, int, int]:
-    """When a film was written, its size, and the process: another may come to its place, and forks have places of their
-    own in it.
-    """
+    """Cache key of an open film: modification time, size and process (files may be replaced, and forks read alone)."""
     try:
         status = film.stat()
     except OSError as error:
@@ -120,7 +117,7 @@ class _Film:
         self._next = 0
 
     def read(self, number: int) -> UInt8[np.ndarray, "h w 3"] | None:
-        """Return a frame; None where the film ends before."""
+        """Return a frame; None where the film ends before it."""
         if number < self._next:
             self._open()
         with without_log():
@@ -128,7 +125,7 @@ class _Film:
                 self._next += 1
             is_there, image = self._capture.read() if self._next == number else (False, None)
         if not is_there or image is None:
-            self._next = MOST_FRAMES  # where it stands is open: begin anew
+            self._next = MOST_FRAMES  # the position is unknown: reopen
             return None
         self._next += 1
         return np.asarray(image)

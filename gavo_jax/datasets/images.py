@@ -1,4 +1,4 @@
-"""Image files into arrays: whatever OpenCV decodes, NumPy arrays, OpenEXR; one line for what cannot be read."""
+"""Decoding of image files: any format of OpenCV, NumPy arrays, OpenEXR; a one-line error for what cannot be read."""
 
 import contextlib
 import io
@@ -21,54 +21,54 @@ from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
 from gavo_jax.image.numbers import NO_READING, Depth
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
-"""Endings of colour images that are looked for in a folder; a file that is named may have any."""
+"""Suffixes of colour images searched for in a folder; a file that is given by name may have any."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm")
 
 MAX_BYTES = 2**20 + 16 * MAX_SIDE**2
-"""Largest file, bytes: the largest image with sixteen bytes to a pixel, and some room."""
+"""Largest file, bytes: the largest image at sixteen bytes per pixel, plus some margin."""
 
 PNG_SIGNATURE, EXR_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
 NPY_SIGNATURE, NPZ_SIGNATURE = b"\x93NUMPY", b"PK\x03\x04"
 
 TIFF_ORIENTATION, TIFF_BITS, TIFF_NUMBERS = 274, 258, 339
-"""Tags of how an image lies (1 is upright), of the bits of a number and of its kind (3 is a float)."""
+"""TIFF tags: orientation (1 is upright), bits per sample, and sample format (3 is float)."""
 
 PFM_SCALE = re.compile(rb"(P[fF]\s+\d+\s+\d+\s+-?)\S+(?=\s)")
-"""The head of a PFM image, up to the number whose sign alone tells of its bytes."""
+"""Header of a PFM image up to the sign of its scale, which alone matters: it gives the byte order."""
 
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 
 JPEG_WORDS = ("Corrupt JPEG data", "Premature end of JPEG", "for sequential JPEG", "JFIF revision")
-"""In what libjpeg prints of a file that it decodes all the same."""
+"""Parts of libjpeg's messages about files that it decodes nevertheless."""
 
 JPEG_LOSS = re.compile(
     r"[Pp]remature end|bad (?:Huffman|arithmetic)|instead of RST|before marker 0xd[0-7]|\d{4,} extraneous"
 )
-"""In those of its words that tell of pixels that are not the camera's; some bytes too many at the end, as many cameras
-leave them there, do not."""
+"""Matches those of libjpeg's messages that mean lost pixels; a few extraneous bytes, which many cameras write, do
+not."""
 
 SIGN = 128
-"""From which on the highest byte of a float says that it is negative."""
+"""Sign bit in the highest byte of a float."""
 
 WHITES = (255, 1023, 4095, 16383, 65535)
-"""Full scales of sensors: what 16-bit intensities are measured against."""
+"""Full scales of sensors, by which 16-bit intensities are normalised."""
 
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_color(path: str | Path) -> UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]:
-    """Return a colour image as BGR of 8 or 16 bits; grey has three equal channels, transparency is left out.
+    """Return a colour image as BGR of 8 or 16 bits; grey gives three equal channels, and alpha is dropped.
 
     Raises:
-        FrameError: it is missing, torn, or no image of 8 or 16 bits; the message names it.
+        FrameError: it is missing, truncated, or no image of 8 or 16 bits; the message names it.
     """
     path = Path(path)
     return decode_color(read_bytes(path), str(path))
 
 
 def decode_color(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]:
-    """`read_color` of a file's content; `name` stands in messages."""
+    """Decode the content of a colour image, see `read_color`; `name` is for messages."""
     if data.startswith(NPY_SIGNATURE):
         image = _color_array(_decode_npy(data, name))
     else:
@@ -80,19 +80,20 @@ def decode_color(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | UInt16[
 
 
 def read_depth(path: str | Path) -> Depth:
-    """Return raw depth, as it stands in the file: whole numbers of 16 bits, or float32 for all else.
+    """Return raw depth as stored in the file: 16-bit integers, or float32 for anything else.
 
-    What is no reading (0, 65535, negative, NaN, infinity) is left as it is: see `without_invalid`.
+    Invalid readings (65535, negative, NaN, infinity) are kept: see `without_invalid`. Only negative integers become 0
+    where the image fits 16 bits.
 
     Raises:
-        FrameError: it is missing, torn, or no depth: one channel of 16 bits or more; the message names it.
+        FrameError: it is missing, truncated, or not depth (one channel of at least 16 bits); the message names it.
     """
     path = Path(path)
     return decode_depth(read_bytes(path), str(path))
 
 
 def decode_depth(data: bytes, name: str) -> Depth:
-    """`read_depth` of a file's content; `name` stands in messages."""
+    """Decode the content of a depth image, see `read_depth`; `name` is for messages."""
     if data.startswith(NPY_SIGNATURE):
         image = _decode_npy(data, name)
     elif data.startswith(NPZ_SIGNATURE):
@@ -103,7 +104,7 @@ def decode_depth(data: bytes, name: str) -> Depth:
         image = _unpacked(_decode(data, name, AS_STORED))
     if image.ndim == 3 and image.shape[-1] == 1:
         image = image[..., 0]
-    elif image.ndim == 3 and image.shape[0] == 1:  # as PyTorch has a channel
+    elif image.ndim == 3 and image.shape[0] == 1:  # channel first, as in PyTorch
         image = image[0]
     if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
         found = _describe(image)
@@ -114,15 +115,15 @@ def decode_depth(data: bytes, name: str) -> Depth:
             found += f", a picture of depth{several} as 16 bits or floats"
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
     if image.dtype.kind in "ui" and image.max() <= NO_READING:
-        return np.maximum(image, 0).astype(np.uint16)  # of 16 bits, whatever they are kept in
+        return np.maximum(image, 0).astype(np.uint16)  # fits 16 bits, whatever the stored type
     return to_float32(image)
 
 
 def _unpacked(image: np.ndarray) -> np.ndarray:
-    """The floats that four channels of 8 bits are, as TartanAir packs them, lowest byte first; else the image as it is.
+    """Unpack little-endian floats stored as four 8-bit channels, as by TartanAir; other images are returned unchanged.
 
-    Transparency would be the highest byte, with the sign: no depth has one, and a picture is opaque somewhere or not to
-    be seen at all.
+    In a real RGBA image the alpha channel has its top bit set somewhere, or is 0 everywhere. In packed depth that bit
+    is the sign, which is never set.
     """
     if image.dtype != np.uint8 or image.shape[2:] != (4,) or not 0 < image[..., 3].max() < SIGN:
         return image
@@ -130,24 +131,24 @@ def _unpacked(image: np.ndarray) -> np.ndarray:
 
 
 def to_float32(image: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Convert to single precision; what is too large for it is infinite."""
+    """Convert to single precision; values that are too large become infinite."""
     with np.errstate(over="ignore"):
         return image.astype(np.float32)
 
 
 def to_8_bits(image: Shaped[np.ndarray, "h w *channels"], white: int) -> UInt8[np.ndarray, "h w *channels"]:
-    """Scale intensities so that `white` is 255; 8-bit images come back as they are."""
+    """Scale intensities so that `white` becomes 255; 8-bit images are returned unchanged."""
     return image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255.0 / white)
 
 
 def white_of(image: Shaped[np.ndarray, "h w *channels"]) -> int:
-    """The smallest full scale of a sensor that holds all of an image: 16 bits often hold 10, 12 or 14."""
+    """The smallest full scale that covers an image's intensities: 16-bit images often hold only 10, 12 or 14 bits."""
     most = int(image.max(initial=0))
     return next(white for white in WHITES if most <= white)
 
 
 def without_invalid(depth: Depth) -> np.ndarray:
-    """Return raw depth with 0 where there is no reading: 0, 65535 (of 16 bits), negative, NaN, infinity."""
+    """Return raw depth with invalid readings set to 0: 65535 (of 16 bits), negative, NaN, infinity."""
     if depth.dtype == np.uint16:
         return cv2.threshold(depth, NO_READING - 1, 0, cv2.THRESH_TOZERO_INV)[1] if depth.max() == NO_READING else depth
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -157,7 +158,7 @@ def read_bytes(path: Path) -> bytes:
     """Return a file's content.
 
     Raises:
-        FrameError: it is missing, no file, too large or unreadable.
+        FrameError: it is missing, not a file, too large or unreadable.
     """
     try:
         if path.exists() and not path.is_file():
@@ -183,7 +184,7 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
     data = PFM_SCALE.sub(rb"\g<1>1", data, 1) if data.startswith((b"Pf", b"PF")) else _unturned(data, name)
     image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
-        image = _decoded(data, AS_STORED, name)  # what is whole, but no colour, is to be told by its kind
+        image = _decoded(data, AS_STORED, name)  # an intact image that is not colour: the caller says so
     if image is None:
         raise FrameError(f"{name}: torn or damaged image: get the file anew")
     if max(image.shape[:2]) > MAX_SIDE:
@@ -193,18 +194,18 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
 
 
 def _unturned(data: bytes, name: str) -> bytes:
-    """A file whose image lies as the camera took it.
+    """Reset the orientation tag of a TIFF, which OpenCV would apply; other files are returned unchanged.
 
-    Tags that turn an image are left aside, as colour and depth have to lie alike; of TIFF alone OpenCV follows them.
+    Orientation tags are ignored in all formats, since colour and depth have to be aligned.
 
     Raises:
-        FrameError: a TIFF of a kind that OpenCV does not decode.
+        FrameError: a TIFF of 16-bit floats, which OpenCV does not decode.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return data
     tags: dict[int, int] = {}
-    with contextlib.suppress(struct.error):  # torn: OpenCV will say so
+    with contextlib.suppress(struct.error):  # truncated: OpenCV will fail on it
         (start,) = struct.unpack_from(f"{order}I", data, 4)
         (count,) = struct.unpack_from(f"{order}H", data, start)
         for at in range(start + 2, start + 2 + 12 * count, 12):
@@ -218,9 +219,9 @@ def _unturned(data: bytes, name: str) -> bytes:
 
 
 def _decoded(data: bytes, flags: int, name: str) -> np.ndarray | None:
-    """What OpenCV makes of a file.
+    """Decode a file with OpenCV; None if that fails.
 
-    Of a JPEG that is damaged libjpeg makes up a part, and tells nobody but standard error; it is refused.
+    A damaged JPEG, of which libjpeg makes up a part with no more than a message on stderr, raises `FrameError`.
     """
     with without_lines(*JPEG_WORDS) if data.startswith(JPEG_SIGNATURE) else contextlib.nullcontext([]) as said:
         try:
@@ -252,12 +253,12 @@ SIGNATURES = (
 
 
 def _is_known(data: bytes) -> bool:
-    """Whether a file begins like an image that OpenCV decodes (AVIF names itself a little later)."""
+    """Whether a file begins like an image that OpenCV decodes (AVIF's signature follows at byte 4)."""
     return data.startswith(SIGNATURES) or data[4:12] in (b"ftypavif", b"ftypavis")
 
 
 def _check_png(data: bytes, name: str) -> None:
-    """Refuse a PNG that is too large, or whose chunks are not all whole: OpenCV decodes part of a torn one silently."""
+    """Refuse a PNG that is too large or has a damaged chunk: OpenCV silently decodes part of a truncated one."""
     at = len(PNG_SIGNATURE)
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -282,7 +283,7 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
     file = io.BytesIO(data)
     try:
         image = np.load(file, allow_pickle=False)
-    except Exception as error:  # of many kinds: a damaged header is read as Python
+    except Exception as error:  # of many types: NumPy parses a damaged header as Python
         raise FrameError(f"{name}: not a NumPy array of numbers: {' '.join(str(error).split())[:100]}") from None
     if not 2 <= image.ndim <= 3 or min(image.shape) == 0 or max(image.shape) > MAX_SIDE:
         raise FrameError(f"{name}: not an image: an array of shape {image.shape}")
@@ -292,7 +293,7 @@ def _decode_npy(data: bytes, name: str) -> np.ndarray:
 
 
 def _decode_npz(data: bytes, name: str) -> np.ndarray:
-    """Decode an archive of NumPy arrays: the one named depth, else the only one."""
+    """Decode an archive of NumPy arrays: the array named depth, else the only one."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         named = [entry for entry in archive.infolist() if entry.filename == "depth.npy"]
@@ -305,13 +306,13 @@ def _decode_npz(data: bytes, name: str) -> np.ndarray:
         content = archive.read(chosen[0])
     except FrameError:
         raise
-    except Exception:  # of many kinds, as the archive's compression is
+    except Exception:  # of many types, depending on the compression
         raise FrameError(f"{name}: torn or damaged archive of NumPy arrays: get the file anew") from None
     return _decode_npy(content, name)
 
 
 def _color_array(image: np.ndarray) -> np.ndarray:
-    """BGR of an array, which holds RGB or RGBA as Python has it; what is neither, nor grey, comes back as it is."""
+    """Convert an array of grey, RGB or RGBA to BGR; any other is returned unchanged."""
     if image.ndim == 2 or image.shape[-1] == 1:
         return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=-1)
     return np.ascontiguousarray(image[..., 2::-1]) if image.shape[-1] in (3, 4) else image
@@ -324,19 +325,19 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
         raise FrameError(
             f"{name}: OpenEXR images need the extra [exr] (pip install 'gavo-jax[exr]'), or TIFF or .npy instead"
         ) from None
-    with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library reads nothing but files
+    with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library only reads files
         file.write(data)
         file.flush()
         try:
             with without_words_on(file.name):
                 channels = OpenEXR.File(file.name).channels()
-        except Exception:  # of several kinds, which the library does not document, with words about its own parts
+        except Exception:  # of several undocumented types, with messages about internals
             raise FrameError(f"{name}: torn or damaged OpenEXR image: get the file anew") from None
     return _depth_channel(channels, name)
 
 
 def _depth_channel(channels: Mapping[str, Any], name: str) -> np.ndarray:
-    """Return the channel of an OpenEXR image that its name says is depth, else the only one; colour may be grey."""
+    """Return the channel of an OpenEXR image named as depth, else the only one; equal colour channels count as one."""
     parts = {key: key.lower().split(".") for key in channels}
     named = [key for key in channels if parts[key][-1] in ("z", "d") or any("depth" in part for part in parts[key])]
     chosen = named or list(channels)

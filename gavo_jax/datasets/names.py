@@ -1,4 +1,4 @@
-"""What the names of image files say: which number tells the frames apart, and whether it is a time."""
+"""Parsing of image file names: which number distinguishes the frames, and whether it is a timestamp."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -24,40 +24,40 @@ from gavo_jax.datasets.clocks import (
 from gavo_jax.errors import GavoError
 
 MOST_DIGITS = 15
-"""What is longer is no number of a frame: floats do not tell it from its neighbours."""
+"""Most digits of a frame number: floats cannot represent longer ones exactly."""
 
 DIGITS_OF_A_CLOCK = 10
-"""Those of seconds since 1970; finer ones have more."""
+"""Fewest digits of a clock: those of seconds since 1970; finer units have more."""
 
 FEWEST = 10
-"""Images of each kind, or poses and images, numbered without a gap, of which it is told that the two do not count
-alike."""
+"""Fewest images of each kind (or poses and images), numbered without gaps, for which differing ranges of numbers are
+an error."""
 
 RATES = (2, 3, 4, 5, 6)
-"""How many images of one kind may come for each of the other, where both are of all that their cameras took."""
+"""Ratios of the two cameras' frame rates that are recognised in folders with all images of both."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ T.]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
     r"(?:(?:[.,_-]|(?=(?:\d{3}){1,3}$))(\d{3,9}))?$"
 )
-"""Day and time of day, to the second or finer; what is finer follows a mark, or in 3, 6 or 9 digits at once."""
+"""Date and time, to the second or finer; fractions follow a separator, or directly as 3, 6 or 9 digits."""
 
 TIME_OF_DAY = re.compile(
     r"(.*?)(?<!\d)([01]\d|2[0-3])[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)([-_.,]?)(\d{3}|\d{6}|\d{9})", re.DOTALL
 )
-"""Hours, minutes and seconds without a day, a mark if there is one, and the milliseconds or finer."""
+"""Hours, minutes and seconds without a date, an optional separator, and milliseconds or finer."""
 
 HALF_A_DAY = 43200.0
-"""Seconds: times of a day further apart are of two."""
+"""Largest span of times of one day, seconds; times further apart are of two days."""
 
 SECONDS_AND_REST = re.compile(r"(.*?)(\d+)[-_,: ](\d{9}|\d{6})", re.DOTALL)
-"""Whole seconds and, with their zeros, the nano- or microseconds beside them."""
+"""Whole seconds followed by nano- or microseconds with leading zeros."""
 
 FASTEST_COUNT = 1 / 60
-"""Seconds: even fractions of one second in shorter steps are the numbers of every so many frames, and no camera's."""
+"""Shortest frame interval, seconds: evenly spaced "fractions" of one second in shorter steps are frame numbers."""
 
 REDWOOD = re.compile(r"\d{6,7}-(\d{12})$")
-"""A number and microseconds, as Redwood and SUN3D have it."""
+"""A frame number and microseconds, as in Redwood and SUN3D."""
 
 
 class Found(NamedTuple):
@@ -66,15 +66,15 @@ class Found(NamedTuple):
     color: dict[int, Path]
     depth: dict[int, Path]
     others: tuple[Path, ...] = ()
-    """Without a number."""
+    """Files without a number."""
 
     def unpaired(self, frames: int) -> list[str]:
-        """What makes no frame, a line each."""
+        """Describe the images that are in no frame, one line per kind."""
         return unpaired((len(self.color), len(self.depth)), frames, "of the same number") + nameless(self.others)
 
 
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
-    """What of the colour and depth images makes no frame, a line each."""
+    """Describe how many colour and depth images are in no frame, one line per kind."""
     return [
         f"{count - frames} {one} images: no {other} image {why}"
         for count, one, other in zip(images, ("colour", "depth"), ("depth", "colour"), strict=True)
@@ -83,22 +83,22 @@ def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
 
 
 def nameless(images: Sequence[Path]) -> list[str]:
-    """A line for images without a number in their names, if there are any."""
+    """Describe images without a number in their names, in one line if there are any."""
     return [f"{len(images)} images: no number in their names, as {images[0].name}"] if images else []
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
-    """Images in the order of their names; hidden files, which some systems leave beside each file, are none."""
+    """Images sorted by name; hidden files, which some systems write beside each file, are skipped."""
     return sorted(file for file in files if file.suffix.lower() in suffixes and not file.name.startswith("."))
 
 
 def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
-    """Images by the number that tells them apart: the last in their names, or one before it that more frames share.
+    """Index images by the number that distinguishes them: of those in order, the one that pairs most frames.
 
-    Names without a number are left out.
+    Numbers are counted from the end of the names, and the last is preferred. Names without a number are left out.
 
     Raises:
-        GavoError: no number does, or it goes another way than the names; the message names a file.
+        GavoError: no number is unique and in the order of the names, or `_check_start` fails; the message names a file.
     """
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
     others = tuple(file for file in (*color, *depth) if not _numbers(file))
@@ -114,11 +114,10 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
 
 
 def _check_start(found: Found) -> None:
-    """Refuse enough images of both kinds, each without a gap, that begin with other numbers and end with others, or of
-    which there are `RATES` times as many of one kind.
+    """Refuse gapless ranges of numbers that differ at both ends, or start alike with a ratio of lengths in `RATES`.
 
-    Whether one number or one place in the order is one frame is open then. Of a camera that started, or stopped, later
-    than the other one, the other ends are alike; but of one that is so many times as fast, too.
+    It is then ambiguous whether images pair by number or by order. Where just one camera started or stopped late, one
+    end agrees; but the starts also agree where one camera is several times as fast. Fewer than `FEWEST` images pass.
     """
     color, depth, _ = found
     few, many = sorted(map(len, (color, depth)))
@@ -135,7 +134,7 @@ def _check_start(found: Found) -> None:
 
 
 def _at(place: int, files: Sequence[Path]) -> dict[int, Path]:
-    """Files by the number at a place of their names, from the end."""
+    """Files by the number at a position of their names, counted from the end."""
     return {_numbers(file)[-place]: file for file in files}
 
 
@@ -145,12 +144,12 @@ def _numbers(file: Path) -> list[int]:
 
 
 def _is_in_order(images: dict[int, Path], files: Sequence[Path]) -> bool:
-    """Whether every file has a number of its own, which grows with all numbers of the names."""
+    """Whether every file has a unique number, in the same order as all numbers of the names."""
     return len(images) == len(files) and [images[n] for n in sorted(images)] == sorted(files, key=_numbers)
 
 
 def _fault(files: Sequence[Path]) -> str | None:
-    """Two files of which nothing tells which comes first."""
+    """Describe two files with the same numbers, whose order is unknown; None if there are none."""
     first: dict[tuple[int, ...], Path] = {}
     for file in files:
         if (other := first.setdefault(tuple(_numbers(file)), file)) is not file:
@@ -159,24 +158,23 @@ def _fault(files: Sequence[Path]) -> str | None:
 
 
 class Stamps(NamedTuple):
-    """What names say of time."""
+    """Timestamps read from names."""
 
     seconds: list[float]
     unit: float | None = None
-    """Seconds of what they count, where they are whole numbers."""
+    """Unit that the names count, seconds, where they are whole numbers."""
 
 
 def stamps(names: Sequence[str], unit: float | None = None) -> Stamps | None:
-    """Times, where all names are stamps; None where they are not.
+    """Read names as timestamps; None unless all of them are.
 
-    Stamps are seconds or milliseconds with decimals, day and time or time alone, seconds beside nano- or microseconds,
-    or whole numbers: since 1970 in s, ms, µs or ns, since a device was switched on in ms, µs or ns, or Windows' ticks.
-    Nothing else may change from name to name but an index before them that grows with them, and the rate has to be that
-    of a camera.
+    Stamps are seconds or milliseconds with decimals, date and time or time alone, seconds beside nano- or microseconds,
+    or whole numbers: since 1970 in s, ms, µs or ns, since device start in ms, µs or ns, or Windows ticks. Only an index
+    before the stamp, in the same order, may vary besides, and the rate has to be that of a camera.
 
     Args:
-        names: of one kind of images, without their endings.
-        unit: seconds of what the other kind's names count: these may count it, too, where nothing else is seen in them.
+        names: of one kind of images, without suffixes.
+        unit: unit of the other kind's stamps, seconds; tried where these names show no unit of their own.
     """
     bare = _without_tail(names)
     found = _stamps(names, unit) or _stamps(bare, unit)
@@ -188,26 +186,26 @@ def stamps(names: Sequence[str], unit: float | None = None) -> Stamps | None:
 
 
 def _stamps(names: Sequence[str], unit: float | None) -> Stamps | None:
-    """The same of names that stamps end."""
+    """Read names that end in stamps, see `stamps`."""
     readers = (_redwood, _dates, _times_of_day, _pairs, _decimals)
     seconds = next((found for read in readers if (found := read(names))), None)
     return Stamps(seconds) if seconds else _counts(names, unit)
 
 
 def form(name: str) -> str:
-    """What a name has beside its numbers, of which long ones count by their length: stamps of a clock have one form."""
+    """A name with its numbers masked; only long ones keep their length, so that stamps of one clock have one form."""
     return re.sub(r"\d+", lambda digits: "0" * (len(digits[0]) if len(digits[0]) >= DIGITS_OF_A_CLOCK else 1), name)
 
 
 def _without_tail(names: Sequence[str]) -> list[str]:
-    """Names without what follows the last number that changes, if that is the same in all."""
+    """Remove what follows the last varying number of the names, if it is the same in all."""
     tail = commonprefix([name[::-1] for name in names])[::-1] if len(set(names)) > 1 else ""
     tail = re.sub(r"^\d*([.,]\d+)?", "", tail)  # digits belong to the number
     return [name.removesuffix(tail) for name in names]
 
 
 def _without_index(names: Sequence[str]) -> tuple[list[int], list[str]] | None:
-    """The first number that changes, and what follows it; None where it tells no frames apart, or is a time."""
+    """Split names into the first varying number and the rest; None if that number is not unique, or is a time."""
     head = re.sub(r"\d*$", "", commonprefix(names))
     found = [match for name in names if (match := re.match(r"(\d+)(\D.*)", name.removeprefix(head), re.DOTALL))]
     indices = [int(match[1]) for match in found]
@@ -237,9 +235,9 @@ def _dates(names: Sequence[str]) -> list[float] | None:
 
 
 def _are_frames(dates: Sequence[re.Match[str]]) -> bool:
-    """Whether what seem to be fractions of one second are the numbers of every so many frames.
+    """Whether apparent fractions of one second are frame numbers with a constant step.
 
-    After a point they are fractions. Those of a camera's clock are uneven in their last place, as 033, 067, 100 are.
+    After a decimal point they are fractions. Those of a camera's clock have uneven steps, as in 033, 067, 100.
     """
     fractions = [date[7] or "" for date in dates]
     widths, counts = set(map(len, fractions)), sorted({int(digits or 0) for digits in fractions})
@@ -251,9 +249,9 @@ def _are_frames(dates: Sequence[re.Match[str]]) -> bool:
 
 
 def _times_of_day(names: Sequence[str]) -> list[float] | None:
-    """Times of one day in which a second ends, or a minute where nothing parts milliseconds from the rest.
+    """Read times of one day that span a change of second, or of minute if nothing separates the milliseconds.
 
-    Before that the digits at the end count as any others: they may be the numbers of frames.
+    Without that change the last digits may be frame numbers, and None is returned.
     """
     found = [match for name in names if (match := TIME_OF_DAY.fullmatch(name))]
     if len(found) < len(names) or len({(match[1], match[5], len(match[6])) for match in found}) != 1:
@@ -269,7 +267,7 @@ def _times_of_day(names: Sequence[str]) -> list[float] | None:
 
 
 def _pairs(names: Sequence[str]) -> list[float] | None:
-    """Seconds beside nano- or microseconds: since 1970, or in steps from one second to the next at a camera's rate."""
+    """Read seconds beside nano- or microseconds: since 1970, or in consecutive seconds at a camera's rate."""
     found = [match for name in names if (match := SECONDS_AND_REST.fullmatch(name))]
     forms = {(match[1], len(match[3])) for match in found}
     if not found or len(found) < len(names) or len(forms) > 1 or max(len(match[2]) for match in found) > MOST_DIGITS:
@@ -286,7 +284,7 @@ def _pairs(names: Sequence[str]) -> list[float] | None:
 def _decimals(names: Sequence[str]) -> list[float] | None:
     found = [number.replace(",", ".") for number in _at_the_end(names, r"\d+[.,]\d+")]
     seconds = [float(number) for number in found]
-    if not found or len(set(seconds)) < len(set(found)):  # of 1.1 and 1.10 the second is the tenth of something
+    if not found or len(set(seconds)) < len(set(found)):  # 1.1 and 1.10: the second is item 10
         return None
     seconds = filled_in(found)
     unit = decimal_unit(seconds)
@@ -300,7 +298,7 @@ def _counts(names: Sequence[str], other: float | None) -> Stamps | None:
 
 
 def _at_the_end(names: Sequence[str], pattern: str) -> list[str]:
-    """What ends the names, where all else in them is the same; else nothing."""
+    """The matching ends of the names, if the rest is the same in all; else nothing."""
     found = [re.fullmatch(rf"(.*?)({pattern})", name) for name in names]
     heads = {match[1] for match in found if match}
     return [match[2] for match in found if match] if all(found) and len(heads) == 1 else []

@@ -1,4 +1,4 @@
-"""What libraries of images say past Python, on standard error and output, kept from there and handed to who asks."""
+"""Suppression of messages that image libraries print to stdout and stderr, bypassing Python; callers can get them."""
 
 import contextlib
 import errno
@@ -12,15 +12,15 @@ from functools import cache
 import cv2
 
 EXR_WARNING = "Exception raised reading pixel data"
-"""In what OpenEXR prints of a torn file."""
+"""Part of OpenEXR's message about a truncated file."""
 
 _ASIDE = threading.Lock()
-"""Held by whoever has standard error of the process put aside, and while the process forks."""
+"""Held while the process's stderr is redirected, and while the process forks."""
 
 
 @contextlib.contextmanager
 def without_log() -> Iterator[None]:
-    """Keep OpenCV from saying on standard error, in lines of its own, what is wrong with a file."""
+    """Silence OpenCV's own log messages on stderr about faulty files."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -31,7 +31,7 @@ def without_log() -> Iterator[None]:
 
 @contextlib.contextmanager
 def without_words_on(name: str) -> Iterator[None]:
-    """Leave out the lines that OpenEXR prints while it reads a file; what others print in that time comes after it."""
+    """Suppress the lines that OpenEXR prints while it reads a file; other output of that time is printed afterwards."""
     with without_lines(name):
         said = io.StringIO()
         try:
@@ -44,15 +44,15 @@ def without_words_on(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def without_lines(*words: str) -> Iterator[list[str]]:
-    """Leave out the lines on standard error, where libraries write past Python, that hold one of some words.
+    """Suppress lines on stderr, also those written by libraries directly, that contain one of the words.
 
-    The list that is yielded has them afterwards; what others write in that time comes after it.
+    The yielded list holds them on exit; other lines of that time are written then.
     """
     left_out: list[str] = []
     with _ASIDE:
         try:
             said, kept = _notes(), _standard_error()
-        except OSError:  # no descriptors are left: nothing is put aside
+        except OSError:  # no descriptors left: nothing is redirected
             yield left_out
             return
         try:
@@ -63,7 +63,7 @@ def without_lines(*words: str) -> Iterator[list[str]]:
 
 
 def _standard_error() -> int | None:
-    """Another descriptor of it; None where it is closed."""
+    """Duplicate the descriptor of stderr; None where it is closed."""
     try:
         return os.dup(2)
     except OSError as error:
@@ -74,13 +74,13 @@ def _standard_error() -> int | None:
 
 @cache
 def _notes() -> int:
-    """Descriptor of a file of this process, for what is said meanwhile; it is open as long as the process lives."""
+    """Descriptor of this process's temporary file for redirected stderr, open for the life of the process."""
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
 
 
 def _renew() -> None:
-    """Give a process that was forked a file of its own."""
+    """Make a forked process open its own temporary file."""
     if _notes.cache_info().currsize:
         os.close(_notes())
     _notes.cache_clear()
@@ -92,7 +92,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _restore(kept: int | None, said: int, words: tuple[str, ...], left_out: list[str]) -> None:
-    """Put standard error in its place again, and pass on what was said but for lines with some words."""
+    """Restore stderr, and write the redirected lines to it except those with one of the words."""
     if kept is None:
         os.close(2)
     else:

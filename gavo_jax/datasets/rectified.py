@@ -1,4 +1,4 @@
-"""Frames and sequences as all that follows takes them: plain arrays, without the camera's lens distortion."""
+"""Frames and sequences prepared for tracking: plain arrays without lens distortion."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,11 +16,11 @@ from gavo_jax.trajectory import Trajectory
 
 
 def rectified(frame: Frame, camera: Camera) -> Frame:
-    """A frame of plain arrays, without the camera's lens distortion and without black bars.
+    """A frame of plain arrays, without lens distortion and black bars.
 
     Raises:
         FrameError: An image is not of the camera's size, or not one number per pixel.
-        GavoError: It is no frame.
+        GavoError: `frame` is no Frame.
     """
     if not isinstance(frame, Frame):
         raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
@@ -35,24 +35,24 @@ def rectified_at(sequence: Sequence, index: int) -> Frame:
     """A frame of a sequence, `rectified`, at the sequence's stamp.
 
     Raises:
-        FrameError: It cannot be read, or as `rectified`.
+        FrameError: It cannot be read, or `rectified` refuses it.
     """
     return rectified(sequence[index], sequence.camera.rectified()).at(float(sequence.timestamps[index]))
 
 
 def without_distortion(sequence: Sequence) -> Sequence:
-    """A sequence whose frames have no lens distortion: itself, where they have none."""
+    """Wrap a sequence so that its frames have no lens distortion; one that has none is returned as it is."""
     return Rectified(sequence) if sequence.camera.is_distorted else sequence
 
 
 class Rectified:
-    """A sequence without its lens distortion; what else it has is as it was."""
+    """A sequence with lens distortion removed from its frames; everything else is passed through."""
 
     def __init__(self, recorded: Sequence) -> None:
         self._recorded = recorded
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # a copy asks for some before it has anything
+        if name.startswith("_"):  # looked up by `copy` before __init__
             raise AttributeError(name)
         return getattr(self._recorded, name)
 
@@ -63,12 +63,12 @@ class Rectified:
 
     @property
     def camera(self) -> Camera:
-        """Without distortion."""
+        """Camera of the recording without distortion."""
         return self._recorded.camera.rectified()
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """Truth of the recording."""
+        """Ground truth of the recording."""
         return self._recorded.ground_truth
 
     @property
@@ -85,13 +85,13 @@ class Rectified:
     @overload
     def __getitem__(self, index: slice) -> "Rectified": ...
     def __getitem__(self, index: int | slice) -> "Frame | Rectified":
-        """Decode a frame and take the distortion out, or choose some frames."""
+        """Decode a frame and undistort it, or return the sequence of a slice."""
         if isinstance(index, slice):
             return Rectified(self._recorded[index])
         return rectified(self._recorded[index], self._recorded.camera)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frame after frame."""
+        """Decode and undistort frame after frame."""
         return (self[index] for index in range(len(self)))
 
     def check(self) -> None:

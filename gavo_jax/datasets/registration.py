@@ -1,4 +1,4 @@
-"""Depth of one camera as another sees it: moved to the colour camera's pixels by the calibration of both."""
+"""Registration of depth to colour: depth images are warped into the colour camera by both cameras' calibration."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,30 +10,31 @@ from jaxtyping import Float, UInt16
 from gavo_jax.camera import Camera
 
 FOOTPRINT = 1.1
-"""A reading covers a little more than its share of the colour image: surfaces are seldom seen head-on."""
+"""Factor by which a reading's footprint in the colour image is enlarged: surfaces are seldom seen head-on."""
 
 MARGIN = 8
-"""Pixels: the largest footprint, and how far outside the image a reading may lie that reaches into it."""
+"""Largest footprint, and farthest outside the image that a reading can still reach into it, pixels."""
 
 SAME_SURFACE = 0.03
-"""Share by which two readings of one surface may differ that have one pixel between them."""
+"""Largest relative difference of two readings, two pixels apart, that are of one surface."""
 
 NEVER = np.uint16(65535)
-"""Deeper than any reading."""
+"""Raw depth beyond any reading."""
 
 
 TO_THE_END = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
-"""When the inversion of a lens ends: after its usual five iterations rays of a wide view are off by pixels."""
+"""Termination criteria of undistortion: after OpenCV's default of five iterations rays of a wide view are off by
+pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Moves depth images to the colour camera; where surfaces hide each other, the nearest is seen.
+    """Warps depth images into the colour camera; under occlusion the nearest surface is kept.
 
     Attributes:
         depth: the depth camera as it records.
-        color: the camera to which depth is moved: of frames as they come, rectified or not.
-        color_T_depth: maps points of the depth camera into the colour camera, metres.
+        color: the camera into which depth is warped: that of the frames, rectified or not.
+        color_T_depth: rigid transform from the depth camera to the colour camera, metres.
     """
 
     depth: Camera
@@ -44,8 +45,8 @@ class Registration:
         """Return a depth image as the colour camera sees it.
 
         Args:
-            depth: of the depth camera's size, 0 = no reading.
-            units: per metre, of both images.
+            depth: raw depth of the depth camera's size, 0 = no reading.
+            units: depth units per metre, of both images.
         """
         flat = depth.ravel()
         seen = np.flatnonzero(flat)
@@ -57,12 +58,12 @@ class Registration:
         return self._splat(u, v, moved, [size[seen] for size in self._footprints])
 
     def _points(self, seen: np.ndarray, metres: np.ndarray) -> list[np.ndarray]:
-        """Return where readings lie in the colour camera: x, y, z."""
+        """Return the readings as points in the colour camera: x, y, z."""
         shift = self.color_T_depth[:3, 3].astype(np.float32)
         return [axis[seen] * metres + shift[i] for i, axis in enumerate(self._rays)]
 
     def _pixels(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows of the colour image; NaN for what its lens does not show."""
+        """Project points to columns and rows of the colour image; NaN for those outside the lens's view."""
         camera = self.color
         if not camera.is_distorted:
             return camera.fx * x / z + np.float32(camera.cx), camera.fy * y / z + np.float32(camera.cy)
@@ -76,7 +77,7 @@ class Registration:
         return pixels[:, 0, 0].astype(np.float32), pixels[:, 0, 1].astype(np.float32)
 
     def _splat(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, sizes: list[np.ndarray]) -> np.ndarray:
-        """Draw each reading over the pixels that it covers; the nearest stays."""
+        """Draw each reading over the pixels that it covers, keeping the nearest."""
         height, width = self.color.height, self.color.width
         most = [int(np.ceil(size.max())) for size in self._footprints]
         around = (-MARGIN < u) & (u < width + MARGIN) & (-MARGIN < v) & (v < height + MARGIN)
@@ -96,7 +97,7 @@ class Registration:
 
     @cached_property
     def _footprints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows of the colour image that each pixel of the depth camera covers, seen head-on."""
+        """Size in columns and rows of the colour image of each depth pixel on a surface seen head-on."""
         x, y = (axis.reshape(self.depth.height, self.depth.width) for axis in self._rays[:2])
         columns = FOOTPRINT * np.abs(self.color.fx * np.gradient(x, axis=1))
         rows = FOOTPRINT * np.abs(self.color.fy * np.gradient(y, axis=0))
@@ -117,7 +118,7 @@ class Registration:
 
 
 def _without_cracks(depth: UInt16[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    """Fill pixels that fell between two readings of one surface, as they do where it is seen from aslant."""
+    """Fill single pixels left empty between two readings of one surface, as happens on slanted surfaces."""
     for image in (depth, depth.T):
         before, after = image[:, :-2], image[:, 2:]
         low, high = np.minimum(before, after), np.maximum(before, after)

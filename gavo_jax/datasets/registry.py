@@ -1,4 +1,4 @@
-"""Which kind of source lies at a path: the kinds that are known, and those that other packages bring."""
+"""Recognition of the kind of source at a path: the built-in kinds, and those of other packages."""
 
 import inspect
 from functools import cache
@@ -26,23 +26,23 @@ from gavo_jax.datasets.recordings.bags import BagSequence
 from gavo_jax.errors import GavoError, blamed
 
 PLUGINS = "gavo_jax.datasets"
-"""Group of entry points through which other packages bring kinds of sources."""
+"""Group of entry points by which other packages register kinds of sources."""
 
 
 class Dataset(Protocol):
-    """A kind of source; the class of its sequences itself, mostly."""
+    """A kind of source; usually the class of its sequences."""
 
     @property
     def kind(self) -> str:
-        """What it is called."""
+        """Name of the kind."""
         ...
 
     def recognises(self, path: Path) -> bool:
-        """Whether a folder or file is of this kind, by names alone: quick, and without reading images."""
+        """Whether a folder or file is of this kind; has to be fast, and must not read images."""
         ...
 
     def open(self, path: Path, reading: Reading) -> Sequence:
-        """Return the frames.
+        """Open the sequence at a path.
 
         Raises:
             GavoError: names the file and the fault.
@@ -77,26 +77,26 @@ BUILT_IN: tuple[Dataset, ...] = (
         PlainFolder,
     ),
 )
-"""In the order in which they are asked."""
+"""Built-in kinds, in the order in which they are tried."""
 
 TOPICS = {"--colour-topic", "--depth-topic"}
 
 USELESS: dict[Dataset, set[str]] = {BagSequence: {"--rate"}}
-"""Options that a kind of source, built in, has no use for; of the others `TOPICS`."""
+"""Options that a built-in kind of source cannot use; for kinds not listed, `TOPICS`."""
 
 _registered: list[Dataset] = []
 
 
 def register_dataset(dataset: Dataset) -> None:
-    """Add a kind of source of one's own; it is asked before those that are built in.
+    """Register a custom kind of source; it is tried before the built-in ones.
 
-    A package that is installed can do without a call: an entry point of the group `gavo_jax.datasets` leads to it.
+    An installed package needs no call: an entry point in the group `gavo_jax.datasets` registers its kind.
 
     Args:
-        dataset: has `kind` (what it is called), `recognises(path) -> bool` and `open(path, reading) -> Sequence`.
+        dataset: has `kind` (its name), `recognises(path) -> bool` and `open(path, reading) -> Sequence`.
 
     Raises:
-        GavoError: it lacks one of these, or one cannot be called so.
+        GavoError: it lacks one of these, or a method cannot be called with these arguments.
     """
     _require_dataset(dataset)
     if dataset not in _registered:
@@ -104,7 +104,7 @@ def register_dataset(dataset: Dataset) -> None:
 
 
 CALLS = {"recognises": ("path",), "open": ("path", "reading")}
-"""What a kind of source is asked, and with what."""
+"""Methods of a kind of source, and their arguments."""
 
 
 def _require_dataset(dataset: Any) -> None:
@@ -120,19 +120,19 @@ def _require_dataset(dataset: Any) -> None:
         except TypeError:
             hint = ": a classmethod is needed, or an object of the class" if isinstance(dataset, type) else ""
             raise GavoError(f"dataset {name}: {form} cannot be called so{hint}") from None
-        except ValueError:  # nothing tells what it takes
+        except ValueError:  # no signature available
             pass
 
 
 def datasets() -> tuple[Dataset, ...]:
-    """All kinds of sources, in the order in which they are asked."""
+    """All kinds of sources, in the order in which they are tried."""
     faulty_plugins()
     return (*_registered, *BUILT_IN)
 
 
 @cache
 def faulty_plugins() -> tuple[str, ...]:
-    """Register what installed packages bring; what is wrong with those that cannot be loaded."""
+    """Register the kinds of installed packages, and return an error message for each that cannot be loaded."""
     faults = []
     for entry in entry_points(group=PLUGINS):
         try:
@@ -144,14 +144,14 @@ def faulty_plugins() -> tuple[str, ...]:
 
 
 def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
-    """Return the frames of a folder or file, whatever kind of source it is.
+    """Open a folder or file of any known kind as a sequence.
 
     Args:
         path: a folder in the layout of a dataset, or a file.
-        reading: camera, units, rate and what else the source does not say itself.
+        reading: camera, units, rate and anything else that the source does not state itself.
 
     Raises:
-        GavoError: there is nothing, nothing that is known, or the source is faulty.
+        GavoError: the path does not exist, its kind is unknown, or the source is faulty.
     """
     path, reading = Path(path), Reading() if reading is None else reading
     if not isinstance(reading, Reading):
@@ -169,7 +169,7 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
 
 
 def _open_others(dataset: Dataset, path: Path, reading: Reading) -> Sequence:
-    """What a dataset of somebody's own opens: what it raises, or gives in place of a sequence, is its fault."""
+    """Open a source of a custom kind; an exception, or a result that is no sequence, is blamed on that kind."""
     whose = f"dataset {dataset.kind!r}: {path}"
     with blamed(whose):
         sequence = dataset.open(path, reading)
@@ -179,10 +179,10 @@ def _open_others(dataset: Dataset, path: Path, reading: Reading) -> Sequence:
 
 
 def recognise(path: Path) -> Dataset:
-    """The kind of source that lies at a path.
+    """The kind of source at a path.
 
     Raises:
-        GavoError: none that is known; the message says what is there instead.
+        GavoError: no known kind; the message says what is there instead.
     """
     dataset, faults = _asked(path)
     if dataset is not None:
@@ -192,7 +192,7 @@ def recognise(path: Path) -> Dataset:
 
 
 def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
-    """The kind of source that lies at a path, and what is wrong with those of packages that were passed over."""
+    """The kind of source at a path or None, and the errors of custom kinds that failed before."""
     faults: list[str] = []
     for dataset in datasets():
         try:
@@ -207,12 +207,12 @@ def _asked(path: Path) -> tuple[Dataset | None, list[str]]:
 
 
 def source_around(path: Path) -> Path | None:
-    """The folder of the source that a file or folder is a part of; None where it is of none."""
+    """The folder of the source that a file or folder belongs to; None if there is none."""
     return unrecognised.source_around(path, _is_source)
 
 
 def _is_source(path: Path) -> bool:
-    """Whether a source of a known kind is at a path; none is where nobody can look: behind a link in a circle, say."""
+    """Whether a path holds a source of a known kind; False if it cannot be accessed (a circular link, say)."""
     try:
         return _asked(path)[0] is not None
     except GavoError:

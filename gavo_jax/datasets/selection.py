@@ -1,4 +1,4 @@
-"""Which frames of which source, by name."""
+"""Selection of a source by name, and of a range of its frames."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from gavo_jax.errors import GavoError
 
 SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES = 40
-"""Unless it is said how many: the drift over one second needs a little more than a second of them."""
+"""Default number of synthetic frames: drift over one second needs slightly more than a second of frames."""
 
 
 def open_part(
@@ -25,21 +25,21 @@ def open_part(
     force: bool = False,
     moving: int = 0,
 ) -> Sequence:
-    """Return the chosen frames, checked as far as that is possible before a run.
+    """Return the chosen frames, checked as far as possible before a run.
 
     Args:
         source: A folder or file that `open_source` knows, or the word synthetic.
         camera: "auto", or what `load_camera` takes.
         start: First frame, from 0.
-        frames: How many, at least 2; all that there are if left out.
-        stride: Take every so-manieth frame, from 1.
-        reading: What else is to be known of the source; its own camera does not count.
-        force: Whether depth that looks as if its scale were wrong is taken all the same.
-        moving: How many bodies move through the synthetic room.
+        frames: Number of frames, at least 2; all of them if None.
+        stride: Take every `stride`-th frame, from 1.
+        reading: Further options for reading the source; its `camera` is ignored.
+        force: Whether to accept depth that is missing, or whose scale looks wrong.
+        moving: Number of bodies that move through the synthetic room.
 
     Raises:
-        GavoError: what is wrong with the source or its camera; fewer than two frames; a depth scale that is wrong by 5
-            or 1000, as the first frames look.
+        GavoError: the source or its camera is faulty; fewer than two frames are chosen; no depth in the frames that are
+            sampled, or a depth scale that looks wrong (by 5 or 1000, say).
     """
     reading = reading or Reading()
     if source == SYNTHETIC and (given := reading.given()):

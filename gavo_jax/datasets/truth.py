@@ -1,4 +1,4 @@
-"""The true trajectory that lies beside the frames: TUM's, ICL-NUIM's and Redwood's files, and matrices."""
+"""Readers of the ground truth beside the frames: files of TUM, ICL-NUIM and Redwood, and pose matrices."""
 
 import fnmatch
 import re
@@ -16,60 +16,60 @@ from gavo_jax.se3 import rigid
 from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
 
 TRUTH = "groundtruth.txt"
-"""In TUM's form."""
+"""Name of a ground truth in TUM's format."""
 
 OTHER_NAMES = re.compile(
     r"(.*[-_])?(gt|ground[-_]?truth|(cam(era)?)?poses?|traj|trajectory|extrinsics?)(_left)?\.(txt|csv|tum|log)"
     r"|\d+\.pose",
     re.IGNORECASE,
 )
-"""Files that look like one, and are not looked for: their form is open. The last one is of UW's RGB-D Scenes."""
+"""Files that look like a trajectory, but aren't read, as their format is unknown. The last is of UW's RGB-D Scenes."""
 
 OTHER_FOLDERS = re.compile(r"(.*[-_])?(poses?|traj|trajectory|extrinsics?)", re.IGNORECASE)
-"""Folders that look as if they held one."""
+"""Folders that look as if they held a trajectory."""
 
 NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
 
 LOG = "trajectory.log"
-"""In Redwood's form, which Open3D writes, too."""
+"""Name of a trajectory in Redwood's format, which Open3D also writes."""
 
 ICL = "*.gt.freiburg"
-"""In TUM's form, of ICL-NUIM: the numbers of frames for stamps, and y points up."""
+"""ICL-NUIM's trajectory: TUM's format with frame numbers for stamps, and y pointing up."""
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-"""Between ICL-NUIM's world and cameras, whose y points up as the negative fy of its page says, and those of its images,
-whose rows run from the top as everywhere. Both sides of a pose turn over, so that it stays a rotation and a shift."""
+"""Converts between ICL-NUIM's axes, with y up (hence the negative fy on its page), and those of its images, with y
+down. It is applied to both sides of a pose, which thus stays a rigid transform."""
 
 SKEWED = 0.01
-"""A pose of which a number is off the nearest rigid transform's by more is none."""
+"""Largest deviation of any element of a pose from the nearest rigid transform."""
 
 MAX_POSE_BYTES = 4096
 
 MILLISECOND = 1e-3
-"""Seconds."""
+"""A millisecond in seconds."""
 
 MAX_NUMBER = 10**18
-"""Largest number of a frame."""
+"""Upper bound of frame numbers."""
 
 LARGEST = 1e10
-"""Of a file of poses, seconds since 1970 included."""
+"""Largest value in a file of poses, including seconds since 1970."""
 
 Seconds = Callable[[np.ndarray], np.ndarray]
-"""Times of frames by their numbers."""
+"""Maps frame numbers to times, seconds."""
 
 
 def truth_in(
     folder: Path, frames: Iterable[float], seconds: Seconds | None, depth: Mapping[int, float] | None = None
 ) -> Trajectory | None:
-    """The true trajectory that lies in a folder, if one does.
+    """Read the ground truth in a folder; None if there is none.
 
     Args:
-        folder: of the frames.
-        frames: their stamps, seconds. Of all that the truth's stamps may count, they count what meets these best.
-        seconds: times of frames by their numbers, where they have no stamps: a truth of whole numbers counts them, too,
-            where these are no stamps since 1970. Else such a truth counts what gives its poses a rate: seconds, milli-,
-            micro- or nanoseconds.
-        depth: time of each depth image by its number, where one may be in Redwood's form.
+        folder: folder of the frames.
+        frames: their stamps, seconds. Of the possible units of the truth's stamps, the one that overlaps these best is
+            chosen.
+        seconds: maps frame numbers to times, where frames have no stamps. A truth whose stamps are whole numbers may
+            then count frames; that is preferred unless they look like stamps since 1970.
+        depth: time of each depth image by its number, if a truth may be in Redwood's format.
 
     Raises:
         GavoError: it cannot be read.
@@ -86,7 +86,7 @@ def truth_in(
 
 
 def _timed(truth: Trajectory, place: Path, frames: list[float], seconds: Seconds | None) -> Trajectory:
-    """A truth with its stamps in seconds."""
+    """Convert the stamps of a ground truth to seconds."""
     stamps = truth.timestamps
     known = clock_unit(stamps.tolist())
     readings = [np.array(in_seconds(stamps.tolist(), counted_in(truth)))]
@@ -97,19 +97,19 @@ def _timed(truth: Trajectory, place: Path, frames: list[float], seconds: Seconds
     low, high = min(frames), max(frames)
 
     def met(reading: np.ndarray) -> float:
-        """Share of the frames' time, to a tenth."""
+        """Share of the frames' time span that the stamps overlap, rounded to a tenth."""
         return round(float(min(high, reading.max()) - max(low, reading.min())) / max(high - low, MILLISECOND), 1)
 
     return replace(truth, timestamps=max(readings, key=lambda reading: max(met(reading), 0.0)))
 
 
 def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seconds) -> int:
-    """Return by how much the numbers of a truth are behind those of the images.
+    """Return the offset from a truth's frame numbers to those of the images.
 
-    As many poses as images, each without a gap, are those of the images in their order.
+    Where there are as many poses as images, both without gaps, they pair in order.
 
     Raises:
-        GavoError: one counts from 0 and the other from 1, and no end is alike: which pose is an image's is open.
+        GavoError: one counts from 0 and the other from 1, and the ends differ too: the pairing is ambiguous.
     """
     images = _numbers(frames, seconds)
     if images is None or not (_is_without_gap(numbers) and _is_without_gap(images)):
@@ -125,13 +125,13 @@ def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seco
 
 
 def _numbers(frames: list[float], seconds: Seconds) -> np.ndarray | None:
-    """Those of frames with these times, where one number is as long as the other."""
+    """The frame numbers at these times; None where `seconds` is not evenly spaced."""
     stamps = np.sort(frames)
     try:
         start, second = seconds(np.array([0.0, 1.0]))
         numbers = np.round((stamps - start) / (second - start))
         is_even = np.allclose(seconds(numbers), stamps, rtol=0, atol=(second - start) / 10)
-    except GavoError:  # a clock that ends before
+    except GavoError:  # beyond the end of the clock
         return None
     return numbers if is_even else None
 
@@ -141,13 +141,13 @@ def _is_without_gap(numbers: np.ndarray) -> bool:
 
 
 def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") -> list[str]:
-    """A line for a file or folder of poses that is not read, where there is no other: it may be the true trajectory, or
-    is none. What a run has written into the folder of its source is passed over.
+    """List files and folders of poses that aren't read, one line for each form of name, with advice; none if a truth
+    was read. What a run has written into its source's folder is passed over.
 
     Args:
-        folder: of the frames.
-        truth: that which was read.
-        estimates: the names, as of `glob`, of what the program has found that wrote the folder.
+        folder: folder of the frames.
+        truth: the ground truth that was read, if any.
+        estimates: glob pattern of poses estimated by the program that wrote the folder.
     """
     entries = [] if truth is not None else sorted(folder.iterdir())
     found = set(fnmatch.filter((entry.name for entry in entries), estimates))
@@ -164,7 +164,7 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
 
 
 def _how_to_name(folder: Path, names: list[str]) -> str:
-    """What makes the truth of a file or a folder of poses, or of a file for each frame, named alike."""
+    """Describe how to make a file or folder of poses, or one file per frame, the ground truth."""
     path, into = folder / names[0], f"write it as rows of timestamp tx ty tz qx qy qz qw into {TRUTH}"
     if len(names) > 1:
         return f"{names[0]} and {len(names) - 1} more: if they are the true trajectory, {into}"
@@ -178,13 +178,13 @@ def _how_to_name(folder: Path, names: list[str]) -> str:
 
 
 def counted_in(trajectory: Trajectory) -> float:
-    """Seconds of what stamps count: since 1970, or as whole numbers whose steps have the rate of a camera."""
+    """The unit of a trajectory's stamps, seconds: as whole numbers at a camera's rate, or as stamps since 1970."""
     stamps = trajectory.timestamps.tolist()
     return (_are_whole(trajectory) and unit_of(stamps)) or clock_unit(stamps) or 1.0
 
 
 def icl_truth(folder: Path) -> Path | None:
-    """The file of ICL-NUIM's trajectory in a folder.
+    """The ICL-NUIM trajectory in a folder; None if there is none.
 
     Raises:
         GavoError: there are several.
@@ -213,20 +213,20 @@ def _are_whole(truth: Trajectory) -> bool:
 
 
 def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
-    """Read a trajectory of blocks of five lines: three numbers, of which the third is the frame's, and a 4×4 matrix.
+    """Read a Redwood trajectory: blocks of three numbers, of which the third is the frame's, and a 4×4 matrix.
 
-    The third number counts depth images from 1. Where the images' own numbers count from 0 it is one ahead; and where
-    it fits neither way, but there are as many poses as images, it is that of a piece of a longer recording.
+    The third number counts depth images from 1, so it is one ahead where the images' own numbers start from 0. Where
+    neither fits, but there are as many poses as images, they pair in order (as in part of a longer recording).
 
     Args:
         path: the file.
-        times: of depth images by their numbers, seconds.
+        times: times of depth images by their numbers, seconds.
 
     Returns:
-        Poses that are finite; None where none is.
+        The finite poses; None if there are none.
 
     Raises:
-        GavoError: malformed; the message names file and line. Or its frames are not those of `times`.
+        GavoError: it is malformed (the message names file and line), or its frames are not those of `times`.
     """
     blocks, poses = _blocks(path), {}
     for frame, (place, fields) in blocks.items():
@@ -249,7 +249,7 @@ def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
 
 
 def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
-    """Sixteen fields, with their place, by the third number of each block."""
+    """The sixteen matrix fields and the location (file:line) of each block, by its third number."""
     rows, blocks = data_rows(path), {}
     if not rows:
         raise GavoError(f"{path}: holds no trajectory (no rows)")
@@ -266,7 +266,7 @@ def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
 
 
 def pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """Poses by the last number in the names of their files."""
+    """Read one pose per file; the last number in a file's name is the frame's."""
     poses = {}
     for file in files:
         numbers = re.findall(r"\d+", file.name)
@@ -277,15 +277,15 @@ def pose_files(files: Iterable[Path]) -> dict[int, Float[np.ndarray, "4 4"]]:
 
 
 def pose_in(file: Path) -> Float[np.ndarray, "4 4"] | None:
-    """The pose that a file of its own holds; see `pose_of`."""
+    """Read the pose in a file; see `pose_of`."""
     return pose_of(str(file), [field for _, row in data_rows(file, MAX_POSE_BYTES) for field in row])
 
 
 def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | None:
-    """A rigid transform from sixteen numbers, row by row; None where it is not finite: the frame was not tracked.
+    """Parse a rigid transform of sixteen numbers in row-major order; None if not finite (the frame was not tracked).
 
     Raises:
-        GavoError: no sixteen numbers, or no rigid transform.
+        GavoError: not sixteen numbers, or not a rigid transform.
     """
     try:
         matrix = np.array([number(field) for field in fields]).reshape(4, 4)
@@ -303,16 +303,16 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
 
 
 def by_stamp(poses: Mapping[float, Float[np.ndarray, "4 4"]]) -> Trajectory:
-    """The trajectory of poses, of one at least, by their stamps."""
+    """Make a trajectory of at least one pose, given by stamp."""
     stamps = sorted(poses)
     return Trajectory(np.array(stamps), np.stack([poses[stamp] for stamp in stamps]))
 
 
 def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | None:
-    """The numbers of a row; None where they are not all finite.
+    """Parse the numbers of a row; None if not all are finite.
 
     Raises:
-        GavoError: there are not so many, or it is text.
+        GavoError: not `count` numbers, or one is too large.
     """
     try:
         values = [number(field) for field in fields]
@@ -328,7 +328,7 @@ def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | N
 
 
 def posed(values: Sequence[float]) -> Float[np.ndarray, "4 4"] | None:
-    """The pose of tx ty tz qx qy qz qw; None where the quaternion is zero."""
+    """The pose of tx ty tz qx qy qz qw; None if the quaternion is zero."""
     if np.linalg.norm(values[3:]) < SHORTEST_QUATERNION:
         return None
     pose = np.eye(4)
@@ -337,10 +337,10 @@ def posed(values: Sequence[float]) -> Float[np.ndarray, "4 4"] | None:
 
 
 def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list[str]]]:
-    """Sixteen fields of each pose in a file, row by row, with their places, by the numbers of their images.
+    """Read the poses in a file as frame number, location (file:line) and fields.
 
-    They are those of the images in their order, where there are as many, else all numbers from 0. A pose has a row to
-    itself, or four rows of four numbers.
+    If there are as many poses as images, they pair in order; else poses are numbered from 0. A pose takes one row, or
+    four rows of four numbers.
 
     Raises:
         GavoError: there is no row.

@@ -1,4 +1,4 @@
-"""What lies at a path where no source is, in words that help: each guess says something, or leaves it to the next."""
+"""Helpful messages for a path that holds no known source: each guess returns a message, or None to let the next try."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +30,7 @@ PACKED = {
     ".zst": "zstd -d",
     ".zstd": "zstd -d",
 }
-"""Endings of files from which a source is to be unpacked first, and by what."""
+"""Suffixes of archives, and the command that unpacks each."""
 
 RECORDINGS = {
     ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
@@ -41,7 +41,7 @@ RECORDINGS = {
     ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
     ".klg": "a log of ElasticFusion's logger: write its images and depth first",
 }
-"""What holds a source in a form of its maker's alone."""
+"""Suffixes of proprietary recordings, and how to convert each."""
 
 ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as .npy of one frame each"
 
@@ -63,34 +63,34 @@ MODEL = "a model or a cloud of points, without the images that it was made of"
 DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 
 WHAT_OF = re.compile(r"^(?:drive|export|recording|scan|scene) of ")
-"""What the names of kinds begin with, and lists of all of them leave out."""
+"""Beginnings of the names of kinds that are left out of lists."""
 
 LOOKED_INTO = 200
 """Folders two levels down that are looked into."""
 
 SHOWN = 5
-"""Names that a message lists."""
+"""Number of names that a message lists."""
 
 
 class Place(NamedTuple):
-    """A path at which no source is."""
+    """A path that holds no source."""
 
     path: Path
     inside: list[Path]
-    """What a folder holds, in the order of its names."""
+    """Contents of the folder, sorted by name."""
     kinds: str
-    """The kinds of sources that are known."""
+    """The known kinds of sources."""
     is_source: Callable[[Path], bool]
-    """Whether a source is at another path."""
+    """Tells whether another path holds a source."""
 
 
 def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]) -> str:
-    """What lies at a path where no source is, in a few words.
+    """Describe in a few words what is at a path that holds no source.
 
     Args:
-        path: Of a file or folder.
-        kinds: The kinds of sources that are known.
-        is_source: Whether one of them is at another path.
+        path: A file or folder.
+        kinds: The known kinds of sources.
+        is_source: Tells whether another path holds one of them.
     """
     known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (SUN3D's, too)"
     if not path.is_dir():
@@ -102,7 +102,7 @@ def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]
 
 
 def source_around(path: Path, is_source: Callable[[Path], bool]) -> Path | None:
-    """The folder of the source that a file or folder is a part of; None where it is of none."""
+    """The folder of the source that a file or folder belongs to; None if there is none."""
     return next((folder for folder in list(path.absolute().parents)[:2] if is_source(folder)), None)
 
 
@@ -269,11 +269,11 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _further_down,
     _folder,
 )
-"""What may be said of a folder, in the order in which it is tried; the last one always has words."""
+"""Guesses about a folder, in the order in which they are tried; the last one always returns a message."""
 
 
 def _in_file(file: Path) -> str | None:
-    """How what a file holds becomes a source, where its name tells."""
+    """Describe how to turn a file into a source, judged by its name; None where the name tells nothing."""
     before, last = ["", "", *(suffix.lower() for suffix in file.suffixes)][-2:]
     if (before, last) == (".bag", ".active"):
         return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"

@@ -1,1 +1,1 @@
-"""Frames as a device gives them, the newest first."""
+"""Live capture from cameras, which always delivers the newest frame."""

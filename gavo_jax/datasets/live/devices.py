@@ -1,4 +1,4 @@
-"""Live devices by name: the words that stand for a camera where a source is asked for."""
+"""Registry of live devices: the names that can be given in place of a recorded source."""
 
 from collections.abc import Callable
 
@@ -10,14 +10,14 @@ _devices: dict[str, Callable[[], LiveDevice]] = {realsense.NAME: realsense.RealS
 
 
 def register_device(name: str, opened: Callable[[], LiveDevice]) -> None:
-    """Give a device of one's own a name: `gavo run NAME` then tracks its frames as they come.
+    """Register a custom device by name: `gavo run NAME` then tracks its frames live.
 
     Args:
-        name: the word; one that is registered again gets the new device.
-        opened: returns the device, ready to be read.
+        name: name of the device; registering it again replaces the device.
+        opened: function that opens the device and returns it, ready to be read.
 
     Raises:
-        GavoError: the name is no word, or nothing can be called.
+        GavoError: the name is empty or no text, or `opened` cannot be called.
     """
     if not (isinstance(name, str) and name):
         raise GavoError(f"live device: name: a word is needed, not {shown(name)}")
@@ -27,12 +27,12 @@ def register_device(name: str, opened: Callable[[], LiveDevice]) -> None:
 
 
 def is_live(source: str) -> bool:
-    """Whether a source is a device's name."""
+    """Whether a source is the name of a live device."""
     return source in _devices
 
 
 def open_device(name: str) -> LiveDevice:
-    """Open the device of a name.
+    """Open a device by name.
 
     Raises:
         GavoError: there is none of that name, or it cannot be opened.

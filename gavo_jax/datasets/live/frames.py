@@ -1,4 +1,4 @@
-"""Frames as a camera delivers them: checked, rectified, and the newest one where they come faster than is tracked."""
+"""Frames from a live camera: checked, rectified, and dropped when they arrive faster than they are tracked."""
 
 import threading
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from gavo_jax.image.numbers import as_array
 
 
 class LiveImages(NamedTuple):
-    """What a device hands over at one moment."""
+    """A pair of images from a device."""
 
     color: np.ndarray
     """RGB of uint8 [H, W, 3], or grey [H, W]."""
@@ -30,16 +30,16 @@ class LiveImages(NamedTuple):
 
 
 class LiveDevice(Protocol):
-    """A camera, or whatever stands for one."""
+    """A live camera, or a stand-in for one."""
 
     @property
     def name(self) -> str:
-        """Short, for tables and folders."""
+        """Short name for tables and folders."""
         ...
 
     @property
     def camera(self) -> Camera:
-        """The camera as it records: with its distortion."""
+        """The camera as it records, with distortion."""
         ...
 
     def read(self) -> LiveImages | None:
@@ -51,12 +51,12 @@ class LiveDevice(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device; a `read` that waits returns."""
+        """Release the device; a `read` that is waiting returns."""
         ...
 
 
 LEAST_UNITS = 500.0
-"""Whole units per metre to which depth in metres is rounded; of a camera with fewer, metres say, it stays as it is."""
+"""Fewest depth units per metre at which float depth is rounded to whole units; in coarser ones it stays float."""
 
 
 def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
@@ -97,15 +97,15 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
 
 @dataclass
 class Newest:
-    """The newest images of a device: a thread takes what comes, and what is not asked for in time is dropped.
+    """Iterates over the newest images of a device: a thread reads them, and those not consumed in time are dropped.
 
-    An odometry that fell behind a camera would never catch up, and its pose would be of ever longer ago. So a frame
-    that is not yet taken when the next one comes makes room for it, and is counted.
+    Otherwise, an odometry slower than the camera would lag ever further behind. So the next frame replaces one that is
+    still waiting, which is counted as dropped.
 
     Attributes:
-        device: it is closed in the end.
-        received: images that came so far.
-        dropped: of these, those that made room for a newer one.
+        device: the device; it is closed on exit.
+        received: number of images received so far.
+        dropped: number of those replaced by a newer one.
     """
 
     device: LiveDevice
@@ -118,7 +118,7 @@ class Newest:
     _thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
-        """Begin to take images."""
+        """Start the thread that reads images."""
         self._thread = threading.Thread(target=self._take, name=f"reads {self.device.name}", daemon=True)
         self._thread.start()
         return self
@@ -131,15 +131,15 @@ class Newest:
             self._thread.join(timeout=5.0)
 
     def __iter__(self) -> Iterator[LiveImages]:
-        """The newest images, whenever they are asked for; waits for some.
+        """Yield the newest images each time, waiting for them if there are none yet.
 
         Raises:
-            GavoError: what the device raised.
+            GavoError: the device failed.
         """
         while True:
             with self._changed:
                 while self._waiting is None and not self._ended:
-                    self._changed.wait(timeout=0.1)  # a wait without end would not hear Ctrl-C everywhere
+                    self._changed.wait(timeout=0.1)  # an unlimited wait would block Ctrl-C on some systems
                 images, self._waiting = self._waiting, None
                 if images is None:
                     if self._fault is not None:

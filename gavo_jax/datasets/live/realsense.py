@@ -1,4 +1,4 @@
-"""A camera of Intel's RealSense line, through the library pyrealsense2 (extra `[realsense]`)."""
+"""Intel RealSense cameras, through the library pyrealsense2 (extra `[realsense]`)."""
 
 from dataclasses import asdict, replace
 from typing import Any
@@ -14,21 +14,21 @@ from gavo_jax.libusb import import_with_libusb
 NAME = "realsense"
 
 SIZE, RATE = (640, 480), 30
-"""Pixels and frames per second that every camera of the line delivers."""
+"""Image size, pixels, and frames per second that every RealSense camera supports."""
 
 PATIENCE = 5000
-"""Milliseconds without a frame after which the camera counts as gone."""
+"""Timeout for a frame, milliseconds, after which the camera is considered gone."""
 
 METRES_PER_UNIT = 1e-3
-"""Metres per unit of depth, where the camera does not say."""
+"""Metres per unit of depth, where the camera does not state it."""
 
 
 class RealSense:
-    """Colour and depth of the first camera that is found, depth registered to colour by the SDK.
+    """Colour and depth of the first camera found, with depth registered to colour by the SDK.
 
     Attributes:
         name: realsense.
-        camera: its factory calibration of colour, distortion included.
+        camera: factory calibration of the colour camera, with distortion.
     """
 
     name = NAME
@@ -39,10 +39,10 @@ class RealSense:
         Args:
             size: width and height, pixels.
             rate: frames per second.
-            sdk: stands for the library, in tests.
+            sdk: stand-in for the library in tests.
 
         Raises:
-            GavoError: the library is not installed, there is no camera, or it does not deliver such frames.
+            GavoError: the library is not installed, there is no camera, or it does not support this size and rate.
         """
         self._sdk = _import_sdk() if sdk is None else sdk
         rs = self._sdk
@@ -70,7 +70,7 @@ class RealSense:
                 return None
             raise GavoError(f"{NAME}: the camera delivers no more frames: {error}") from None
         color, depth = frames.get_color_frame(), frames.get_depth_frame()
-        # the SDK's buffers are its own and few: what is kept has to be copied
+        # copied, since the SDK reuses its few buffers
         return LiveImages(
             np.array(color.get_data()),
             np.array(depth.get_data()),
@@ -86,14 +86,14 @@ class RealSense:
 
 
 def camera_of(intrinsics: Any, depth_scale: float) -> Camera:
-    """A camera of the SDK's intrinsics.
+    """Convert the SDK's intrinsics to a `Camera`.
 
     Args:
-        intrinsics: of the colour stream.
+        intrinsics: intrinsics of the colour stream.
         depth_scale: raw depth units per metre.
 
     Raises:
-        GavoError: a lens model that is none of ours.
+        GavoError: the lens model is not supported.
     """
     camera = Camera(
         intrinsics.fx,
