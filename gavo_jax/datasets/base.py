@@ -104,18 +104,18 @@ MOST_DELAY = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D image, its arrays of any numbers: bytes and 16 bits are those that `Odometry.warm_up` compiles for.
+    """One RGB-D image. Arrays may have any number type; `Odometry.warm_up` compiles for 8-bit grey and 16-bit depth.
 
     Attributes:
         grey: intensities, 0 to 255.
-        depth: raw depth along z, registered to `grey`; metres = depth / camera.depth_scale. 0, and of 16 bits 65535,
-            is no reading.
-        timestamp: of the colour image, seconds.
-        color: RGB, where the sequence was asked for it.
-        depth_timestamp: of the depth image, seconds, where it is known: the two are not exposed together.
+        depth: raw depth along z, registered to `grey`; metres = depth / camera.depth_scale. 0, and 65535 in 16-bit
+            images, is no reading.
+        timestamp: stamp of the colour image, seconds.
+        color: RGB, if the sequence was asked for it.
+        depth_timestamp: stamp of the depth image, seconds, if known: the two are not exposed together.
 
     Raises:
-        GavoError: A stamp is no number.
+        GavoError: A stamp is not a number.
     """
 
     grey: UInt8[np.ndarray, "height width"]
@@ -131,7 +131,7 @@ class Frame:
 
     @property
     def depth_delay(self) -> float:
-        """Seconds from the colour image to the depth image; 0 where that is not known, or beyond `MOST_DELAY`."""
+        """Seconds from the colour image to the depth image; 0 if unknown, or beyond `MOST_DELAY`."""
         delay = 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
         return delay if abs(delay) <= MOST_DELAY else 0.0
 

@@ -69,8 +69,8 @@ def download(name: str, to: str | Path, server: str = SERVER, progress: Progress
         The sequence's folder.
 
     Raises:
-        GavoError: unknown name, no connection, the server refuses or keeps breaking off, the archive is damaged or would
-            write outside its folder, the disk is full, or pooch is missing.
+        GavoError: unknown name, no connection, the server refuses or keeps breaking off, the archive is damaged or
+            would write outside its folder, the disk is full, or pooch is missing.
     """
     folder = folder_of(name)
     target = Path(to) / folder

@@ -1,1 +1,1 @@
-"""How folders of image files lie, each dataset in its own way."""
+"""Folder layouts of datasets stored as image files."""

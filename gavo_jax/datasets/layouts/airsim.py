@@ -23,23 +23,23 @@ from gavo_jax.trajectory import Trajectory
 RECORDING = "airsim_rec.txt"
 
 IMAGE = re.compile(r"img_([^/\\]*)_(\d+)_\d+\.\w+")
-"""The name of an image: vehicle and camera, the number of its kind, and nanoseconds of the machine's clock."""
+"""Name of an image: vehicle and camera, image type, and nanoseconds of the machine's clock."""
 
 SCENE, PLANAR = "0", "1"
-"""Numbers of colour and of depth along z; others are depth along rays, pictures of depth, labels and more."""
+"""Image types of colour and of depth along z; others are depth along rays, visualised depth, labels and more."""
 
 MILLISECOND = 1e-3
-"""Seconds of what stamps count."""
+"""Unit of the stamps, seconds."""
 
 VEHICLE, STAMP, IMAGES = "VehicleName", "TimeStamp", "ImageFile"
-"""Names of columns; the first one is not in older recordings."""
+"""Names of columns; older recordings lack the first one."""
 
 
 class AirSim(PlainFolder):
-    """A recording: `airsim_rec.txt` has a row for each moment, and names what was taken then; that lies in `images/`.
+    """A recording: each row of `airsim_rec.txt` has a stamp and the names of the images taken then, in `images/`.
 
-    Depth is planar, in metres, as PFM whose rows run from the top, against the format. The rows' poses are those of the
-    vehicle, and settings say elsewhere how a camera lies on it and which view it has.
+    Depth is along z, in metres, in PFM files whose rows run from the top, contrary to the format. The rows' poses are
+    the vehicle's; the camera's mounting and field of view are only in AirSim's settings.
     """
 
     kind: ClassVar[str] = "recording of AirSim"
@@ -47,18 +47,18 @@ class AirSim(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by that file."""
+        """Recognise a folder by `airsim_rec.txt`."""
         return (path / RECORDING).is_file()
 
     @classmethod
     def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
-        """Those of one camera, as the rows name them."""
+        """The images of one camera, as named in the rows."""
         taken, left_out = _taken(path)
         return [one.color for one in taken], [one.depth for one in taken], left_out
 
     @classmethod
     def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
-        """The frames at their stamps, or row by row at a rate that is said."""
+        """Pair the images by row, at their stamps or at the given rate."""
         if reading.rate:
             return paired_at(color, depth, [at / reading.rate for at in range(len(color))])
         stamps: dict[float, str] = {}
@@ -69,7 +69,7 @@ class AirSim(PlainFolder):
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file, there or one folder up."""
+        """The camera file in the folder or in its parent."""
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             usual = "with FOV_Degrees of 90, AirSim's own, fx and fy are half the width"
@@ -78,24 +78,24 @@ class AirSim(PlainFolder):
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
-        """Somebody's own, if one lies there."""
+        """A custom ground truth, if the folder has one."""
         found, unread = super().truth(path, paired)
         why = f"{RECORDING}: its poses are the vehicle's, and nothing says how the camera lies on it"
         return found, unread if found is not None else [*unread, why]
 
     @classmethod
     def depth_in(cls, file: Path) -> Depth:
-        """The rows from the top."""
+        """Read depth, undoing the flip of PFM, since AirSim writes rows from the top."""
         return np.flipud(read_depth(file))
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Find the files and read the camera; the unit of depth is known, and the sky tells nothing of it."""
+        """Open the folder; its depth unit is known (the sky would mislead a guess)."""
         return super().open(path, replace(reading, depth_scale=reading.depth_scale or METRES))
 
 
 class _Taken(NamedTuple):
-    """What was taken at a moment by the camera that is read."""
+    """The images of one row by the camera that is read."""
 
     place: str
     stamp: float
@@ -109,11 +109,11 @@ class _Row(NamedTuple):
     vehicle: str
     stamp: float
     images: dict[tuple[str, str], str]
-    """Names by camera and kind."""
+    """Names by camera and image type."""
 
 
 def _taken(path: Path) -> tuple[list[_Taken], list[str]]:
-    """What the camera has taken that is the first to have both kinds; and a line for each kind of what is not read."""
+    """The images of the first camera that has colour and depth, and lines about what is not read."""
     rows = _rows(path / RECORDING)
     own = [row for row in rows if row.vehicle == rows[0].vehicle]
     cameras = list(dict.fromkeys(camera for row in own for camera in _cameras(row)))
@@ -134,16 +134,16 @@ def _taken(path: Path) -> tuple[list[_Taken], list[str]]:
 
 
 def _cameras(row: _Row) -> list[str]:
-    """Those of which a row has both kinds."""
+    """The cameras of which a row has colour and depth."""
     depths = [camera for (camera, kind), name in row.images.items() if kind == PLANAR and name.endswith(".pfm")]
     return [camera for camera in depths if (camera, SCENE) in row.images]
 
 
 def _rows(file: Path) -> list[_Row]:
-    """The rows of a recording, one at least.
+    """Read the rows of a recording, at least one.
 
     Raises:
-        GavoError: it has none, or one is torn.
+        GavoError: it has none, or one is incomplete.
     """
     text = enumerate(read_text(file).splitlines(), 1)
     lines = [(f"{file}:{at}", line.split("\t")) for at, line in text if line.strip()]

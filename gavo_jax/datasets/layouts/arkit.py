@@ -1,4 +1,4 @@
-"""Scans of phones that say camera and pose of each frame in JSON, as ARKit found them."""
+"""Phone scans with ARKit's camera and pose of each frame in JSON files."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -24,10 +24,10 @@ from gavo_jax.trajectory import Trajectory
 
 
 class ScanNetPlusPlus(NumberedFolder):
-    """A scan of ScanNet++ (Yeshwanth et al. 2023) by its iPhone, once its toolbox has written `rgb/` and `depth/`.
+    """An iPhone scan of ScanNet++ (Yeshwanth et al. 2023), after its toolbox has written `rgb/` and `depth/`.
 
-    Depth is in millimetres, of colour's view at a seventh of its size. `pose_intrinsic_imu.json` has stamp, camera and
-    pose of each frame, `frame_000000` and so on: `aligned_pose` in the scan's world, else `pose` in ARKit's.
+    Depth is in millimetres, registered to colour at a seventh of its size. `pose_intrinsic_imu.json` has stamp, camera
+    and pose of each frame, `frame_000000` and so on: `aligned_pose` in the scan's world, else `pose` in ARKit's.
     """
 
     kind: ClassVar[str] = "scan of ScanNet++"
@@ -37,26 +37,26 @@ class ScanNetPlusPlus(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by that file, beside images."""
+        """Recognise a folder by `pose_intrinsic_imu.json` beside images."""
         return (path / cls.STAMPS).is_file() and all(plain_files(path))
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """What the frames' cameras have in common."""
+        """The common camera of the frames."""
         file = path / cls.STAMPS
         matrices = [frame["intrinsic"] for frame in _frames(file).values() if "intrinsic" in frame]
         return of_matrices(file, matrices, size, MILLIMETRES)
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """Those of the frames, which are seconds."""
+        """Stamps of the frames, seconds."""
         file = path / cls.STAMPS
         found = {number: frame["timestamp"] for number, frame in _frames(file).items() if "timestamp" in frame}
         return {number: told_stamp(str(file), stamp) for number, stamp in found.items()}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """What ARKit found, moved into the scan where the dataset did so."""
+        """ARKit's poses, aligned to the scan if the dataset has aligned them."""
         frames = _frames(path / cls.STAMPS)
         key = next((key for key in cls.POSES if any(key in frame for frame in frames.values())), cls.POSES[0])
         given = {number: frame[key] for number, frame in frames.items() if key in frame}
@@ -65,10 +65,10 @@ class ScanNetPlusPlus(NumberedFolder):
 
 
 class ScannerApp(NumberedFolder):
-    """What 3D Scanner App exports as *All Data*: `frame_00000.jpg`, `depth_00000.png`, `frame_00000.json`.
+    """An *All Data* export of 3D Scanner App: `frame_00000.jpg`, `depth_00000.png`, `frame_00000.json`.
 
-    Depth is in millimetres, of colour's view at a size of its own; there is more of it than of colour. A frame's file
-    has its stamp, its camera, and the pose of a camera that looks along -z.
+    Depth is in millimetres, registered to colour at another size; there are more depth than colour images. A frame's
+    JSON file has its stamp, its camera, and the pose of a camera that looks along -z.
     """
 
     kind: ClassVar[str] = "scan of 3D Scanner App"
@@ -78,31 +78,31 @@ class ScannerApp(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the frames' files, of which one has such a pose, beside images."""
+        """Recognise a folder by JSON files of frames, with ARKit's pose in the first found, beside images."""
         file = next(path.glob(cls.STAMPS), None)
         return file is not None and cls.POSE in read_text(file, MAX_JSON_BYTES) and all(plain_files(path))
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """What the frames' cameras have in common."""
+        """The common camera of the frames."""
         matrices = [matrix for _, matrix in cls._said(path, "intrinsics").values()]
         return of_matrices(path / cls.STAMPS, matrices, size, MILLIMETRES)
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """Those of the frames, which are seconds since the phone was switched on."""
+        """Stamps of the frames, seconds since the phone was started."""
         return {number: told_stamp(str(file), stamp) for number, (file, stamp) in cls._said(path, "time").items()}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """What ARKit found."""
+        """ARKit's poses."""
         said = cls._said(path, cls.POSE)
         found = {number: pose_of_rows(str(file), rows) for number, (file, rows) in said.items()}
         return {number: pose @ FLIP for number, pose in found.items() if pose is not None}
 
     @classmethod
     def _said(cls, path: Path, key: str) -> dict[int, tuple[Path, Any]]:
-        """What the frames' files say by a key, by the frames' numbers."""
+        """The value of a key in each frame's file, with the file, by frame number."""
         numbers = {file: file.stem.removeprefix("frame_") for file in sorted(path.glob(cls.STAMPS))}
         written = tuple((file, file.stat().st_mtime_ns) for file, number in numbers.items() if number.isdecimal())
         found = {file: said.get(key) for file, said in _read_files(written).items()}
@@ -110,10 +110,10 @@ class ScannerApp(NumberedFolder):
 
 
 class Polycam(PlainFolder):
-    """The `keyframes/` of Polycam's raw data: `images/`, `depth/` and `cameras/`, a file of JSON for each frame.
+    """The `keyframes/` of Polycam's raw data: `images/`, `depth/` and `cameras/`, with a JSON file for each frame.
 
-    Depth is in millimetres, of colour's view at a size of its own. A camera's file has its numbers and the pose of a
-    camera that looks along -z, `t_00` to `t_23`; where the app has corrected them, `corrected_cameras/` has better.
+    Depth is in millimetres, registered to colour at another size. A camera's file has the intrinsics and the pose of a
+    camera that looks along -z, `t_00` to `t_23`; `corrected_cameras/`, if present, has the poses refined by the app.
     """
 
     kind: ClassVar[str] = "scan of Polycam"
@@ -124,12 +124,12 @@ class Polycam(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the cameras' files beside the images."""
+        """Recognise a folder by the camera files beside the images."""
         return any((path / cls.CAMERAS).glob("*.json")) and super().recognises(path)
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the frames' cameras have in common."""
+        """The camera file in the folder, else the common camera of the frames."""
         if own_camera_file(path) is not None:
             return super().calibrate(path, entries, reading)
         tables = [
@@ -145,7 +145,7 @@ class Polycam(PlainFolder):
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
-        """What the app found, unless a better one lies there."""
+        """The app's poses, unless the folder has a ground truth."""
         found, unread = super().truth(path, paired)
         folder = path / (cls.CORRECTED if (path / cls.CORRECTED).is_dir() else cls.CAMERAS)
         if found is not None:
@@ -162,19 +162,19 @@ class Polycam(PlainFolder):
 
 @lru_cache(maxsize=1)
 def _read_files(written: tuple[tuple[Path, int], ...]) -> dict[Path, dict[str, Any]]:
-    """What each of some files says that were written then; read once for stamps, cameras and poses."""
+    """Read JSON files, given with their modification times; cached for stamps, cameras and poses."""
     return {file: read_json_object(file) for file, _ in written}
 
 
 def _frames(file: Path) -> dict[int, dict[str, Any]]:
-    """What a file says of each frame, by the frames' numbers."""
+    """The entries of a file by frame number."""
     status = file.stat()
     return _read_frames(file, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=1)
 def _read_frames(file: Path, written: int, size: int) -> dict[int, dict[str, Any]]:
-    """`_frames`, of a file that was written then; read once for its stamps, cameras and poses."""
+    """Read the entries of a file with this modification time and size; cached for stamps, cameras and poses."""
     frames = {}
     for name, frame in read_json_object(file).items():
         number = name.removeprefix("frame_")

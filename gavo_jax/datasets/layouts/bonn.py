@@ -1,4 +1,4 @@
-"""The Bonn RGB-D Dynamic dataset (Palazzolo et al. 2019): TUM's layout, with the true poses of the camera's markers."""
+"""The Bonn RGB-D Dynamic dataset (Palazzolo et al. 2019): TUM's layout, with true poses of the camera's markers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +18,17 @@ ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]
 MARKERS = np.array(
     [[1.0157, 0.1828, -0.2389, 0.0113], [0.0009, -0.8431, -0.6413, -0.0098], [-0.3009, 0.6147, -0.8085, 0.0111]]
 )
-"""T_ros and T_m of the dataset's page, which has T_ros · T · T_ros · T_m for the camera's pose of a row T."""
+"""T_ros and T_m of the dataset's page, where the camera's pose for a row T is T_ros · T · T_ros · T_m."""
 
 
 class Bonn(TumSequence):
-    """A folder of TUM's layout whose name begins with `rgbd_bonn_`; its truth becomes that of the camera."""
+    """A folder in TUM's layout whose name begins with `rgbd_bonn_`; its ground truth is converted to the camera."""
 
     kind: ClassVar[str] = "Bonn RGB-D Dynamic sequence"
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by its lists and its name, where no camera file of somebody's own lies in it."""
+        """Recognise a folder by its lists and its name, unless it contains a custom camera file."""
         try:
             is_bonn = preset_for_sequence(path.resolve().name) == "bonn"
         except GavoError:
@@ -37,7 +37,7 @@ class Bonn(TumSequence):
 
     @classmethod
     def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
-        """The markers' true poses, moved to the camera."""
+        """The markers' true poses, converted to the camera."""
         found, unread = super().truth(folder, stamps, seconds)
         if found is None:
             return found, unread
@@ -45,7 +45,7 @@ class Bonn(TumSequence):
 
 
 def markers_T_camera() -> Float[np.ndarray, "4 4"]:
-    """Return where the camera lies among its markers: of T_m, which is scaled by 1.06, the nearest rotation."""
+    """Return the camera's pose among its markers, with the rotation nearest to that of T_m, which is scaled by 1.06."""
     left, _, right = np.linalg.svd(MARKERS[:, :3])
     moved = np.eye(4)
     moved[:3] = np.column_stack([left @ right, MARKERS[:, 3]])

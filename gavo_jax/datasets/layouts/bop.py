@@ -1,4 +1,4 @@
-"""Scenes of the BOP challenge (Hodaň et al. 2018): T-LESS, LineMOD, YCB-Video and others in one layout."""
+"""Scenes of the BOP challenge (Hodaň et al. 2018): T-LESS, LineMOD, YCB-Video and others in one format."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,8 +20,8 @@ from gavo_jax.trajectory import inverse
 class BopScene(NumberedFolder):
     """A scene of a BOP dataset: `rgb/000000.png` (or `gray/`), `depth/000000.png`, `scene_camera.json`.
 
-    That has, by the images' numbers, the camera matrix, `depth_scale` in millimetres a unit of depth, and for some
-    datasets the world in the camera, in millimetres.
+    `scene_camera.json` has the camera matrix of each image by number, its `depth_scale` in millimetres per unit, and in
+    some datasets camera_T_world, in millimetres.
     """
 
     kind: ClassVar[str] = "BOP scene"
@@ -29,12 +29,12 @@ class BopScene(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by that file, beside images."""
+        """Recognise a folder by `scene_camera.json` beside images."""
         return (path / cls.FILE).is_file() and all(plain_files(path))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the frames' cameras have in common; the unit of depth is its own."""
+        """The camera file in the folder, else the common camera of the frames; the depth unit is the scene's."""
         file, size = path / cls.FILE, size_of_most(entries)
         frames = _frames(file)
         scale = _depth_scale(file, list(frames.values()))
@@ -45,7 +45,7 @@ class BopScene(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """Those that are said, turned round."""
+        """The poses in the file, inverted to world_T_camera, in metres."""
         found = {}
         for image, frame in _frames(path / cls.FILE).items():
             turn, shift = frame.get("cam_R_w2c"), frame.get("cam_t_w2c")
@@ -60,7 +60,7 @@ class BopScene(NumberedFolder):
 
 
 def _frames(file: Path) -> dict[int, dict[str, Any]]:
-    """What a file says of each image, by the images' numbers."""
+    """The entries of a file by image number."""
     frames = {}
     for name, frame in read_json_object(file, MAX_JSON_BYTES).items():
         if not name.isdecimal() or not isinstance(frame, dict):
@@ -70,7 +70,7 @@ def _frames(file: Path) -> dict[int, dict[str, Any]]:
 
 
 def _depth_scale(file: Path, frames: list[dict[str, Any]]) -> float:
-    """Units of depth a metre, which all frames have to share."""
+    """Depth units per metre, which have to be equal for all frames."""
     scales = [frame.get("depth_scale", 1.0) for frame in frames] or [1.0]
     scale = scales[0]
     is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
@@ -80,7 +80,7 @@ def _depth_scale(file: Path, frames: list[dict[str, Any]]) -> float:
 
 
 def _fields(place: str, turn: Any, shift: Any) -> list[str]:
-    """Sixteen fields of a pose, row by row."""
+    """The sixteen fields of a pose in row-major order."""
     if not (isinstance(turn, list) and isinstance(shift, list) and (len(turn), len(shift)) == (9, 3)):
         raise GavoError(f"{place}: expected nine numbers in cam_R_w2c, and three in cam_t_w2c")
     rows = [[*turn[3 * row : 3 * row + 3], shift[row]] for row in range(3)]

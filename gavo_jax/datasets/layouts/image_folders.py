@@ -1,4 +1,4 @@
-"""Where colour and depth images lie in a folder, by the names of folders and files."""
+"""Location of colour and depth images in a folder, by the names of folders and files."""
 
 import re
 from pathlib import Path
@@ -15,42 +15,41 @@ DEPTH_FOLDERS = (
     *("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth"),
     *("depth_images", "depth_raw", "depth_rect", "depth_map", "depth_maps", "distance_to_image_plane"),
 )
-"""The first one counts, after those whose names say that they are registered, see `_is_registered`."""
+"""Names of depth folders, in order of preference, after those that are named as registered (`_is_registered`)."""
 
 REGISTERED = {"aligned", "align", "registered", "transformed", "to"}
-"""Words of which one stands in the name of a folder of depth that is registered to colour: beside such a one, another
-is that of its own camera."""
+"""Words that mark a depth folder as registered to colour; another one beside it is the depth camera's own."""
 
 ALL_SUFFIXES = tuple({*COLOR_SUFFIXES, *DEPTH_SUFFIXES})
 
 COLOR_NAMES = {"color", "colour", "rgb"}
 DEPTH_NAMES = {"depth", "depths"}
 PLAIN_WORDS = {"image", "images", "raw"}
-"""What else may stand in the name of such a folder."""
+"""Other words allowed in the name of a registered depth folder."""
 
 PAIR = re.compile(r"(.*)(?<![a-z])(?:colou?r|rgb)(?![a-z])(.*)")
-"""A folder of colour named as its scene is, as Redwood has it, or its camera; depth's has the same around its word."""
+"""Colour folder named after its scene (as in Redwood) or camera; the depth folder has the same text around "depth"."""
 
 DEPTH_WORD = re.compile(r"(?<![a-z])(?:depth|distance_to_image_plane)(?![a-z])", re.IGNORECASE)
-"""In the names of depth images that lie beside colour, as a part of its own, where some have it so; the latter is of
-Isaac Sim's Replicator."""
+"""Marks depth images in the same folder as colour, as a separate word if any name has it so; the longer one is of Isaac
+Sim's Replicator."""
 
 NO_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?r(?:ed)?)(?![a-z])")
-"""In the names of folders of what is made of depth, or said of it."""
+"""Marks folders of images derived from depth, or about it."""
 
 OF_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?rmap)(?![a-z])", re.IGNORECASE)
-"""The same in the names of files beside which depth itself lies."""
+"""Marks files derived from depth, as `NO_DEPTH` does folders, where depth itself lies beside them."""
 
 DEPTH_PART = re.compile(r"([-_. ]?)depth([-_. ]?)", re.IGNORECASE)
-"""What depth's name has more than that of its colour image, where colour's has no word of its own."""
+"""The part that distinguishes a depth image's name from its colour image's, where colour's has no word of its own."""
 
 COLOR_WORDS = ("colou?r|rgb", "image|frame|img", "left", r"^\d+\.")
-"""In the names of colour images that lie beside depth; the latter, at last a number and nothing else, where the former
-say nothing. Of a stereo camera depth is that of the left image."""
+"""Patterns that mark colour images in the same folder as depth, tried in order; the last is a bare number. Depth of a
+stereo camera belongs to the left image."""
 
 
 def _is_registered(name: str) -> bool:
-    """Whether a folder's name speaks of depth that is registered to colour; colour, if named, stands last."""
+    """Whether a folder is named as depth registered to colour; if its name mentions colour, it has to end with it."""
     words = re.split(r"[-_. ]+", name)
     said = set(words)
     if not said & DEPTH_NAMES or not said & REGISTERED or said - REGISTERED - COLOR_NAMES - DEPTH_NAMES - PLAIN_WORDS:
@@ -59,7 +58,7 @@ def _is_registered(name: str) -> bool:
 
 
 def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
-    """Folders of colour and of depth images, as far as a folder has them, the one that counts first."""
+    """Colour folders and depth folders in a folder, the preferred one first."""
     children = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
     registered = sorted(filter(_is_registered, children), key=lambda name: (name not in DEPTH_FOLDERS, name))
     names = COLOR_FOLDERS, dict.fromkeys((*registered, *DEPTH_FOLDERS))
@@ -71,13 +70,13 @@ def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _named_alike(children: dict[str, Path]) -> tuple[list[Path], list[Path]]:
-    """The same, of the one scene or camera that the names of both speak of."""
+    """Colour and depth folders named after the same scene or camera, if unique."""
     found = _pairs(children)
     return found[0] if len(found) == 1 else ([], [])
 
 
 def _pairs(children: dict[str, Path]) -> list[tuple[list[Path], list[Path]]]:
-    """A folder of colour and those of depth beside it, of each scene or camera; depth's may say more at its end."""
+    """The colour folder and the depth folders of each scene or camera; depth's name may have a suffix."""
     matches = [match for name in children if (match := PAIR.fullmatch(name))]
     return [
         ([children[match[0]]], depth)
@@ -98,18 +97,18 @@ def several_pairs(path: Path) -> str | None:
 
 
 def _is_depth_beside(color: re.Match[str], name: str) -> bool:
-    """Whether a folder's name is that of depth, beside colour's."""
+    """Whether a folder's name is that of the depth folder matching a colour folder."""
     return name.startswith(f"{color[1]}depth{color[2]}") and not NO_DEPTH.search(name)
 
 
 def _folders(path: Path) -> tuple[Path | None, Path | None]:
-    """Those of colour and of depth images that count."""
+    """The preferred folders of colour and depth images."""
     color, depth = _candidates(path)
     return next(iter(color), None), next(iter(depth), None)
 
 
 def passed_over(path: Path) -> list[str]:
-    """A line for each other folder of images whose name speaks of depth or colour, of a folder with folders of both."""
+    """List further colour and depth folders that are not read, one line each, if there are folders of both kinds."""
     candidates = _candidates(path)
     if not all(candidates):
         return []
@@ -121,7 +120,7 @@ def passed_over(path: Path) -> list[str]:
 
 
 def missing_images(path: Path) -> str | None:
-    """Which kind of images a folder lacks that has folders for both."""
+    """Describe which kind of images is missing in a folder with subfolders for both; None if neither is."""
     color, depth = _folders(path)
     if color is None or depth is None:
         return None
@@ -133,7 +132,7 @@ def missing_images(path: Path) -> str | None:
 
 
 def missing_folder(path: Path) -> str | None:
-    """Which folder of images a folder lacks that has that of the other kind."""
+    """Describe which image folder is missing beside that of the other kind; None if both or neither are there."""
     color, depth = _folders(path)
     if (color is None) == (depth is None):
         return None
@@ -144,13 +143,13 @@ def missing_folder(path: Path) -> str | None:
 
 
 def _film_beside(path: Path) -> Path | None:
-    """The film of colour that lies in a folder in place of a folder of colour; None where none or several do."""
+    """The colour film that takes the place of a colour folder; None unless there is exactly one."""
     found = [file for file in images_among(path.glob("*"), FILMS) if file.stem.lower() in COLOR_FOLDERS]
     return found[0] if len(found) == 1 and _folders(path)[0] is None else None
 
 
 def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
-    """Colour and depth files, each in the order of their names."""
+    """Colour and depth files, each sorted by name."""
     color, depth = _folders(path)
     if color is not None and depth is not None:
         files = list(color.glob("*"))
@@ -174,14 +173,14 @@ def _partners(files: list[Path], depths: list[Path]) -> list[Path]:
 
 
 def _with_depth(files: list[Path]) -> list[Path]:
-    """Files whose names speak of depth: as a part of its own, else within a word."""
+    """Files whose names contain "depth" as a separate word, or if none does, as part of a word."""
     return [file for file in files if DEPTH_WORD.search(file.name)] or [
         file for file in files if "depth" in file.name.lower()
     ]
 
 
 def missing_word(path: Path) -> str | None:
-    """What the images of a folder lack that all speak of depth."""
+    """Describe why a folder has no colour images if all names contain "depth"; else None."""
     files = images_among(path.glob("*"), ALL_SUFFIXES)
     if not files or len(_with_depth(files)) < len(files):
         return None

@@ -1,4 +1,4 @@
-"""Poses in NeRF's `transforms.json`, as nerfstudio, Polycam's converters and others write it."""
+"""Poses in NeRF's `transforms.json`, as written by nerfstudio, Polycam's converters and others."""
 
 from collections.abc import Mapping
 from pathlib import Path, PureWindowsPath
@@ -15,28 +15,28 @@ from gavo_jax.trajectory import Trajectory
 TRANSFORMS = "transforms.json"
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From our camera's axes to NeRF's: its y points up, and it looks along -z."""
+"""From our camera axes to NeRF's, where y points up and the camera looks along -z."""
 
 LARGEST_SCALE = 1e6
-"""Of a pose's shift, or how small it may be: what is beyond is no scale."""
+"""Largest scale of translations; its inverse is the smallest."""
 
 WITHOUT_SCALE = ("colmap_im_id", "sharpness", "colmap_pose")
-"""Keys of frames whose poses structure from motion made: how long its unit is, is open."""
+"""Keys of frames whose poses come from structure from motion, so that their scale is unknown."""
 
 
 def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory | None, list[str]]:
-    """The poses of images, world_T_camera.
+    """Read the poses of images, world_T_camera.
 
     Args:
         path: the file.
-        stamps: seconds of each image, by its name without the ending.
+        stamps: stamp of each image, seconds, by its name without suffix.
 
     Returns:
-        The poses; or None, and a line that says why: none is finite and of one of these images, or their unit is open
-        (`WITHOUT_SCALE`). None and no line where the file has no poses.
+        The trajectory; or None, and a line that says why: no finite pose belongs to these images, or the scale is
+        unknown (`WITHOUT_SCALE`). None and no line if the file has no poses.
 
     Raises:
-        GavoError: no JSON, or a pose or a scale that is none.
+        GavoError: not JSON, or an invalid pose or scale.
     """
     values = read_json(path, MAX_JSON_BYTES)
     frames = [(at, frame) for at, frame in _frames(values) if frame.get("transform_matrix") is not None]
@@ -56,17 +56,17 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
 
 
 def _frames(values: Any) -> list[tuple[int, dict[str, Any]]]:
-    """What is said of each frame, with its place."""
+    """The entry of each frame, with its index."""
     frames = values.get("frames") if isinstance(values, dict) else None
     listed = frames if isinstance(frames, list) else []
     return [(at, frame) for at, frame in enumerate(listed) if isinstance(frame, dict)]
 
 
 def _scale(path: Path, values: dict[str, Any]) -> float:
-    """What the shifts of the poses were multiplied by, as nerfstudio says it; the world may be turned and moved, too.
+    """The factor by which translations were multiplied, as stated by nerfstudio; a rigid transform may be applied, too.
 
     Raises:
-        GavoError: it is no scale, or the world was changed otherwise.
+        GavoError: the scale is invalid, or the applied transform is not rigid.
     """
     if (moved := values.get("applied_transform")) is not None:
         pose_of_rows(f"{path}: applied_transform", moved)
@@ -80,10 +80,10 @@ def _scale(path: Path, values: dict[str, Any]) -> float:
 
 
 def pose_of_rows(place: str, matrix: Any) -> Float[np.ndarray, "4 4"] | None:
-    """A pose of three or four rows of four numbers, or of as many numbers; None where it is not finite.
+    """Parse a pose of three or four rows of four numbers, or as a flat list; None if it is not finite.
 
     Raises:
-        GavoError: it is none.
+        GavoError: it is not a pose.
     """
     rows = matrix if isinstance(matrix, list) else [matrix]
     fields = [str(value) for row in rows for value in (row if isinstance(row, list) else [row])]

@@ -1,4 +1,4 @@
-"""Folders whose `transforms.json` names a depth image for each frame, as nerfstudio and instant-ngp read them."""
+"""Folders whose `transforms.json` names each frame's depth image, as read by nerfstudio and instant-ngp."""
 
 import os
 import re
@@ -20,19 +20,19 @@ from gavo_jax.errors import GavoError, read_json_object, read_text, shown
 
 COLOR_KEY = "file_path"
 DEPTH_KEYS = ("depth_file_path", "depth_path")
-"""As nerfstudio and as instant-ngp call it."""
+"""Keys of the depth image in nerfstudio and in instant-ngp."""
 
 STAMP_KEY = "timestamp"
-"""As NeRFCapture calls it."""
+"""Key of the stamp in NeRFCapture."""
 
 NAMES_DEPTH = re.compile(r'"(depth_file_path|depth_path)"\s*:\s*"')
 
 
 class Nerfstudio(PlainFolder):
-    """A folder whose `transforms.json` says which colour and which depth image are a frame.
+    """A folder whose `transforms.json` names the colour and depth image of each frame.
 
-    Spectacular AI and NeRFCapture write such. The stamps of the frames say when, where they have any; else the names of
-    the colour images do, as in any folder.
+    Spectacular AI and NeRFCapture write such folders. Times are the frames' stamps, if they have any, else they come
+    from the names of the colour images, as in a plain folder.
     """
 
     kind: ClassVar[str] = "nerfstudio folder"
@@ -40,13 +40,13 @@ class Nerfstudio(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by that file, where it names depth."""
+        """Recognise a folder by a `transforms.json` that names depth images."""
         file = path / TRANSFORMS
         return file.is_file() and NAMES_DEPTH.search(read_text(file, MAX_JSON_BYTES)) is not None
 
     @classmethod
     def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
-        """What the file names, by the names of colour; and a line for what lies beside, and is not named with depth."""
+        """The images in the file, sorted by the names of colour; and a line about others not listed with depth."""
         file, partners = path / TRANSFORMS, dict[Path, Path]()
         for place, color, depth, _ in _pairs(path):
             if partners.setdefault(color, depth) != depth:
@@ -62,7 +62,7 @@ class Nerfstudio(PlainFolder):
 
     @classmethod
     def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
-        """The frames as the file has them, at their stamps, if it says those."""
+        """Pair the images as in the file, with its stamps if it has usable ones."""
         stamps = {} if reading.rate else _stamps(path)
         if stamps and (unit := told_unit([*stamps.values()])) is not None:
             times = dict(zip(stamps, in_seconds([*stamps.values()], unit), strict=True))
@@ -73,7 +73,7 @@ class Nerfstudio(PlainFolder):
 
 
 def _pairs(path: Path) -> Iterator[tuple[str, Path, Path, dict[str, Any]]]:
-    """Place, colour and depth of each frame of which depth is named, and what is said of it."""
+    """Location in the file, colour, depth and entry of each frame that names a depth image."""
     for place, frame in _frames(path / TRANSFORMS):
         key = next((key for key in DEPTH_KEYS if frame.get(key) is not None), None)
         if key is not None:
@@ -82,10 +82,10 @@ def _pairs(path: Path) -> Iterator[tuple[str, Path, Path, dict[str, Any]]]:
 
 
 def _stamps(path: Path) -> dict[Path, float]:
-    """Stamps of the images, as the file has them; none where it has none.
+    """Stamps of the images as in the file; empty where it has none.
 
     Raises:
-        GavoError: one is no stamp, is missing among others, or is that of two images; or an image has two.
+        GavoError: a stamp is invalid, missing or shared by two images, or an image has two.
     """
     told = [(place, color, frame.get(STAMP_KEY)) for place, color, _, frame in _pairs(path)]
     if all(stamp is None for _, _, stamp in told):
@@ -102,7 +102,7 @@ def _stamps(path: Path) -> dict[Path, float]:
 
 
 def _frames(file: Path) -> list[tuple[str, dict[str, Any]]]:
-    """What is said of each frame, with its place."""
+    """The entry of each frame, with its location in the file."""
     frames = read_json_object(file, MAX_JSON_BYTES).get("frames")
     if not isinstance(frames, list):
         raise GavoError(f"{file}: frames: expected a list, found {shown(frames)}")
@@ -113,13 +113,13 @@ def _frames(file: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _named(folder: Path, place: str, key: str, value: Any) -> Path:
-    """The path that a frame has by a key."""
+    """The path under a key of a frame's entry."""
     if not isinstance(value, str) or not value:
         raise GavoError(f"{place}: {key}: expected a path, found {shown(value)}")
     return folder / path_below(resolve_folder(folder), f"{place}: {key}", value)
 
 
 def _with_ending(image: Path) -> Path:
-    """An image with the ending of its file, which NeRFCapture leaves out and instant-ngp tries."""
+    """Complete a path with the suffix of its file, which NeRFCapture omits (instant-ngp also tries suffixes)."""
     files = (image.with_name(image.name + ending) for ending in COLOR_SUFFIXES if not os.path.exists(image))
     return next((file for file in files if os.path.isfile(file)), image)

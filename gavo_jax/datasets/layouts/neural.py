@@ -1,4 +1,4 @@
-"""Scenes that neural mapping is tried on: Replica as Semantic-NeRF and vMAP have it, and those of Neural RGB-D."""
+"""Scenes for neural mapping: Replica in the layout of Semantic-NeRF and vMAP, and Neural RGB-D."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -19,21 +19,21 @@ from gavo_jax.errors import GavoError, number, read_text
 
 
 class NeuralScene(NumberedFolder):
-    """A scene whose camera looks along the middle of its image, with one focal length, and whose depth is z in mm."""
+    """A scene with a centred principal point, a single focal length, and depth along z in millimetres."""
 
     POSES: ClassVar[str]
-    """The file of poses, each of sixteen numbers."""
+    """File of poses, each of sixteen numbers."""
     FROM_OURS: ClassVar[np.ndarray] = np.eye(4)
-    """From our camera's axes to those of the poses."""
+    """Rotation from our camera axes to those of the poses."""
 
     @classmethod
     def focal(cls, path: Path, width: int) -> tuple[float, str]:
-        """The focal length, pixels, and where it is from."""
+        """The focal length, pixels, and its origin for messages."""
         raise NotImplementedError
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """One by the focal length."""
+        """A camera with this focal length and the image's middle as principal point."""
         width, height = size
         focal, origin = cls.focal(path, width)
         middle = (width - 1) / 2, (height - 1) / 2
@@ -41,7 +41,7 @@ class NeuralScene(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """Poses by the numbers of their images, or in order where there are as many as images."""
+        """Poses by image number, or in order if there are as many as images."""
         file = path / cls.POSES
         rows = in_order(file, cls.find(path).color) if file.is_file() else ()
         found = {number: pose_of(place, row) for number, place, row in rows}
@@ -49,7 +49,7 @@ class NeuralScene(NumberedFolder):
 
 
 class SemanticReplica(NeuralScene):
-    """A rendered room of Replica as Semantic-NeRF and vMAP have it: `rgb/rgb_0.png`, `depth/`, `traj_w_c.txt`."""
+    """A room of Replica as rendered for Semantic-NeRF and vMAP: `rgb/rgb_0.png`, `depth/`, `traj_w_c.txt`."""
 
     kind: ClassVar[str] = "Replica room of Semantic-NeRF"
     POSES: ClassVar[str] = "traj_w_c.txt"
@@ -61,14 +61,14 @@ class SemanticReplica(NeuralScene):
 
     @classmethod
     def focal(cls, path: Path, width: int) -> tuple[float, str]:
-        """That of a view of 90 degrees."""
+        """The focal length of a 90 degree field of view."""
         return width / 2, "the one that it was rendered with, of 90 degrees"
 
 
 class NeuralRgbd(NeuralScene):
     """A scene of Neural RGB-D (Azinović et al. 2022): `images/img0.png`, `depth_filtered/depth0.png`, `focal.txt`.
 
-    Its `poses.txt` are of cameras that look along -z; four rows of not-a-number stand for a frame without one.
+    Cameras in `poses.txt` look along -z; four rows of NaN stand for a frame without a pose.
     """
 
     kind: ClassVar[str] = "scene of Neural RGB-D"
@@ -79,17 +79,17 @@ class NeuralRgbd(NeuralScene):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the file of the focal length beside images."""
+        """Recognise a folder by `focal.txt` beside the image folders."""
         return (path / cls.FOCAL).is_file() and all((path / name).is_dir() for name in ("images", cls.DEPTH))
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Depth is what the method itself takes, which is always there."""
+        """Colour, and the filtered depth that the method itself uses, which is always present."""
         return found_among((path / "images").glob("*"), (path / cls.DEPTH).glob("*"))
 
     @classmethod
     def focal(cls, path: Path, width: int) -> tuple[float, str]:
-        """What its file says."""
+        """The focal length in `focal.txt`."""
         file = path / cls.FOCAL
         try:
             return number(read_text(file).strip()), str(file)

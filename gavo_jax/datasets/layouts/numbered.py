@@ -1,6 +1,6 @@
 """Datasets whose frames are numbered files in a folder: 7-Scenes, ScanNet, Replica, Open3D's, and plain folders.
 
-Each class says how its folder is recognised, where the images and poses lie, and which camera took them.
+Each class defines how its folder is recognised, where its images and poses are, and which camera took them.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -41,27 +41,27 @@ from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
-"""Frames per second where nobody says it: that of nearly every RGB-D camera."""
+"""Default frame rate, Hz: that of nearly every RGB-D camera."""
 
 SLOWEST, FASTEST = 0.1, 1000.0
-"""Frames per second that may be a rate."""
+"""Range of plausible frame rates, Hz."""
 
 NUMBERS, BY_FILM = "names are numbers", "as the film says"
-"""What is said of stamps that are counted, of which frames per second are a guess, or are a film's."""
+"""Values of `times_guessed` for stamps from frame numbers, at the default rate or at a film's."""
 
 
 class NumberedFolder(FileSequence):
-    """Frames of which colour and depth have the same number; their time is that number over the rate."""
+    """Frames whose colour and depth images share a number; times come from `stamps`, else from number and rate."""
 
     kind: ClassVar[str] = "folder of numbered images"
     depth_is_of_view: ClassVar[bool] = False
-    """Whether depth shows what colour does where it is of another size, as phones have it."""
+    """Whether depth of another size than colour is still registered to it, as from phones."""
     poses_of_depth: ClassVar[bool] = False
-    """Whether the poses are those of the depth camera, where it is another than the colour camera."""
+    """Whether the poses are those of the depth camera, if it differs from the colour camera."""
     DEPTH_SCALE: ClassVar[float] = MILLIMETRES
-    """Units a metre, where a camera file that is named does not say them."""
+    """Depth units per metre, if a given camera file does not state them."""
     STAMPS: ClassVar[str] = ""
-    """The file of `stamps`."""
+    """Name of the file that `stamps` reads, for messages."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -70,12 +70,12 @@ class NumberedFolder(FileSequence):
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """The image files: each kind in a folder, or told apart by their names."""
+        """Find the image files: each kind in its folder, or distinguished by name."""
         return by_number(*plain_files(path))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera that the folder, or the dataset, brings: a camera file in the folder goes before its own.
+        """The camera file in the folder, else the dataset's own camera.
 
         Raises:
             GavoError: there is none, or it cannot be read.
@@ -85,29 +85,29 @@ class NumberedFolder(FileSequence):
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """The camera of images of a size, as the dataset itself says it.
+        """The dataset's own camera for images of a size.
 
         Raises:
-            GavoError: as `calibrate`.
+            GavoError: as in `calibrate`.
         """
         raise NotImplementedError
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """True poses, world_T_camera, by the numbers of their frames; empty where there is no truth."""
+        """True poses, world_T_camera, by frame number; empty if there is no ground truth."""
         return {}
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """Seconds by the numbers of frames; empty where nothing says them, so that the rate does."""
+        """Stamps, seconds, by frame number; empty if unknown, so that the rate is used."""
         return {}
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Find the files and read camera and poses; no image is read, but where the camera's file lacks the size.
+        """Find the files and read camera and poses; images are read only to find their size.
 
         Raises:
-            GavoError: no frame, no camera, unreadable poses.
+            GavoError: no frames, no camera, or unreadable poses.
         """
         root = resolve_folder(path)
         found = cls.find(path)
@@ -130,7 +130,7 @@ class NumberedFolder(FileSequence):
         calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
         if cls.depth_is_of_view:
             calibration = calibration.with_depth_of_size(*depth_size_of_most(entries))
-        if (path / TRUTH).exists():  # somebody's own, which is better than the dataset's poses
+        if (path / TRUTH).exists():  # a custom ground truth overrides the dataset's poses
             truth = truth_in(path, times.values(), None if is_stamped else lambda counts: counts / rate)
         else:
             moved = calibration.color_T_depth if cls.poses_of_depth else None
@@ -144,7 +144,7 @@ class NumberedFolder(FileSequence):
 def _trajectory(
     poses: Mapping[int, np.ndarray], times: Mapping[int, float], posed_T_color: np.ndarray
 ) -> Trajectory | None:
-    """Poses of the frames that have one, in the order of their times, of equal times the first; None where none has."""
+    """Trajectory of the frames that have a pose, sorted by time (the first of equal times); None if none has one."""
     numbers = [number for number in times if number in poses]
     if not numbers:
         return None
@@ -155,29 +155,29 @@ def _trajectory(
 class SevenScenes(NumberedFolder):
     """A sequence of 7-Scenes (Shotton et al. 2013): `frame-000000.color.png`, `.depth.png`, `.pose.txt`.
 
-    Depth is in millimetres, 65535 where there is none, and not registered to colour. BundleFusion, 3RScan and 12-Scenes
-    name their files alike; their `info.txt` has the cameras.
+    Depth is in millimetres, 65535 = no reading, and not registered to colour. BundleFusion, 3RScan and 12-Scenes use
+    the same file names; their `info.txt` has the cameras.
     """
 
     kind: ClassVar[str] = "7-Scenes sequence"
     poses_of_depth: ClassVar[bool] = True
     CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480, depth_scale=MILLIMETRES)
-    """As the dataset's page has it, for colour and depth alike."""
+    """Camera from the dataset's page, for both colour and depth."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the names of the images."""
+        """Recognise a folder by its image names."""
         return bool(_any(path, "frame-*.color.*")) and bool(_any(path, "frame-*.depth.*"))
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Both kinds lie in the folder itself."""
+        """The images of both kinds, in the folder itself."""
         color, depth = (sorted(path.glob(f"frame-*.{kind}.*")) for kind in ("color", "depth"))
         return found_among(_recorded(color), _recorded(depth))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera file beside the frames or one folder up, a scan's info.txt, too, else the dataset's."""
+        """The camera file or a scan's info.txt in the folder or its parent, else the dataset's camera."""
         file = own_camera_file(path) or own_camera_file(path.resolve().parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
@@ -185,23 +185,23 @@ class SevenScenes(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """A file for each frame."""
+        """Poses from one file per frame."""
         return pose_files(images_among(path.glob("frame-*.pose.*"), (".txt",)))
 
 
 class ScanNet(NumberedFolder):
-    """A scan of ScanNet (Dai et al. 2017) as its reader exports it: `color/`, `depth/`, `pose/`, `intrinsic/`.
+    """A scan of ScanNet (Dai et al. 2017) as exported by its reader: `color/`, `depth/`, `pose/`, `intrinsic/`.
 
-    The frames that the dataset has exported, one in a hundred, have the cameras' files beside these folders.
+    In the dataset's own export of every hundredth frame, the camera files are beside these folders.
     """
 
     kind: ClassVar[str] = "ScanNet scan"
     INTRINSICS: ClassVar[tuple[str, ...]] = ("intrinsic/intrinsic_", "intrinsic_", "intrinsics_")
-    """How the names of the cameras' files begin."""
+    """Prefixes of the camera files' names."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the file of the colour camera, beside images and, unless it has a folder, poses."""
+        """Recognise a folder by image folders and the colour camera's file, in `intrinsic/` or beside `pose/`."""
         file = cls._intrinsics(path, "color")
         if file is None or not all((path / name).is_dir() for name in ("color", "depth")):
             return False
@@ -214,12 +214,12 @@ class ScanNet(NumberedFolder):
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Each kind has a folder."""
+        """The images of both kinds, each in its folder."""
         return found_among((path / "color").glob("*"), (path / "depth").glob("*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The files of both cameras, as far as they are two; the scans say that nothing is to be turned or shifted."""
+        """The cameras of colour and depth, or one if they are equal; the extrinsics of scans are the identity."""
         color, depth = (cls._intrinsics(path, name) for name in ("color", "depth"))
         assert color is not None
         found = _millimetres(load_calibration(color, partial(size_of_most, entries), MILLIMETRES))
@@ -234,12 +234,12 @@ class ScanNet(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """A file for each frame; those of frames that were not tracked hold infinities."""
+        """Poses from one file per frame; frames that were not tracked have infinite values."""
         return pose_files(images_among((path / "pose").glob("*.txt"), (".txt",)))
 
 
 class Replica(NumberedFolder):
-    """A rendered room of Replica as NICE-SLAM has it: `results/frame*.jpg`, `results/depth*.png`, `traj.txt`."""
+    """A room of Replica as rendered for NICE-SLAM: `results/frame*.jpg`, `results/depth*.png`, `traj.txt`."""
 
     kind: ClassVar[str] = "Replica room"
     DEPTH_SCALE: ClassVar[float] = 6553.5
@@ -247,19 +247,19 @@ class Replica(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the names of the images."""
+        """Recognise a folder by its image names."""
         results = path / "results"
         return results.is_dir() and all(_any(results, f"{kind}[0-9]*") for kind in ("frame", "depth"))
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Both kinds lie in one folder."""
+        """The images of both kinds, in `results/`."""
         results = path / "results"
         return found_among(results.glob("frame*"), results.glob("depth*"))
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """cam_params.json of the room or of all rooms, else the one that they were rendered with."""
+        """The camera file (cam_params.json) of the room or of all rooms, else the camera used for rendering."""
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one that Replica was rendered with")
@@ -267,35 +267,35 @@ class Replica(NumberedFolder):
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """A row of sixteen numbers for each frame: by its number, or in order where there are as many as images."""
+        """Poses from rows of sixteen numbers: by frame number, or in order if there are as many as images."""
         file = path / "traj.txt"
         rows = in_order(file, cls.find(path).color) if file.exists() else ()
         return {number: pose for number, place, row in rows if (pose := pose_of(place, row)) is not None}
 
 
 class PlainFolder(FileSequence):
-    """A folder of colour and a folder of depth images, or one folder of both told apart by their names.
+    """A folder of colour and a folder of depth images, or one folder of both, distinguished by name.
 
-    Names that are stamps are paired by time (see `names.stamps`); else images of the same number are of one frame, and
+    Names that are stamps are paired by time (see `names.stamps`). Otherwise images of the same number form a frame, and
     its time is that number over the rate.
     """
 
     kind: ClassVar[str] = "folder of colour and depth images"
     scale_is_open: ClassVar[bool] = True
     depth_is_of_view: ClassVar[bool] = False
-    """As of `NumberedFolder`; nerfstudio has it so, too."""
+    """As in `NumberedFolder`; it is also assumed if there is a `transforms.json`."""
     ESTIMATES: ClassVar[str] = ""
-    """Names of files of poses that the kind's own program found, which are no truth; empty where there are none."""
+    """Glob pattern of pose files estimated by the program that wrote the folder, which are no ground truth."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by its folders' names, or the files'."""
+        """Recognise a folder by the names of its subfolders or files."""
         color, depth = plain_files(path)
         return bool(color and depth)
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera file in the folder, or in the one above, else the preset that the folder's name speaks of.
+        """The camera file in the folder or its parent, else the preset implied by its name, else an exported camera.
 
         Raises:
             GavoError: there is none.
@@ -309,7 +309,7 @@ class PlainFolder(FileSequence):
         """Find the files, pair them and read the camera.
 
         Raises:
-            GavoError: no frame, no camera.
+            GavoError: no frames, or no camera.
         """
         root = resolve_folder(path)
         color, depth, others = cls.images(path)
@@ -331,30 +331,30 @@ class PlainFolder(FileSequence):
 
     @classmethod
     def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
-        """Colour and depth images, and a line for each kind of others that are not read.
+        """Colour and depth images, and a line for each kind of other images that are not read.
 
         Raises:
-            GavoError: what names them cannot be read.
+            GavoError: the file that lists them cannot be read.
         """
         return *plain_files(path), passed_over(path)
 
     @classmethod
     def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
-        """The frames that these images are; `seconds` are times by numbers, where the names are no stamps.
+        """Pair the images to frames; `seconds` maps frame numbers to times, if the names are no stamps.
 
         Raises:
-            GavoError: no frame, or which images are one is open.
+            GavoError: no frames, or the pairing is ambiguous.
         """
         return paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:
-        """Times of frames by their numbers, where a file of the folder says them."""
+        """Mapping from frame numbers to times from a file in the folder; None if there is none."""
         return None
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
-        """The true trajectory that lies in the folder, if one does; why poses that lie there are none, a line each.
+        """The ground truth in the folder, if any, and a line for each file of poses that is not used, with the reason.
 
         Raises:
             GavoError: it cannot be read.
@@ -372,19 +372,19 @@ class Open3DFolder(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the intrinsics' file beside the images."""
+        """Recognise a folder by the intrinsics file beside the images."""
         return cls._intrinsics(path) is not None and super().recognises(path)
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The intrinsics' file; depth is in millimetres unless said otherwise."""
+        """The camera of the intrinsics file; depth is in millimetres unless stated otherwise."""
         file = cls._intrinsics(path)
         assert file is not None
         return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:
-        """Times by the rate that Open3D's reader of RealSense recordings writes beside the intrinsics."""
+        """Times at the rate that Open3D's RealSense reader writes into the intrinsics file."""
         file = cls._intrinsics(path)
         assert file is not None
         return by_rate(told_in(file).get("fps"))
@@ -396,7 +396,7 @@ class Open3DFolder(PlainFolder):
 
 
 def by_rate(rate: Any) -> Seconds | None:
-    """Times of frames by their numbers at some frames per second; None for what is no such rate."""
+    """Mapping from frame numbers to times at a rate, frames per second; None if it is no plausible rate."""
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not SLOWEST <= rate <= FASTEST:
         return None
     return lambda numbers: numbers / rate
@@ -407,22 +407,22 @@ def _any(folder: Path, pattern: str) -> Path | None:
 
 
 def _recorded(files: list[Path]) -> list[Path]:
-    """Files of names of three parts, where some are: those of more are made of others, by projecting or rendering."""
+    """Files whose names have three parts, if there are any; those with more were derived by projection or rendering."""
     return [file for file in files if file.name.count(".") == 2] or files
 
 
 def found_among(color: Iterable[Path], depth: Iterable[Path]) -> Found:
-    """The images of either kind among files, by their numbers."""
+    """Index the images of both kinds among files by their numbers."""
     return by_number(images_among(color, COLOR_SUFFIXES), images_among(depth, DEPTH_SUFFIXES))
 
 
 def _millimetres(calibration: Calibration) -> Calibration:
-    """The same where the file says nothing of depth: the dataset does."""
+    """Set the depth scale to the dataset's millimetres, unless the camera file states one."""
     return calibration if calibration.states_depth_scale else calibration.with_depth_scale(MILLIMETRES)
 
 
 def _check_identity(file: Path) -> None:
-    """Refuse a camera that is turned or shifted in its device: no scan has one, and which way it goes is open."""
+    """Refuse extrinsics other than the identity: no scan has them, and their direction is undocumented."""
     if not file.is_file():
         return
     pose = pose_in(file)
@@ -431,16 +431,16 @@ def _check_identity(file: Path) -> None:
 
 
 def of_matrices(file: Path, matrices: list[Any], size: Size, depth_scale: float) -> Calibration:
-    """The camera that the frames' own have in common, see `common_camera`.
+    """Combine the frames' camera matrices into one camera, see `common_camera`.
 
     Args:
-        file: that has them.
-        matrices: of the cameras, each nine numbers or three rows of three.
-        size: of the images, width and height.
-        depth_scale: units per metre.
+        file: their file, for messages.
+        matrices: camera matrices, each nine numbers or three rows of three.
+        size: width and height of the images.
+        depth_scale: depth units per metre.
 
     Raises:
-        GavoError: there is none, one is no camera matrix, or they differ by more than focus moves them.
+        GavoError: there is none, one is no camera matrix, or they differ by more than autofocus explains.
     """
     if not matrices:
         raise GavoError(f"{file}: has no camera of any frame: say --camera")
@@ -451,7 +451,7 @@ def of_matrices(file: Path, matrices: list[Any], size: Size, depth_scale: float)
 
 
 def _table_of(file: Path, matrix: Any) -> dict[str, Any]:
-    """Intrinsics of a matrix."""
+    """The intrinsics in a camera matrix, by name."""
     try:
         return of_matrix(str(file), matrix)
     except GavoError:
@@ -461,15 +461,15 @@ def _table_of(file: Path, matrix: Any) -> dict[str, Any]:
 
 
 def of_each_frame(folder: Path, files: Sequence[Path], load: Callable[[Path], Calibration]) -> Calibration:
-    """The camera that the frames' own have in common, see `common_camera`.
+    """Combine the frames' camera files into one camera, see `common_camera`.
 
     Args:
-        folder: where they lie.
-        files: of the cameras.
+        folder: their folder, for messages.
+        files: the camera files.
         load: reads one of them.
 
     Raises:
-        GavoError: they differ by more than focus moves them, or one cannot be read.
+        GavoError: they differ by more than autofocus explains, or one cannot be read.
     """
     first, *_ = cameras = [load(file).color for file in files]
     found = common_camera(str(folder), [{key: getattr(camera, key) for key in REQUIRED} for camera in cameras])

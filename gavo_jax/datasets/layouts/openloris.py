@@ -1,4 +1,4 @@
-"""Sequences of OpenLORIS-Scene (Shi et al. 2020) as packaged: TUM's layout by other names, of a robot."""
+"""Packaged sequences of OpenLORIS-Scene (Shi et al. 2020), taken by robots: TUM's layout with other file names."""
 
 from dataclasses import replace
 from functools import partial
@@ -20,14 +20,14 @@ from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory
 
 BASE = "base_link"
-"""The robot's frame, of which the true poses are."""
+"""The robot's frame, to which the true poses refer."""
 
 
 class OpenLoris(TumSequence):
-    """A folder with `color.txt`, `aligned_depth.txt`, `sensors.yaml` and, of a robot's body, `groundtruth.txt`.
+    """A folder with `color.txt`, `aligned_depth.txt`, `sensors.yaml` and `groundtruth.txt`, the robot's poses.
 
-    Depth of `aligned_depth/` is registered to colour, in millimetres; `depth.txt` beside it is of the depth camera.
-    Poses of the body become those of the colour camera by `trans_matrix.yaml`, whose matrices are parent_T_child.
+    Depth in `aligned_depth/` is registered to colour, in millimetres; `depth.txt` lists that of the depth camera.
+    `trans_matrix.yaml`, with matrices parent_T_child, converts the robot's poses to those of the colour camera.
     """
 
     kind: ClassVar[str] = "OpenLORIS-Scene sequence"
@@ -38,13 +38,13 @@ class OpenLoris(TumSequence):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by its lists of colour and registered depth, or its sensors, without TUM's list."""
+        """Recognise a folder by its colour list, beside `aligned_depth.txt` or `sensors.yaml`, and no `rgb.txt`."""
         color, *others = (path / name for name in (*cls.LISTS, cls.SENSORS))
         return color.exists() and any(file.exists() for file in others) and not (path / TumSequence.LISTS[0]).exists()
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Read the folder as told."""
+        """Open the folder; its registered depth has to be there."""
         if not (depth := path / cls.LISTS[1]).exists():
             tool = "align_depth.py of openloris-scene-tools"
             raise GavoError(f"{depth}: no such file: unpack it and its images, or make them by {tool}")
@@ -52,7 +52,7 @@ class OpenLoris(TumSequence):
 
     @classmethod
     def calibrate(cls, folder: Path, entries: list[Entry]) -> Calibration:
-        """A camera file in the folder, else the colour camera among the sensors."""
+        """The camera file in the folder, else the colour camera of `sensors.yaml`."""
         file = own_camera_file(folder) or folder / cls.SENSORS
         if not file.exists():
             raise GavoError(f"{file}: no such file, which has the camera: restore it, or say --camera")
@@ -60,7 +60,7 @@ class OpenLoris(TumSequence):
 
     @classmethod
     def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
-        """The body's true poses, moved to the colour camera where a file says how it lies on the body."""
+        """The robot's true poses, converted to the colour camera if its pose on the robot is known."""
         found, unread = super().truth(folder, stamps, seconds)
         if found is None or not (folder / TRUTH).exists():
             return found, unread
@@ -72,7 +72,7 @@ class OpenLoris(TumSequence):
 
 
 def _base_T_color(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Return where the colour camera lies on the robot; None where no file or no chain of its transforms says it.
+    """Return the colour camera's pose on the robot; None if there is no file, or no chain of transforms in it.
 
     Raises:
         GavoError: the file is malformed.
@@ -98,7 +98,7 @@ def _listed(path: Path, stored: dict[str, Any]) -> list[Any]:
 
 
 def _transform(place: str, move: Any) -> tuple[str, tuple[str, np.ndarray]]:
-    """The child of a transform, its parent, and parent_T_child."""
+    """The child frame of a transform, with its parent frame and parent_T_child."""
     keys = ("child_frame", "parent_frame", "matrix")
     if not isinstance(move, dict) or not set(keys) <= move.keys():
         raise GavoError(f"{place}: expected parent_frame, child_frame and matrix")

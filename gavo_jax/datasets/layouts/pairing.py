@@ -1,4 +1,4 @@
-"""Frames of a folder whose images are nothing but files: which colour and which depth image are one, and when."""
+"""Pairing of colour and depth files in plain folders, and the frames' timestamps, from the file names."""
 
 import re
 from pathlib import Path
@@ -14,10 +14,10 @@ from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import associate
 
 FEWEST_FOR_A_RATE = 3
-"""Images whose steps tell more than chance."""
+"""Fewest images whose steps indicate a frame rate."""
 
 MOST_ODD = 1 / 3
-"""Images whose names have another form than the rest, for each of the rest: so many may have come in by chance."""
+"""Largest ratio of images whose names have an unusual form to the others, for which the former are ignored."""
 
 
 class Paired(NamedTuple):
@@ -28,9 +28,9 @@ class Paired(NamedTuple):
     times: dict[int, float]
     """Stamp of each depth image, by the number in its name, else by its place, from 1."""
     seconds: Seconds | None
-    """Times by numbers, where the names are those."""
+    """Maps frame numbers to times, where names are frame numbers."""
     guessed: str = ""
-    """What names were taken for that are whole numbers, and no date says it."""
+    """The unit guessed for names that are whole numbers without a date; empty if none was guessed."""
 
 
 class _Timed(NamedTuple):
@@ -41,14 +41,16 @@ class _Timed(NamedTuple):
     unit: float | None
     """Unit of stamps that are whole numbers; see `names.Stamps`."""
     others: tuple[Path, ...] = ()
-    """Whose names have another form."""
+    """Files whose names have another form."""
 
 
 def paired_by_stamp(path: Path, color: list[Path], depth: list[Path], reading: Reading) -> Paired | None:
-    """Frames by the stamps that the names are, but for a few; None where they are none, or the rate is said.
+    """Pair images by the timestamps in their names; None if the names are no stamps, or the rate is given.
+
+    A few names may have another form.
 
     Raises:
-        GavoError: which images are of one time is open.
+        GavoError: no stamps are near enough, or only some names are stamps.
     """
     others = [file for file in (*color, *depth) if not re.search(r"\d", file.stem)]
     color, depth = ([file for file in files if re.search(r"\d", file.stem)] for files in (color, depth))
@@ -76,7 +78,7 @@ def paired_by_stamp(path: Path, color: list[Path], depth: list[Path], reading: R
 
 
 def _both_timed(path: Path, color: list[Path], depth: list[Path]) -> tuple[_Timed, _Timed] | None:
-    """Times of both kinds; where one has none of its own accord, in what the other one counts."""
+    """The timestamps of both kinds; if one kind shows no unit, that of the other is tried."""
     first, second = _timed(color), _timed(depth)
     if first and not second:
         second = _timed(depth, first.unit)
@@ -90,7 +92,7 @@ def _both_timed(path: Path, color: list[Path], depth: list[Path]) -> tuple[_Time
 
 
 def _check_numbers(path: Path, known: _Timed, color: list[Path], depth: list[Path]) -> None:
-    """Refuse names that are times in one kind of images alone, unless their numbers are those of the other kind."""
+    """Refuse names that are times in one kind of images only, unless their numbers match those of the other kind."""
     fewer = min(len(color), len(depth))
     if len(known.files) < FEWEST_FOR_A_RATE or not fewer:
         return
@@ -105,10 +107,10 @@ def _check_numbers(path: Path, known: _Timed, color: list[Path], depth: list[Pat
 
 
 def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
-    """Images by their stamps; a few whose names have another form than most do not count.
+    """Read the stamps of images, ignoring a few whose names have another form than most.
 
     Raises:
-        GavoError: these are many.
+        GavoError: too many names have another form.
     """
     if found := stamps([file.stem for file in files], unit):
         return _Timed(files, *found)
@@ -130,10 +132,10 @@ def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
 
 
 def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Reading, clock: Seconds) -> Paired:
-    """Frames of a colour and a depth image at the same place of the lists; colour's names say when, as in all folders.
+    """Pair colour and depth images at equal positions of the lists; times come from the names of the colour images.
 
     Raises:
-        GavoError: they do not, or two have the same number.
+        GavoError: the names give no time, or two have the same number.
     """
     found = paired_by_stamp(path, color, color, reading) or paired_by_number(path, color, color, clock)
     partners = dict(zip(color, depth, strict=True))
@@ -142,7 +144,7 @@ def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Re
     entries = []
     for stamp, image, *_ in found.entries:
         own = of_depth.get(partners[image])
-        is_near = own is not None and abs(own - stamp) < reading.max_difference  # else of another clock
+        is_near = own is not None and abs(own - stamp) < reading.max_difference  # else from another clock
         entries.append(Entry(stamp, image, partners[image], own if is_near else None))
     others = sorted(partners.keys() - {entry.color for entry in entries})
     left_out = [f"{len(others)} frames: names of another form than most, as {others[0].name}"] if others else []
@@ -150,13 +152,13 @@ def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Re
 
 
 def paired_at(color: list[Path], depth: list[Path], stamps: list[float]) -> Paired:
-    """Frames of a colour and a depth image at the same place of the lists, at stamps that a file says, seconds."""
+    """Pair colour and depth images at equal positions of the lists, with given stamps, seconds."""
     entries = sorted(Entry(*frame) for frame in zip(stamps, color, depth, strict=True))
     return Paired(entries, [], {at: entry.stamp for at, entry in enumerate(entries, 1)}, None)
 
 
 def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Seconds) -> Paired:
-    """Frames by the numbers in the names, whose times a clock says."""
+    """Pair images by the numbers in their names, which `clock` maps to times."""
     found = by_number(color, depth)
     numbers = sorted(found.color.keys() & found.depth.keys())
     if not numbers:

@@ -1,4 +1,4 @@
-"""Scans of phones: Stray Scanner's folders, ARKitScenes, and what Record3D exports."""
+"""Phone scans: Stray Scanner, ARKitScenes, and exports of Record3D."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,10 +22,10 @@ from gavo_jax.trajectory import Trajectory, inverse
 
 
 class StrayScan(NumberedFolder):
-    """A scan of the app Stray Scanner, once the frames of its film are images: `rgb/`, `depth/`, `odometry.csv`.
+    """A scan of the app Stray Scanner: `rgb.mp4`, or its frames in `rgb/`, with `depth/` and `odometry.csv`.
 
-    Depth is registered to colour, in millimetres. `odometry.csv` has a stamp and a pose for each frame, by its number:
-    of a camera whose y points down, as ours. Older versions wrote poses alone, newer ones add the camera of each frame.
+    Depth is registered to colour, in millimetres. `odometry.csv` has the stamp and pose of each frame by its number;
+    y of the camera points down, as ours. Older versions wrote only poses, newer ones add each frame's camera.
     """
 
     kind: ClassVar[str] = "scan of Stray Scanner"
@@ -33,16 +33,16 @@ class StrayScan(NumberedFolder):
     STAMPS: ClassVar[str] = "odometry.csv"
     MATRIX: ClassVar[str] = "camera_matrix.csv"
     FILM: ClassVar[tuple[int, int]] = (1920, 1440)
-    """Pixels, of which the camera matrix is."""
+    """Image size to which the camera matrix refers, pixels."""
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the recorder's own files, beside images."""
+        """Recognise a folder by the app's own files beside images."""
         return all((path / name).is_file() for name in (cls.STAMPS, cls.MATRIX)) and all(plain_files(path))
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """The film's, at the size of the images."""
+        """The film's camera, scaled to the size of the images."""
         width, height = size
         if width * cls.FILM[1] != height * cls.FILM[0]:
             film = "x".join(map(str, cls.FILM))
@@ -54,19 +54,19 @@ class StrayScan(NumberedFolder):
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """The column of stamps, where there is one."""
+        """The stamps, if the file has that column."""
         return {n: stamp for n, (stamp, _) in _odometry(path / cls.STAMPS).items() if stamp is not None}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """What ARKit found."""
+        """ARKit's poses."""
         return {n: pose for n, (_, pose) in _odometry(path / cls.STAMPS).items()}
 
 
 class ArkitScenes(PlainFolder):
-    """A scan of ARKitScenes (Baruch et al. 2021): `lowres_wide/`, `lowres_depth/`, a camera for each frame, poses.
+    """A scan of ARKitScenes (Baruch et al. 2021): `lowres_wide/`, `lowres_depth/`, a camera file per frame, and poses.
 
-    A row of `lowres_wide.traj` is a stamp, the turn as axis times angle and the shift of the world into the camera.
+    A row of `lowres_wide.traj` is a stamp and camera_T_world as a rotation vector and a translation.
     """
 
     kind: ClassVar[str] = "scan of ARKitScenes"
@@ -81,7 +81,7 @@ class ArkitScenes(PlainFolder):
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the frames' cameras have in common."""
+        """The camera file in the folder, else the common camera of the frames."""
         files = sorted((path / cls.CAMERAS).glob("*.pincam"))
         if own_camera_file(path) is not None or not files:
             return super().calibrate(path, entries, reading)
@@ -89,7 +89,7 @@ class ArkitScenes(PlainFolder):
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
-        """What ARKit found, unless a better one lies there."""
+        """ARKit's poses, unless the folder has a ground truth."""
         found, unread = super().truth(path, paired)
         if found is not None or not (path / cls.POSES).is_file():
             return found, unread
@@ -97,9 +97,9 @@ class ArkitScenes(PlainFolder):
 
 
 class Record3D(PlainFolder):
-    """What the app Record3D exports as EXR and RGB: images by their numbers, and `metadata.json`.
+    """An EXR + RGB export of the app Record3D: numbered images and `metadata.json`.
 
-    That says the camera, and when the frames were taken: `frameTimestamps`, by their numbers, or `fps`.
+    `metadata.json` has the camera and the frames' times, as `frameTimestamps` by number, or as `fps`.
     """
 
     kind: ClassVar[str] = "export of Record3D"
@@ -108,14 +108,14 @@ class Record3D(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the camera in its file, beside images."""
+        """Recognise a folder by the camera in `metadata.json`, beside images."""
         file = path / cls.FILE
         return file.is_file() and "K" in told_in(file) and super().recognises(path)
 
     @classmethod
     def clock(cls, path: Path) -> Seconds | None:
-        """What its file says, of each frame or of all."""
-        told = told_in(path / cls.FILE)  # with a camera file in the folder it need not be one
+        """Times of the frames from `frameTimestamps`, else from `fps`."""
+        told = told_in(path / cls.FILE)
         stamps = told.get("frameTimestamps")
         if isinstance(stamps, list) and len(stamps) > 1:
             return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps)
@@ -123,10 +123,10 @@ class Record3D(PlainFolder):
 
 
 def _clock_of(place: str, stamps: list[Any]) -> Seconds:
-    """Times of frames that count from 0, by the stamps of all of them.
+    """Map frame numbers, from 0, to the given stamps of all frames.
 
     Raises:
-        GavoError: they are no times; or, when it is asked, a frame is beyond the last of them.
+        GavoError: the stamps are no increasing times. The returned function raises it for a number beyond the last.
     """
     try:
         times = np.array(stamps, np.float64)
@@ -144,7 +144,7 @@ def _clock_of(place: str, stamps: list[Any]) -> Seconds:
 
 
 def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
-    """Stamps and poses by the numbers of frames; the first line may name the columns, of which the first nine count."""
+    """Read stamps and poses by frame number; there may be a header, and columns after the ninth are ignored."""
     rows, found = data_rows(path), {}
     if rows and "qx" in rows[0][1]:
         rows = rows[1:]
@@ -161,7 +161,7 @@ def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
 
 
 def _read_turns(path: Path) -> Trajectory:
-    """Rows of a stamp, axis times angle and shift, camera_T_world."""
+    """Read rows of a stamp and camera_T_world (rotation vector and translation) as a trajectory."""
     rows = [values for place, fields in data_rows(path) if (values := numbers_in(place, fields, 7)) is not None]
     if not rows:
         raise GavoError(f"{path}: holds no trajectory (no rows)")

@@ -1,4 +1,4 @@
-"""What RTAB-Map exports of a map: the images of its nodes, by `rtabmap-export` or from its database viewer."""
+"""Exports of RTAB-Map: the images of a map's nodes, by `rtabmap-export` or its database viewer."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -14,10 +14,10 @@ from gavo_jax.errors import GavoError
 
 
 class RtabMap(PlainFolder):
-    """Images in `rgb/` and `depth/`, their cameras in `calib/` or `calib.yaml`; a map's name may stand before each.
+    """Images in `rgb/` and `depth/`, cameras in `calib/` or `calib.yaml`; each may be prefixed by the map's name.
 
-    Depth is registered, in millimetres. Names are stamps, or the ids of nodes. A camera is that of images without
-    distortion, whatever lens its file has, as RTAB-Map itself takes it.
+    Depth is registered, in millimetres. Names are stamps or node ids. Images are rectified, so the distortion in camera
+    files is ignored, as RTAB-Map itself does.
     """
 
     kind: ClassVar[str] = "export of RTAB-Map"
@@ -27,12 +27,12 @@ class RtabMap(PlainFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the cameras beside the images."""
+        """Recognise a folder by the camera files beside the images."""
         return bool(_cameras(path)) and super().recognises(path)
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else what the images' cameras have in common."""
+        """The camera file in the folder, else the common camera of the images."""
         if own_camera_file(path) is not None:
             return super().calibrate(path, entries, reading)
         files = _cameras(path)
@@ -47,7 +47,7 @@ class RtabMap(PlainFolder):
 
 
 def _cameras(path: Path) -> list[Path]:
-    """Files of the cameras: beside the folder of colour one of the same name but for its kind, else a file so named."""
+    """The camera files: in a folder named like that of colour, with `calib` for `rgb`, else a single file named so."""
     color, _ = plain_files(path)
     if not color or color[0].parent == path or "rgb" not in color[0].parent.name:
         return []

@@ -1,4 +1,4 @@
-"""Trajectories of TartanAir (Wang et al. 2020), rendered, of its first and its second version."""
+"""Rendered trajectories of TartanAir (Wang et al. 2020), versions 1 and 2."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,26 +19,26 @@ from gavo_jax.datasets.truth import in_order, numbers_in, posed
 from gavo_jax.errors import GavoError
 
 FIRST, SECOND = "left", "lcam_front"
-"""The camera that is read of either version, as its folders and files are named."""
+"""The camera that is read in each version, as named in its folders and files."""
 
 RATE_OF_SECOND = 10.0
-"""Frames per second, as the second version's page has it; that of the first does not say it."""
+"""Frames per second according to the second version's page; the first version's does not state it."""
 
 SIZES = ((640, 480), (640, 640))
-"""Of the images of either version."""
+"""Image size of each version."""
 
 FOCAL = 320.0
-"""Pixels, of both: a view of 90 degrees across."""
+"""Focal length of both versions, pixels: a horizontal field of view of 90 degrees."""
 
 BODY_T_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""The poses' axes are north, east and down of the world and forward, right and down of the camera."""
+"""From our camera axes to those of the poses: forward, right, down (the world's are north, east, down)."""
 
 
 class TartanAir(NumberedFolder):
     """A trajectory: `image_left/`, `depth_left/`, `pose_left.txt`, or the same of `lcam_front` in the second version.
 
-    Depth is registered, in metres: floats of NumPy, or packed into images of four channels. The sky is 10 km away, so
-    that what depth looks like tells nothing of its unit.
+    Depth is registered, in metres, as NumPy floats or packed into four-channel images. The sky is 10 km away, so the
+    unit cannot be guessed from the depth.
     """
 
     kind: ClassVar[str] = "TartanAir trajectory"
@@ -46,14 +46,14 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise the second version by its folders, the first one by its images' names: others have such folders."""
+        """Recognise version 2 by its folders and version 1 by its image names, as its folder names are common."""
         color, depth = (path / f"{kind}_{FIRST}" for kind in ("image", "depth"))
         is_first = any(color.glob(f"*_{FIRST}.*")) and any(depth.glob(f"*_{FIRST}_depth.*"))
         return is_first or _is_second(path)
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Each kind has a folder."""
+        """The images of both kinds, each in its folder."""
         camera = SECOND if _is_second(path) else FIRST
         folders = [path / f"{kind}_{camera}" for kind in ("image", "depth")]
         for folder, other in zip(folders, reversed(folders), strict=True):
@@ -64,7 +64,7 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """A camera file in the folder, else the camera that the images of this size were rendered with."""
+        """The camera file in the folder, else the camera with which images of this size were rendered."""
         if (file := own_camera_file(path)) is not None:
             return load_calibration(file, partial(size_of_most, entries), METRES)
         width, height = size = size_of_most(entries)
@@ -76,12 +76,12 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """Count by the rate of the second version."""
+        """Stamps from the frame numbers at the rate of the second version; empty for the first."""
         return {number: number / RATE_OF_SECOND for number in cls.find(path).color} if _is_second(path) else {}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """A row of tx ty tz qx qy qz qw for each frame."""
+        """Poses from rows of tx ty tz qx qy qz qw, one per frame."""
         file, poses = path / f"pose_{SECOND if _is_second(path) else FIRST}.txt", {}
         for number, place, row in in_order(file, cls.find(path).color) if file.exists() else ():
             values = numbers_in(place, row, 7)
@@ -91,7 +91,7 @@ class TartanAir(NumberedFolder):
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Find the files and read poses; the unit of depth is known."""
+        """Open the folder; its depth unit is known."""
         return super().open(path, replace(reading, depth_scale=reading.depth_scale or METRES))
 
 

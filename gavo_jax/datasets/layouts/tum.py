@@ -1,4 +1,4 @@
-"""Sequences in the folder layout of the TUM RGB-D benchmark (Sturm et al. 2012): lists of stamps and images."""
+"""Sequences in the folder layout of the TUM RGB-D benchmark (Sturm et al. 2012): lists of timestamped images."""
 
 import bisect
 import itertools
@@ -34,49 +34,49 @@ MAX_DIFFERENCE = 0.02
 """Colour and depth stamps at least this far apart, in seconds, are not of one frame."""
 
 MAX_LIST_BYTES = 16 * 2**20
-"""Hours of frames; what is larger is no list of them."""
+"""Largest list, bytes: enough for hours of frames."""
 
 MAX_PATH = 1000
-"""Characters of a path in a list."""
+"""Longest path in a list, characters."""
 
 MAX_STAMP = 1e10
-"""Seconds, three centuries since 1970: what is larger counts something else."""
+"""Largest stamp, seconds: three centuries after 1970; anything larger is in another unit."""
 
 COLOR = "color.txt"
-"""The list of colour, by the name that some give it."""
+"""Alternative name of the colour list."""
 
 ASSOCIATIONS = tuple(f"{name}.txt" for name in ("associations", "association", "associated", "associate", "assoc"))
-"""Both lists in one, as ICL-NUIM has it and `associate.py` prints it: `stamp path stamp path`."""
+"""Names of a combined list `stamp path stamp path`, as in ICL-NUIM and printed by `associate.py`."""
 
 INDEX_RATE = 30.0
-"""Frames per second where the stamps are nothing but the numbers of the frames."""
+"""Frames per second where stamps are just frame numbers."""
 
 MAX_MISPLACED = 0.25
-"""Share of a list's rows whose stamps may be out of order; a list with more is merely unsorted."""
+"""Largest share of a list's rows whose stamps are out of order; a list with more is considered unsorted."""
 
 
 class TumSequence(FileSequence):
     """A folder with `rgb.txt`, `depth.txt`, the images they list and, where known, `groundtruth.txt`.
 
     Colour and depth are paired by time (`associate`: greedy, one to one, |Δt| < `max_difference`), or by the rows of a
-    list of pairs (`ASSOCIATIONS`) in place of the two; frames come in the order of their colour stamps and carry them.
-    Images are decoded one by one when asked for, and nothing of them is kept.
+    combined list (`ASSOCIATIONS`) in place of the two. Frames are in the order of their colour stamps, which become
+    theirs. Images are decoded one by one on access and not cached.
 
     Lists need not be sorted. But where all but a few stamps of a list increase (`MAX_MISPLACED`), those few are in
-    doubt: a frame of such a colour or depth stamp has its place by it, but reading it raises `TimestampError`. In an
-    unsorted list the first of rows with equal stamps is kept, and the images of others are left out.
+    doubt: a frame with such a colour or depth stamp is placed by it, but reading it raises `TimestampError`. In an
+    unsorted list, of rows with equal stamps only the first is kept.
 
     Attributes:
         name: the folder's name, unless given.
-        camera: of the frames as they come: without distortion when they are undistorted, else as recorded.
-        ground_truth: `groundtruth.txt` as it stands, or None where there is no such file.
+        camera: camera of the returned frames: without distortion when they are undistorted, else as recorded.
+        ground_truth: the true trajectory in the folder, or None if there is none.
     """
 
     kind: ClassVar[str] = "TUM RGB-D folder"
     LISTS: ClassVar[tuple[str, str]] = ("rgb.txt", "depth.txt")
-    """Of colour and of depth."""
+    """Lists of colour and depth."""
     DEPTH_SCALE: ClassVar[float] = DEPTH_SCALE
-    """Units per metre, where a camera file does not say them."""
+    """Depth units per metre, if a camera file does not state them."""
 
     def __init__(
         self,
@@ -92,19 +92,19 @@ class TumSequence(FileSequence):
         """Read the lists and the ground truth; no image yet (see `check`).
 
         Args:
-            folder: holds the lists.
+            folder: folder of the lists.
             camera: a camera, what `load_camera` takes, or "auto" (or None): the camera file in the folder, else the
-                preset that the folder's name speaks of.
-            color: whether frames carry RGB beside grey.
-            undistort: whether lens distortion is taken out of the frames.
-            max_difference: seconds.
+                preset implied by the folder's name.
+            color: whether frames have RGB beside grey.
+            undistort: whether to remove lens distortion.
+            max_difference: colour and depth stamps at least this far apart, in seconds, are not of one frame.
             name: overrides the folder's name.
-            depth_scale: raw depth units per metre; the camera's if left out.
-            rate: frames per second, where stamps are the numbers of the frames.
+            depth_scale: raw depth units per metre; the camera's if None.
+            rate: frames per second, if stamps are frame numbers.
 
         Raises:
             GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder, no pair
-                of stamps near enough, unusable ground truth, unknown camera.
+                of stamps near enough, unusable ground truth, or unknown camera.
         """
         self.folder = Path(folder)
         resolved = resolve_folder(self.folder)
@@ -136,17 +136,17 @@ class TumSequence(FileSequence):
 
     @property
     def unit_is_assumed(self) -> bool:
-        """Whether nothing says the unit of depth, so that it is taken for the benchmark's."""
+        """Whether the depth unit is not stated anywhere, but assumed to be the benchmark's."""
         return not self.calibration.states_depth_scale
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a list lies in the folder."""
+        """Recognise a folder by any of its lists."""
         return any((path / name).exists() for name in (*cls.LISTS, *ASSOCIATIONS))
 
     @classmethod
     def calibrate(cls, folder: Path, entries: list[Entry]) -> Calibration:
-        """The camera file in the folder, else the preset that its name speaks of.
+        """The camera file in the folder, else the preset implied by its name, else an exported camera.
 
         Raises:
             GavoError: there is none, or it cannot be read.
@@ -157,7 +157,7 @@ class TumSequence(FileSequence):
 
     @classmethod
     def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
-        """The true trajectory that lies in the folder, if one does; why one that lies there is not used, a line each.
+        """The ground truth in the folder, if any, and a line for each file of poses that is not used, with the reason.
 
         Raises:
             GavoError: it cannot be read.
@@ -167,7 +167,7 @@ class TumSequence(FileSequence):
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Read the folder as told."""
+        """Open the folder as specified by `reading`."""
         return cls(
             path,
             reading.camera,
@@ -187,10 +187,10 @@ class _Row(NamedTuple):
     place: str
     """file:line"""
     written: str
-    """The stamp, as it stands there."""
+    """The stamp as written in the file."""
     misplaced: bool = False
     repeated: bool = False
-    """Whether the stamp is that of another image, which is taken."""
+    """Whether another image has the same stamp and is used instead."""
 
 
 class _Entry(NamedTuple):
@@ -201,7 +201,7 @@ class _Entry(NamedTuple):
 
 
 def _files(entry: _Entry, max_difference: float) -> Entry:
-    """Paths, stamps and doubts of a frame. A depth stamp that is further off is of another clock, and tells nothing."""
+    """Paths, stamps and doubt of a frame; a depth stamp `max_difference` or more off (of another clock) is dropped."""
     misplaced = next((row for row in entry if row is not None and row.misplaced), None)
     doubt = f"{misplaced.place}: stamp {misplaced.stamp:.6f} is out of order or given twice" if misplaced else ""
     color, depth = entry
@@ -210,20 +210,20 @@ def _files(entry: _Entry, max_difference: float) -> Entry:
 
 
 class _Lists(NamedTuple):
-    """What a folder's lists say."""
+    """Contents of a folder's lists."""
 
     color: list[_Row]
     depth: list[_Row]
     unit: float
-    """Seconds of what the stamps counted; those of the rows are in seconds."""
+    """Unit of the stamps as written, seconds; those of the rows are converted to seconds."""
     are_paired: bool
-    """Whether one list has both images of a frame in a row."""
+    """Whether a combined list has both images of a frame in one row."""
     repeated: list[str]
-    """What was left out for the stamp of another image, a line each kind."""
+    """Number of images left out because of a repeated stamp, one line per kind."""
 
 
 def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | None) -> _Lists:
-    """Read both lists, or the one in their place."""
+    """Read both lists, or a combined one in their place."""
     both = next((folder / name for name in ASSOCIATIONS if (folder / name).exists()), None)
     if not (folder / names[0]).exists() and (folder / COLOR).exists():
         names = (COLOR, names[1])
@@ -255,16 +255,16 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
 
 
 WHOLE = re.compile(r"-?\d+")
-"""A stamp that counts something; 2.000000 is in seconds."""
+"""A stamp that may be in any unit or a frame number; 2.000000 is in seconds."""
 
 
 def _unit(color: list[float], rate: float | None) -> float:
-    """Seconds of what whole numbers seem to count; numbers of frames go by the rate."""
+    """The likely unit of whole numbers, seconds; frame numbers count intervals at the rate."""
     return 1 / rate if rate else unit_of(color) or 1 / INDEX_RATE
 
 
 def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
-    """Read `stamp path stamp path` rows, depth first or last."""
+    """Read rows of `stamp path stamp path`, with depth first or last."""
     pairs = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 4:
@@ -277,7 +277,7 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
 
 
 def _read_list(root: Path, path: Path) -> list[_Row]:
-    """Read `timestamp path` rows, in the order of their stamps; the images' paths stay below `root`."""
+    """Read rows of `timestamp path`, sorted by stamp; the images' paths must stay below `root`."""
     rows: list[_Row] = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 2:
@@ -287,7 +287,7 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
 
 
 def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
-    """Check a stamp and a path."""
+    """Check the stamp and path of a row."""
     try:
         stamp = number(time)
     except ValueError:
@@ -298,14 +298,14 @@ def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:
 
 
 def path_below(root: Path, place: str, image: str) -> str:
-    """A path that a file at `place` names, which as it is written stays below `root`; links are followed.
+    """Check that a path listed at `place` stays below `root`, as written or with links resolved; return it.
 
     Raises:
-        GavoError: it leaves the folder, or is no usable path.
+        GavoError: it leaves the folder, or is unusable.
     """
     try:
         if "\\" in image and not (root / image).exists():
-            image = image.replace("\\", "/")  # as Windows has it
+            image = image.replace("\\", "/")  # a Windows path
         places = (root / image).resolve(), Path(os.path.normpath(root / image))
         if len(image) > MAX_PATH:
             raise ValueError("too long")
@@ -317,7 +317,7 @@ def path_below(root: Path, place: str, image: str) -> str:
 
 
 def _back(root: Path, image: str) -> str:
-    """What helps where a list's path is of another place: its end may be a path of this folder."""
+    """Suggest a fix for a path outside the folder: its last parts may exist in this folder."""
     parts = PurePosixPath(image).parts
     ends = ("/".join(parts[at:]) for at in range(1, len(parts)) if ".." not in parts[at:])
     end = next((end for end in ends if (root / end).is_file()), None)
@@ -327,7 +327,7 @@ def _back(root: Path, image: str) -> str:
 
 
 def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:
-    """Rows in the order of their stamps, each once, marked where the stamp is in doubt or another's."""
+    """Sort rows by stamp, drop duplicates, and mark those whose stamp is in doubt or repeated."""
     if not rows:
         raise GavoError(f"{path}: lists no images")
     if all(re.fullmatch(r"\d+\.\d+", row.written) for row in rows):
@@ -362,17 +362,17 @@ def _in_order(stamps: list[float]) -> list[bool]:
 
 
 def _by_place(color: list[_Row], depth: list[_Row]) -> list[_Entry]:
-    """Frames as the rows of one list say, from the first one that is in no doubt."""
+    """Frames from the rows of a combined list, starting with the first that is not in doubt."""
     partners = {row.place: row for row in depth}
     paired = [_Entry(row, None if row.misplaced else partners[row.place]) for row in color if row.place in partners]
     return list(itertools.dropwhile(_is_in_doubt, paired))
 
 
 def _associate_lists(color: list[_Row], depth: list[_Row], max_difference: float) -> list[_Entry]:
-    """Frames in the order of their colour stamps, from the first one that is in no doubt.
+    """Frames in the order of their colour stamps, starting with the first that is not in doubt.
 
-    Rows in no doubt are associated first; of the others, depth goes to what is left of the colour rows, and a colour
-    row stands alone.
+    Rows not in doubt are associated first. Doubtful depth rows are then associated with the remaining colour rows, and
+    doubtful colour rows become frames without depth.
     """
     good = [row for row in color if not row.misplaced]
     entries = [_Entry(row, None) for row in color if row.misplaced]

@@ -1,4 +1,4 @@
-"""A sequence as a folder in the layout of the TUM RGB-D benchmark."""
+"""Writing of a sequence as a folder in the layout of the TUM RGB-D benchmark."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mas
 from gavo_jax.errors import GavoError
 
 WRITTEN = ("camera", "__iter__", "name", "ground_truth")
-"""What is needed of a `Sequence`."""
+"""Members of `Sequence` that are needed to write it."""
 
 
 def write_tum(sequence: Sequence, folder: str | Path) -> None:
     """Write a sequence as a folder in TUM layout that reads back identically, with its camera as `camera.toml`.
 
-    Colour images are 8-bit RGB (three equal channels where the frames have no colour), depth 16 bit in the camera's raw
-    units. Where bodies move, `bodies_truth.csv` and `masks/` tell where they are. The lists are written last, so that a
-    folder left half written is not taken for a sequence.
+    Colour images are 8-bit RGB (three equal channels where frames have no colour), depth is 16-bit in the camera's raw
+    units. The ground truth of moving bodies, if any, goes to `bodies_truth.csv` and `masks/`. The lists are written
+    last, so that an incomplete folder is not taken for a sequence.
 
     Raises:
-        GavoError: it is no sequence, the folder holds one already, something cannot be written, or images are not of 8
-            and 16 bits.
+        GavoError: it is no sequence, the folder already holds one, a file cannot be written, or images are not 8-bit
+            grey and 16-bit depth.
         FrameError: a frame of the sequence cannot be read.
     """
     require_sequence(sequence, WRITTEN)
@@ -59,7 +59,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
 
 
 def _write_frame(frame: Frame, folder: Path) -> tuple[str, str]:
-    """Write both images; their stamps, as they are written."""
+    """Write both images, and return their stamps as formatted for the lists."""
     for name, pixels, dtype in (("grey", frame.grey, np.uint8), ("depth", frame.depth, np.uint16)):
         if pixels.dtype != dtype:
             raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")

@@ -1,4 +1,4 @@
-"""Drives of Virtual KITTI 2 (Cabon et al. 2020), rendered."""
+"""Rendered drives of Virtual KITTI 2 (Cabon et al. 2020)."""
 
 import re
 from dataclasses import replace
@@ -17,24 +17,24 @@ from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import inverse
 
 CENTIMETRES = 100.0
-"""Units of depth a metre; the sky, 655.35 m away, is no reading."""
+"""Depth units per metre; the sky, at 655.35 m, is no reading."""
 
 RATE = 10.0
-"""Frames per second, those of the drives of KITTI that it is a copy of."""
+"""Frames per second, those of the KITTI drives that it imitates."""
 
 CAMERA = "Camera_0"
-"""The left one of two."""
+"""The left camera of the stereo pair."""
 
 NUMBER = re.compile(r"\d{1,9}", re.ASCII)
-"""Of a frame or a camera."""
+"""Number of a frame or a camera."""
 
 TEXTS = "it is in the dataset's vkitti_2.0.3_textgt.tar.gz"
 
 
 class VirtualKitti(NumberedFolder):
-    """A variation of a scene (`Scene01/clone`): `frames/rgb/Camera_0/`, `frames/depth/Camera_0/`, and texts.
+    """A variation of a scene (`Scene01/clone`): `frames/rgb/Camera_0/`, `frames/depth/Camera_0/`, and text files.
 
-    `intrinsic.txt` and `extrinsic.txt` have a row for each frame and camera: the camera, and the world in it.
+    `intrinsic.txt` and `extrinsic.txt` have a row for each frame and camera: the intrinsics, and camera_T_world.
     """
 
     kind: ClassVar[str] = "drive of Virtual KITTI 2"
@@ -44,12 +44,12 @@ class VirtualKitti(NumberedFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by those of the images, which are downloaded one by one."""
+        """Recognise a folder by either of its image folders, which are separate downloads."""
         return any(folder.is_dir() for folder in _folders(path))
 
     @classmethod
     def find(cls, path: Path) -> Found:
-        """Each kind has a folder."""
+        """The images of both kinds, each in its folder."""
         color, depth = folders = _folders(path)
         for folder, other in (folders, folders[::-1]):
             if not folder.is_dir():
@@ -59,7 +59,7 @@ class VirtualKitti(NumberedFolder):
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
-        """What the rows of the frames have in common."""
+        """The common camera of the frames' rows."""
         file = path / cls.INTRINSICS
         if not file.is_file():
             raise GavoError(f"{file}: no such file: {TEXTS}; or say --camera")
@@ -69,12 +69,12 @@ class VirtualKitti(NumberedFolder):
 
     @classmethod
     def stamps(cls, path: Path) -> dict[int, float]:
-        """Count by the rate."""
+        """Stamps from the frame numbers at `RATE`."""
         return {number: number / RATE for number in cls.find(path).color}
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """Those of the rows, turned round."""
+        """The poses of the rows, inverted to world_T_camera."""
         file = path / cls.POSES
         rows = _rows(file) if file.is_file() else {}
         found = {frame: pose_of(place, row) for frame, (place, row) in rows.items()}
@@ -82,17 +82,17 @@ class VirtualKitti(NumberedFolder):
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Find the files and read camera and poses; the unit of depth is known."""
+        """Open the folder; its depth unit is known."""
         return super().open(path, replace(reading, depth_scale=reading.depth_scale or CENTIMETRES))
 
 
 def _folders(path: Path) -> tuple[Path, Path]:
-    """Those of colour and of depth."""
+    """The folders of colour and depth."""
     return path / "frames/rgb" / CAMERA, path / "frames/depth" / CAMERA
 
 
 def _rows(file: Path) -> dict[int, tuple[str, list[str]]]:
-    """What follows frame and camera in each row of the camera that is read, with its place, by the frames' numbers."""
+    """The location (file:line) and the fields after frame and camera of each row of `CAMERA`, by frame number."""
     rows: dict[int, tuple[str, list[str]]] = {}
     for place, (frame, *fields) in data_rows(file):
         if frame == "frame":

@@ -60,15 +60,15 @@ LEAST_UNITS = 500.0
 
 
 def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
-    """A frame of raw images, without the camera's lens distortion.
+    """Make an undistorted frame from a device's images.
 
     Args:
-        images: as the device hands them over.
-        camera: as it records; frames are those of `camera.rectified()`.
-        color: whether the frame carries RGB beside grey.
+        images: images as delivered by the device.
+        camera: the camera as it records; the frame is that of `camera.rectified()`.
+        color: whether the frame has RGB beside grey.
 
     Raises:
-        GavoError: an image is of another size or type than it may be; the message says what was expected.
+        GavoError: an image has the wrong size or type; the message says what was expected.
     """
     require_camera(camera)
     size = (camera.height, camera.width)

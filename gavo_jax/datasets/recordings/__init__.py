@@ -1,1 +1,1 @@
-"""Recordings of ROS 1 and ROS 2 as sequences."""
+"""Sequences from ROS 1 and ROS 2 recordings."""

@@ -1,4 +1,4 @@
-"""Frames of recordings of ROS 1 and ROS 2 (SQLite, MCAP), which are read as a stream."""
+"""Sequences from recordings of ROS 1 and ROS 2 (SQLite, MCAP), which are read as a stream."""
 
 import contextlib
 import threading
@@ -25,23 +25,23 @@ from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, associate
 
 FAR_AHEAD = 64
-"""Messages that are read over on the way to a frame; for one further on the recording is entered anew."""
+"""Most messages that are skipped on the way to a frame; for one further ahead the reader seeks by time."""
 
 NOWHERE: tuple[int, int] = (2**62, 2**62)
-"""Behind every message: where a stream stands before it is entered."""
+"""Position of a stream before it is opened: after every message."""
 
 
 class BagSequence:
-    """Frames of a recording: a topic of colour and one of depth images, paired by the stamps of their headers.
+    """Frames of a recording: a colour topic and a depth topic, paired by the stamps of their message headers.
 
-    Messages are read one after the other and nothing of them is kept; a frame out of order is found by its time.
+    Messages are read in sequence and not cached; a frame out of order is sought by its time.
 
     Attributes:
-        name: of the file or folder.
+        name: name of the file or folder.
         calibration: the cameras as they record.
-        ground_truth: None: recordings hold none.
-        left_out: what is not used, and why, a line each.
-        kind: what kind of source it is.
+        ground_truth: None, as recordings hold none.
+        left_out: messages that are not used, and why, one line per reason.
+        kind: name of the kind of source.
     """
 
     kind: ClassVar[str] = "ROS bag"
@@ -50,7 +50,7 @@ class BagSequence:
         """Read the stamps of both topics, and the camera.
 
         Raises:
-            GavoError: no bag, a torn one, no topic of colour or depth or several, no camera, no frame.
+            GavoError: no bag or a damaged one, no colour or depth topic or an ambiguous choice, no camera, no frames.
         """
         self._bag = Bag(path)
         self.name = path.resolve().name if path.is_dir() else path.resolve().stem
@@ -80,12 +80,12 @@ class BagSequence:
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Recognise a recording by the file's ending, or the folder's metadata."""
+        """Recognise a recording by the file's suffix, or the folder's metadata."""
         return (path / METADATA).is_file() if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
     @classmethod
     def open(cls, path: Path, reading: Reading) -> Self:
-        """Read the recording as told."""
+        """Open the recording as specified by `reading`."""
         return cls(path, reading)
 
     @property
@@ -95,13 +95,13 @@ class BagSequence:
 
     @property
     def topics(self) -> tuple[str, str]:
-        """Names of those of colour and depth."""
+        """Names of the colour and depth topics."""
         color, depth = self._topics
         return color.name, depth.name
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames as they come."""
+        """Camera of the returned frames."""
         return self._shared.assembler.camera
 
     @property
@@ -136,14 +136,14 @@ class BagSequence:
         return (self[index] for index in range(len(self)))
 
     def raw_depth(self, index: int) -> np.ndarray:
-        """The depth image of a frame as it was recorded."""
+        """The depth image of a frame as recorded."""
         return self._decoded(index)[1].raw
 
     def check(self) -> None:
-        """Refuse a first frame that is unusable.
+        """Refuse an empty sequence, or an unusable first frame.
 
         Raises:
-            GavoError: there is none, or it cannot be decoded.
+            GavoError: there is no frame, or the first cannot be decoded.
         """
         if len(self) == 0:
             raise GavoError(f"{self.name}: no frames in the chosen range")
@@ -173,7 +173,7 @@ class BagSequence:
 
 
 class _Shared:
-    """What kind of images a recording has, found out once; its slices share it."""
+    """The kind of a recording's images, found once from a few of them and shared by its slices."""
 
     def __init__(self, sequence: BagSequence, reading: Reading):
         self._sequence, self._reading = sequence, reading
@@ -199,7 +199,7 @@ class _Shared:
 
 
 def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> float:
-    """Millimetres, as messages have them, unless they look otherwise: a preset's scale is that of its files."""
+    """Millimetres, usual in messages, unless depth looks otherwise: a preset's scale holds for its own files only."""
     sample = sample_depth([depth.raw for depth in depths])
     if sample is None:
         return MILLIMETRES
@@ -207,7 +207,7 @@ def _scale_of_integers(depths: list[DepthImage], calibration: Calibration) -> fl
 
 
 class _Stream:
-    """Gives the messages of frame after frame; each is read once while frames are asked for in order."""
+    """Reads the messages of frames; each message is read only once if frames are requested in order."""
 
     def __init__(self, bag: Bag, topics: tuple[Topic, ...]) -> None:
         self._bag, self._topics, self._lock = bag, topics, threading.Lock()
@@ -217,10 +217,10 @@ class _Stream:
         self._pending: dict[tuple[int, int], tuple[bytes, str]] = {}
 
     def messages(self, *wanted: int) -> list[Any]:
-        """The messages of these numbers, one of each topic.
+        """The messages with these numbers, one of each topic.
 
         Raises:
-            FrameError: the recording ends before, or a message cannot be read.
+            FrameError: the recording ends before them, or a message cannot be read.
         """
         with self._lock:
             for key in [key for key in self._pending if key[1] < wanted[key[0]]]:
@@ -244,7 +244,7 @@ class _Stream:
         return (topic, number) not in self._pending and not 0 <= ahead <= FAR_AHEAD
 
     def _enter(self, wanted: tuple[int, ...]) -> None:
-        """Go to where the earlier of the wanted messages lies."""
+        """Seek to the earlier of the wanted messages."""
         start = min(int(topic.received[number]) for topic, number in zip(self._topics, wanted, strict=True))
         self._next = [int(np.searchsorted(topic.received, start)) for topic in self._topics]
         self._pending.clear()

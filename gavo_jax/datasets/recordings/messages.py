@@ -1,4 +1,4 @@
-"""Images and cameras in the messages of ROS, whatever version: raw, compressed, and depth compressed its own way."""
+"""Decoding of images and cameras in messages of ROS 1 and 2: raw, compressed, and compressedDepth."""
 
 import math
 import re
@@ -48,34 +48,34 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
     "32FC1": ("f4", 1, None),
     "64FC1": ("f8", 1, None),
 }
-"""Number type and channels of an encoding, and what makes BGR of it (None: it is, or it is depth)."""
+"""Number type, channels and conversion to BGR of each encoding (None: it is BGR already, or depth)."""
 
 HALVED = ("nv12", "nv21")
-"""Below the rows of brightness half as many of colour, at half the width."""
+"""Encodings whose rows of luma are followed by half as many rows of chroma, subsampled by two."""
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "64FC1", "mono16", "Z16")
 """Encodings of raw depth images; Z16 is what librealsense calls 16UC1."""
 
 FILM = re.compile(r"(?i)\b(?:[hx]\.?26[45]|hevc|avc|vp[89]|av1|theora)\b")
-"""In the format of compressed images that are no images of their own."""
+"""Matches formats of video codecs, whose frames cannot be decoded on their own."""
 
 DEPTH_HEADER = 12
-"""Bytes before the image in a message of the transport compressedDepth: a format and two coefficients."""
+"""Size of the header before the image in a compressedDepth message, bytes: a format and two coefficients."""
 
 AS_COMPRESSED = re.compile(r"\bcompressed +(\w+)")
-"""In the format of compressed images: the encoding that they were given before they were compressed."""
+"""Matches the encoding, before compression, in the format of compressed images."""
 
 INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|disparity|confidence)\d*(?:[/_]|$)")
-"""In the name of a topic of numbers that are brightness, pixels or a probability, and no depth."""
+"""Matches names of topics whose numbers are intensity, disparity or confidence, not depth."""
 
 
 def encoding_of(kind: str, message: Any) -> str:
-    """What an image message says that it holds: of a compressed one the format."""
+    """The encoding of an image message, or the format of a compressed one."""
     return message.encoding if kind == IMAGE else message.format
 
 
 def is_depth(kind: str, message: Any, topic: str) -> bool:
-    """Whether an image message holds depth, by its encoding; where that leaves it open, by the topic's name."""
+    """Whether an image message holds depth, by its encoding, or if that is ambiguous by the topic's name."""
     encoding = encoding_of(kind, message)
     is_named = "depth" in topic.lower()
     if INFRARED.search(topic) and not is_named:
@@ -86,10 +86,10 @@ def is_depth(kind: str, message: Any, topic: str) -> bool:
 
 
 def color_of(kind: str, message: Any, name: str) -> np.ndarray:
-    """BGR of 8 or 16 bits.
+    """Decode a colour message to BGR of 8 or 16 bits.
 
     Raises:
-        FrameError: an encoding that is not known, or too few bytes; `name` stands in it.
+        FrameError: an unknown encoding, or too few bytes; the message contains `name`.
     """
     if kind == COMPRESSED:
         if FILM.search(message.format):
@@ -106,14 +106,14 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
 
 
 def _mosaic(form: str) -> str | None:
-    """Which mosaic of colours a format's images hold: it is compressed as it is, or what it was made into first."""
+    """The Bayer encoding that compressed images still have; None if they were converted before compression."""
     compressed = AS_COMPRESSED.search(form)
     encoding = compressed.group(1) if compressed else form.partition(";")[0].strip()
     return encoding if encoding.startswith("bayer_") and encoding in LAYOUTS else None
 
 
 def _converted(pixels: np.ndarray, encoding: str, name: str) -> np.ndarray:
-    """Pixels as they stand in a message as BGR."""
+    """Convert the pixels of a message to BGR."""
     conversion = LAYOUTS[encoding][2]
     try:
         return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
@@ -123,10 +123,10 @@ def _converted(pixels: np.ndarray, encoding: str, name: str) -> np.ndarray:
 
 
 def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
-    """Raw depth, 16-bit integers or float32.
+    """Decode a depth message to raw depth, 16-bit integers or float32.
 
     Raises:
-        FrameError: no depth, an encoding that is not known, or too few bytes; `name` stands in it.
+        FrameError: not depth, an unknown encoding, or too few bytes; the message contains `name`.
     """
     if kind == IMAGE:
         if message.encoding not in DEPTH_ENCODINGS:
@@ -148,20 +148,20 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
     stored = decode_depth(data[DEPTH_HEADER:], name)
     if not _is_inverse(message.format, slope):
         return stored
-    with np.errstate(divide="ignore"):  # inverse depth was rounded; 0 stands for no reading
+    with np.errstate(divide="ignore"):  # quantised inverse depth; 0 = no reading
         return np.where(stored > 0, np.float32(slope) / (stored.astype(np.float32) - np.float32(offset)), np.float32(0))
 
 
 def _is_inverse(form: str, slope: float) -> bool:
-    """Whether compressed depth counts 1 / z: of 32FC1, or where the format is silent and there is a slope.
+    """Whether compressed depth is inverse depth: for 32FC1, or if the format doesn't say and the slope is above 0.
 
-    Before 16UC1 the transport writes whatever lay in memory for a slope.
+    For 16UC1 the slope is ignored: the transport leaves it uninitialised.
     """
     return "32FC1" in form or "16UC1" not in form and math.isfinite(slope) and slope > 0
 
 
 def _pixels(message: Any, name: str) -> np.ndarray:
-    """Pixels as they stand in a raw image message, [h, w] or [h, w, channels]."""
+    """The pixels of a raw image message, not converted, [h, w] or [h, w, channels]."""
     layout = LAYOUTS.get(message.encoding)
     if layout is None:
         raise FrameError(f"{name}: encoding {message.encoding[:40]!r} is not one of {', '.join(LAYOUTS)}")
@@ -183,16 +183,16 @@ def _pixels(message: Any, name: str) -> np.ndarray:
 
 
 def is_calibrated(info: Any) -> bool:
-    """Whether a camera_info says anything: drivers without a calibration send zeros."""
+    """Whether a camera_info holds a calibration: drivers without one send zeros."""
     return info.width > 0 and any(getattr(info, "k", getattr(info, "K", ())))
 
 
 def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
-    """What a camera_info says, by the keys of a camera file.
+    """Convert a camera_info to the keys of a camera file.
 
     Args:
         info: the message, of ROS 1 (K, D, P) or ROS 2 (k, d, p).
-        rectified: whether the images are free of distortion; the projection matrix is theirs.
+        rectified: whether the images are free of distortion, so that the projection matrix applies.
     """
 
     def numbers(name: str) -> list[float]:
@@ -207,19 +207,18 @@ def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
 
 
 def as_taken(place: str, table: dict[str, Any], info: Any, find_size: Callable[[], tuple[int, int]]) -> dict[str, Any]:
-    """The camera of images that are a region of the sensor's, or hold its pixels in groups, as its camera_info says.
+    """Adapt a sensor's camera to images that are cropped (roi) or binned, according to its camera_info.
 
-    Where the images have the size that stands there all the same, its numbers are those of the groups: some drivers
-    have it so.
+    If the images have the stated size nevertheless, the numbers are taken to be theirs already, as in some drivers.
 
     Args:
         place: names the topic in messages.
-        table: of the whole sensor, as `camera_table` has it.
+        table: camera of the full sensor, from `camera_table`.
         info: the message.
-        find_size: width and height of the images, asked where it counts.
+        find_size: finds width and height of the images; called only if needed.
 
     Raises:
-        GavoError: the images are of the sensor's size, and a region of it begins elsewhere than at its corner.
+        GavoError: the images have the full size, but the region does not start at the sensor's corner.
     """
     region, whole = info.roi, (table["width"], table["height"])
     offset, groups = (int(region.x_offset), int(region.y_offset)), (int(info.binning_x) or 1, int(info.binning_y) or 1)

@@ -1,4 +1,4 @@
-"""A recording of ROS 1 or ROS 2 (SQLite, MCAP) as the library rosbags opens it: its messages, topics and cameras."""
+"""Recordings of ROS 1 and ROS 2 (SQLite, MCAP), opened by the library rosbags: messages, topics and cameras."""
 
 import contextlib
 import io
@@ -35,25 +35,25 @@ from gavo_jax.errors import GavoError, blamed
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
-"""In the folder of a ROS 2 bag."""
+"""Name of the metadata in the folder of a ROS 2 bag."""
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of what is compressed so."""
+"""First bytes of data compressed by zstd."""
 MCAP = b"\x89MCAP0\r\n"
-"""First bytes of such a file."""
+"""First bytes of an MCAP file."""
 FOREIGN = {
     "": "its header names no profile, and the library reads 'ros2' alone: ros2 bag convert writes it so, if ROS 2's "
     "messages are in it",
     "ros1": "its profile is 'ros1', and the library reads 'ros2' alone: name the .bag that it was made from",
 }
-"""What to do about an MCAP by the profile in its header."""
+"""What to do about an unsupported MCAP, by the profile in its header."""
 FEW = 30
-"""Messages of a topic that are looked at for one that says something."""
+"""Number of messages of a topic that are searched for a usable one."""
 ROUNDED = 0.05
-"""Pixels by which the same camera may differ from one camera_info to another."""
+"""Largest difference between two camera_infos of the same camera, pixels."""
 
 
 class Bag:
-    """A recording as the library opens it; whatever it raises is one line here."""
+    """A recording opened by the library, whose exceptions are turned into one-line errors."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -74,7 +74,7 @@ class Bag:
         self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
 
     def stream(self, names: list[str], start: int | None = None) -> Iterator[tuple[str, bytes, str]]:
-        """Topic, content and type of messages, in the order in which they were received, from a time (ns) on."""
+        """Topic, content and type of messages in the order of their arrival, from time `start` (ns) on."""
         connections = [connection for connection in self._reader.connections if connection.topic in names]
         for connection, _, raw in self._reader.messages(connections, start=start):
             if self._reader.is2 and bytes(raw[:4]) == ZSTD:
@@ -84,12 +84,12 @@ class Bag:
             yield connection.topic, bytes(raw), connection.msgtype
 
     def deserialize(self, raw: bytes, kind: str) -> Any:
-        """The message; raises `FrameError` for one that is torn."""
+        """Deserialise a message; raises `FrameError` if it is damaged."""
         with legible(self.path, FrameError):
             return self._reader.deserialize(raw, kind)
 
     def topic(self, name: str) -> Topic:
-        """Go over the messages of a topic for their stamps."""
+        """Collect the stamps of a topic's messages."""
         connections = [connection for connection in self._reader.connections if connection.topic == name]
         received, stamps = [], []
         with legible(self.path):
@@ -99,7 +99,7 @@ class Bag:
         return Topic(name, self.kinds[name], np.array(received, np.int64), np.array(stamps))
 
     def first(self, name: str, is_good: Callable[[Any], bool] = lambda message: True) -> Any | None:
-        """The first message of a topic, of the first few those that are good."""
+        """The first good message among the first few of a topic; None if none is."""
         with legible(self.path):
             few = itertools.islice(self.stream([name]), FEW)
             messages = (self._reader.deserialize(raw, kind) for _, raw, kind in few)
@@ -115,7 +115,7 @@ class Bag:
         return width, height
 
     def choose(self, reading: Reading) -> tuple[str, str]:
-        """The topics of colour and depth, those that are named or those that messages and names speak for."""
+        """The colour and depth topics: the ones given, else chosen by their messages and names."""
         images = {}
         for name, kind in sorted(self.kinds.items()):
             if (message := self.first(name)) is not None:
@@ -145,7 +145,7 @@ class Bag:
         frames = (info.header.frame_id, other[1].header.frame_id)
         says_so = says_registered(color, depth)
         is_one_place = frames[0] == frames[1] or not all(frames) or says_so
-        are_placed = any(frames) or says_so  # two that have no name are not for that one frame
+        are_placed = any(frames) or says_so  # two unnamed frames need not be the same
         color_T_depth, where = self._between(*frames) if are_placed else (None, "")
         if _is_same(moved, camera):
             color_T_depth = np.eye(4) if is_one_place else color_T_depth
@@ -162,7 +162,7 @@ class Bag:
         return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
 
     def _alone(self, camera: Camera, name: str, topics: tuple[str, str], frame: str) -> Calibration:
-        """One camera for both topics, where nothing says that depth, without a camera_info, lies in another frame."""
+        """One camera for both topics, if depth, without a camera_info, isn't in another frame."""
         image = self.first(topics[1])
         other = frame if image is None else image.header.frame_id
         color_T_depth, _ = self._between(frame, other)
@@ -175,31 +175,31 @@ class Bag:
         return Calibration(camera, origin=name, states_depth_scale=False)
 
     def _between(self, a: str, b: str) -> tuple[np.ndarray | None, str]:
-        """`a_T_b`, and the topic that says it; None where nothing does."""
+        """`a_T_b` and the topic that it comes from; None if unknown."""
         found = between(self._fixed, a, b)
         return (found, FIXED_TOPIC) if found is not None else (between(self._unchanged, a, b), ANY_TOPIC)
 
     @cached_property
     def _fixed(self) -> dict[tuple[str, str], np.ndarray]:
-        """The transforms that are published once."""
+        """Transforms that are published once."""
         return self._transforms(FIXED_TOPIC)
 
     @cached_property
     def _unchanged(self) -> dict[tuple[str, str], np.ndarray]:
-        """Those, and the ones that are published over and over without a change."""
+        """Transforms that are published once, or repeatedly without changes."""
         return self._transforms(FIXED_TOPIC, ANY_TOPIC)
 
     def _transforms(self, *names: str) -> dict[tuple[str, str], np.ndarray]:
-        """The transforms of some topics that never change."""
+        """The transforms on some topics that never change."""
         topics = [c.topic for c in self._reader.connections if c.topic in names and c.msgtype == TRANSFORMS]
         with blamed(f"{self.path}: {' and '.join(names)}"):
             raw = self.stream(topics) if topics else ()
             return fixed_transforms(self._reader.deserialize(content, kind) for _, content, kind in raw)
 
     def _info(self, topic: str) -> tuple[str, Any] | None:
-        """Name and first message of the camera_info beside a topic of images; one that says something, if any does.
+        """Name and first message of the camera_info beside an image topic, preferably one with a calibration.
 
-        RealSense's own recordings have it in a place of its own, `info/` beside `image/`.
+        RealSense's own recordings have it in `info/` beside `image/`.
         """
         infos = [c.topic for c in self._reader.connections if c.msgtype == CAMERA_INFO]
         parts = topic.split("/")
@@ -219,7 +219,7 @@ class Bag:
 
 
 class _File(io.BufferedReader):
-    """A file that closes itself when nobody holds it any more: to read a recording is no context to be left."""
+    """A file that is closed when it is garbage collected, since sequences aren't closed explicitly."""
 
     def close(self) -> None:
         self.raw.close()
@@ -227,9 +227,9 @@ class _File(io.BufferedReader):
 
 
 def _own_files(reader: Any) -> None:
-    """Let the library read files that close themselves in place of those that it opened.
+    """Replace the files that the library opened by ones that close themselves.
 
-    It does not get to closing a ROS 1 file while somebody holds a message of its last chunk.
+    The library fails to close a ROS 1 file while a message of its last chunk is still referenced.
     """
     for part in reader.readers:
         if isinstance(file := getattr(part, "bio", None), io.BufferedReader):
@@ -239,13 +239,13 @@ def _own_files(reader: Any) -> None:
 
 @contextlib.contextmanager
 def legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
-    """Turn what the library raises of a torn recording into one line that says what may help."""
+    """Turn the library's exceptions about a damaged recording into a one-line error with advice."""
     with blamed(f"{path}: not a bag that can be read", lambda words: kind(f"{words}: {_mending(path)}")):
         yield
 
 
 def _mending(path: Path) -> str:
-    """What may help with a recording that is torn."""
+    """Suggest a fix for a damaged recording."""
     files = [path] if path.is_file() else list(path.iterdir())
     profiles = {_profile(file) for file in files if file.suffix.lower() == ".mcap"}
     if (profile := next(iter(profiles - {"ros2", None}), None)) is not None:
@@ -256,7 +256,7 @@ def _mending(path: Path) -> str:
 
 
 def _profile(file: Path) -> str | None:
-    """The profile in the header of an MCAP, the first of its records; None where there is no such header."""
+    """The profile in the header (first record) of an MCAP; None if there is no such header."""
     with contextlib.suppress(OSError, struct.error, UnicodeDecodeError), file.open("rb") as stream:
         magic, kind, _, length = struct.unpack("<8sBQI", stream.read(21))
         if (magic, kind) == (MCAP, 1) and len(profile := stream.read(min(length, 64))) == length:
@@ -265,13 +265,13 @@ def _profile(file: Path) -> str | None:
 
 
 def _close(reader: Any) -> None:
-    """Close a recording that nobody holds any more, as far as the library gets."""
+    """Close a recording that is no longer referenced, ignoring failures of the library."""
     with contextlib.suppress(Exception):
         reader.close()
 
 
 def _stamp(raw: Any, is_2: bool) -> float:
-    """Seconds, from the header that every image message begins with."""
+    """The stamp, seconds, in the header at the start of every image message."""
     data = bytes(raw[:12])
     if len(data) < 12:
         return 0.0
@@ -281,6 +281,6 @@ def _stamp(raw: Any, is_2: bool) -> float:
 
 
 def _is_same(a: Camera, b: Camera) -> bool:
-    """Whether two cameras without their lenses are one, as far as their numbers are rounded."""
+    """Whether two cameras have the same size and intrinsics (not distortion), up to rounding."""
     numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
     return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))

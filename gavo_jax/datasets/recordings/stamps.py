@@ -1,4 +1,4 @@
-"""The stamps of a recording's messages: by which clock they are paired, and which of them count."""
+"""Timestamps of a recording's messages: which clock pairs them, and which messages are used."""
 
 from bisect import bisect, insort
 from collections.abc import Sequence
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 JITTER = 0.5
-"""Seconds by which stamps may go back in the order of arrival; by more, a clock was set back."""
+"""Largest step back of stamps in the order of arrival, seconds; after a larger one the clock was reset."""
 
 HOLE, AMID = 1.5, 2
-"""Times the usual step: the least that a message which comes late leaves open, into which its stamp belongs. So many
-stamps one after the other that belong into none are of a clock that was set back by less than `JITTER`."""
+"""Smallest gap that a late message leaves, in median steps; its stamp falls into that gap. `AMID` successive stamps that
+go back, but fall into no gap, mean a clock that was reset by less than `JITTER`."""
 
 
 class Topic(NamedTuple):
@@ -20,28 +20,28 @@ class Topic(NamedTuple):
     name: str
     kind: str
     received: np.ndarray
-    """Nanoseconds."""
+    """Time of arrival, nanoseconds."""
     stamps: np.ndarray
-    """Seconds, of their headers; 0 where they have none."""
+    """Stamps of the headers, seconds; 0 where they have none, NaN where a message is not used."""
     repeated: int = 0
-    """How many have the stamp of one before them."""
+    """Number of messages with the stamp of an earlier one."""
     aside: int = 0
-    """How many are of another run of the clock than those that are used."""
+    """Number of messages from other runs of the clock, which are not used."""
     why: str = ""
-    """Where the clock was set back."""
+    """Description of where the clock was reset."""
 
     @property
     def span(self) -> str:
-        """The first and the last stamp, in words."""
+        """The first and last stamp, for messages."""
         if not len(self.stamps):
             return f"{self.name} has no message"
         return f"{self.name} goes from {np.nanmin(self.stamps):.3f} to {np.nanmax(self.stamps):.3f}"
 
 
 def in_one_time(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
-    """Stamp both by the headers, without which a message has no partner; where a topic has none, by arrival.
+    """Stamp both topics by their headers, or by arrival if either topic has no header stamps.
 
-    Stamps that stand still are none.
+    Stamps that are all equal don't count. With header stamps, messages without one aren't paired.
     """
     topics = color, depth
     if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
@@ -52,9 +52,9 @@ def in_one_time(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
 
 
 def of_one_run(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
-    """Topics of which the longest run of colour's clock counts: a simulator that is reset sets the clock back.
+    """Keep only the longest run of the clock: resetting a simulator resets its clock.
 
-    Messages of two runs may have the same stamps, and are of different places.
+    Messages of two runs may have equal stamps although they show different places.
     """
     runs = _runs(color.stamps)
     is_used = runs == _longest(runs)
@@ -67,9 +67,9 @@ def of_one_run(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
 
 
 def once(topic: Topic) -> Topic:
-    """A topic of which a message that comes twice, by its stamp, counts the first time.
+    """Keep only the first of messages with equal stamps.
 
-    Two publishers of one topic leave such, or a recording that was played while it was recorded again.
+    Repetitions come from two publishers of one topic, or from recording a recording that is played.
     """
     is_first = np.zeros(len(topic.stamps), bool)
     is_first[np.unique(topic.stamps, return_index=True)[1]] = True
@@ -78,7 +78,7 @@ def once(topic: Topic) -> Topic:
 
 
 def _runs(stamps: np.ndarray) -> np.ndarray:
-    """Which run of the clock each message is of; -1 for one without a stamp, or with one far from both beside it."""
+    """The run of the clock that each message belongs to; -1 if it has no stamp, or one far from both neighbours'."""
     stamped = np.flatnonzero(np.isfinite(stamps))
     before, here, after = (stamps[stamped[part]] for part in (slice(-2), slice(1, -1), slice(2, None)))
     is_stray = (before <= after + JITTER) & ((here > after + JITTER) | (here < before - JITTER))
@@ -97,7 +97,7 @@ def _runs(stamps: np.ndarray) -> np.ndarray:
 
 
 def _are_amid(stamps: np.ndarray, earlier: Sequence[float], hole: float) -> bool:
-    """Whether stamps lie amid earlier ones, in order, that leave none of them open; those that come again do not."""
+    """Whether all stamps fall strictly between earlier ones, but into no gap; repeated stamps don't."""
     places = [bisect(earlier, float(stamp)) for stamp in stamps]
     return len(stamps) == AMID and all(
         0 < place < len(earlier) and earlier[place - 1] < stamp and earlier[place] - earlier[place - 1] < hole
@@ -106,12 +106,12 @@ def _are_amid(stamps: np.ndarray, earlier: Sequence[float], hole: float) -> bool
 
 
 def _longest(runs: np.ndarray) -> int:
-    """The run that most messages are of, the first of several."""
+    """The run with most messages, the first if several have as many."""
     return int(np.bincount(runs[runs >= 0], minlength=1).argmax())
 
 
 def _aside(topic: Topic, is_used: np.ndarray) -> Topic:
-    """A topic of which some messages lose their stamps, with the place where the clock is set back the most."""
+    """Remove the stamps of unused messages, and describe where the clock goes back the most."""
     aside = ~is_used & np.isfinite(topic.stamps)
     if not aside.any():
         return topic

@@ -1,4 +1,4 @@
-"""Which topics of a recording are colour and depth of one camera, by their names and what their messages hold."""
+"""Choice of a recording's colour and depth topics of one camera, by their names and messages."""
 
 import re
 from collections.abc import Mapping
@@ -9,37 +9,37 @@ from gavo_jax.datasets.recordings.messages import COMPRESSED, DEPTH_ENCODINGS, I
 from gavo_jax.errors import GavoError
 
 COLOR_NAMES, DEPTH_NAMES = ("color", "colour", "rgb"), ("aligned", "registered", "depth_to_rgb", "depth_to_color")
-"""Words in the names of topics that are chosen before others of the same camera."""
+"""Words in topic names that are preferred among those of one camera."""
 
 MOVED_COLOR = ("rgb_to_depth", "color_to_depth")
-"""In the names of topics of colour as the depth camera would see it, which are chosen last."""
+"""Words in names of colour topics that are warped to the depth camera, which are chosen last."""
 
 DEVICE = re.compile(r"depth_?(?:ai|cam(?:era)?|sensor)")
-"""In the name of a topic: a device that is called after depth, whose other images are no pictures of it."""
+"""Matches device names that contain "depth", whose other images don't show depth."""
 
 COLORED = re.compile(r"colou?r(?:ed|i[sz]ed|_?map)")
-"""In the name of a topic of depth that was drawn in colours."""
+"""Matches names of topics with colour-mapped depth."""
 
 SENSOR = re.compile(r"/sensor_\d+(?=/)")
-"""In the names of RealSense's own recordings, which number the sensors of one device."""
+"""Matches the sensor numbers of one device in RealSense's own recordings."""
 
 STREAM = re.compile(
     r"(?:colou?r|rgb|ima?ge?|ir|infra(?:red)?|left|right|stereo|mono|gr[ae]y|aligned|registered|disparity)\d*|.*depth.*"
 )
-"""A word that tells one image of a camera from another, and no camera from another."""
+"""Matches words that distinguish images of one camera, not cameras."""
 
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
-"""In the name of a topic whose images are free of distortion."""
+"""Matches names of topics whose images are rectified."""
 
 
 class Images(NamedTuple):
-    """What the first message of a topic tells of all."""
+    """Properties of an image topic, from its first message."""
 
     is_depth: bool
     encoding: str
     """Encoding of raw images; the format of compressed ones."""
     frame: str
-    """In which their camera looks."""
+    """Coordinate frame of the camera."""
 
     @classmethod
     def of(cls, kind: str, message: Any, topic: str) -> "Images":
@@ -48,16 +48,16 @@ class Images(NamedTuple):
 
 
 def choose(path: Path, images: Mapping[str, Images], color: str | None, depth: str | None) -> tuple[str, str]:
-    """Return the topics of colour and depth: those that are named, and beside them those of the same camera.
+    """Return the colour and depth topics: those given, else those of the same camera.
 
     Args:
-        path: of the recording, for what is said of it.
-        images: by the names of topics.
-        color: the topic of colour, where it is named.
-        depth: the topic of depth, where it is named.
+        path: the recording, for messages.
+        images: properties of the image topics, by name.
+        color: the colour topic, if given.
+        depth: the depth topic, if given.
 
     Raises:
-        GavoError: there is none, or there are several, of one camera or of more.
+        GavoError: a topic is missing, or the choice is ambiguous, within a camera or between several.
     """
     if not images:
         raise GavoError(f"{path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
@@ -85,24 +85,24 @@ def choose(path: Path, images: Mapping[str, Images], color: str | None, depth: s
 
 
 def are_of_two_cameras(color: str, depth: str) -> bool:
-    """Whether topics part at the names of two cameras, `/front/color` and `/rear/depth`, and not at their images'."""
+    """Whether topics belong to two cameras, as `/front/color` and `/rear/depth`, by where their names differ."""
     both = list(zip(_words(color), _words(depth), strict=False))
     at = next((at for at, (a, b) in enumerate(both) if a != b), len(both))
     return at + 1 < len(both) and not any(STREAM.fullmatch(word) for word in both[at])
 
 
 def says_registered(color: str, depth: str) -> bool:
-    """Whether the topic of depth says of itself that it lies on the images of colour, of the same camera."""
+    """Whether the depth topic is named as registered to colour, and is of the same camera."""
     return _is_named(depth, DEPTH_NAMES) and not are_of_two_cameras(color, depth)
 
 
 def says_rectified(topic: str) -> bool:
-    """Whether a topic's name says that its images are free of distortion."""
+    """Whether a topic is named as rectified."""
     return bool(RECTIFIED.search(topic))
 
 
 def _of_depth(images: Mapping[str, Images], color: str | None, depth: str | None) -> list[str]:
-    """Topics that may be the depth."""
+    """Candidates for the depth topic."""
     if depth is not None:
         return [depth]
     names = _without_copies([name for name, one in images.items() if one.is_depth])
@@ -110,7 +110,7 @@ def _of_depth(images: Mapping[str, Images], color: str | None, depth: str | None
 
 
 def _of_color(images: Mapping[str, Images], color: str | None, depth: str | None) -> list[str]:
-    """Topics that may be the colour; a picture of depth has to be named."""
+    """Candidates for the colour topic; visualised depth counts only if there is nothing else."""
     if color is not None:
         return [color]
     names = _without_copies([name for name, one in images.items() if not one.is_depth])
@@ -119,9 +119,9 @@ def _of_color(images: Mapping[str, Images], color: str | None, depth: str | None
 
 
 def _cameras(color: list[str], depth: list[str], level: int = 0) -> list[tuple[list[str], list[str]]]:
-    """Topics of colour and depth by their cameras: the longest beginnings of names that both are found under.
+    """Group colour and depth topics by camera: the longest name prefixes that have topics of both kinds.
 
-    Where nothing but the whole has both, it is one camera.
+    If only the whole set has both, it is one camera.
     """
     color = _to_be_seen(color)
     places: dict[str, tuple[list[str], list[str]]] = {}
@@ -134,7 +134,7 @@ def _cameras(color: list[str], depth: list[str], level: int = 0) -> list[tuple[l
 
 
 def _to_be_seen(names: list[str]) -> list[str]:
-    """Topics of colour, or else of infrared, or else of what was moved to the depth camera."""
+    """Colour topics, else infrared ones, else those warped to the depth camera."""
     here = [name for name in names if not _is_named(name, MOVED_COLOR)]
     return [name for name in here if not INFRARED.search(name.lower())] or here or names
 
@@ -144,12 +144,12 @@ def _preferred(names: list[str], words: tuple[str, ...]) -> list[str]:
 
 
 def _words(topic: str) -> list[str]:
-    """The words of a topic's name, small."""
+    """The words of a topic's name in lower case."""
     return [word for word in re.split("[/_]", SENSOR.sub("", topic).lower()) if word]
 
 
 def _shows_depth(topic: str) -> bool:
-    """Whether the name of a topic of other images than depth says that they show depth."""
+    """Whether a topic that is not depth is named as a picture of depth."""
     name = topic.lower()
     for words in MOVED_COLOR:
         name = name.replace(words, "")
@@ -157,18 +157,18 @@ def _shows_depth(topic: str) -> bool:
 
 
 def _unread(images: Mapping[str, Images]) -> str:
-    """Which topics, by their names, would be depth if their encoding were."""
+    """Describe topics that are named as depth, but have another encoding; empty if there are none."""
     faults = [f"{name} has {one.encoding[:40]!r}" for name, one in sorted(images.items()) if _shows_depth(name)]
     return f": {', '.join(faults)}, and not {', '.join(DEPTH_ENCODINGS)}" if faults else ""
 
 
 def _without_copies(names: list[str]) -> list[str]:
-    """Topics without those that hold the same images as another, compressed."""
+    """Leave out topics that are compressed copies of another."""
     return [name for name in names if name.rpartition("/")[0] not in names]
 
 
 def _is_named(topic: str, words: tuple[str, ...]) -> bool:
-    """Whether a topic's name holds one of some words, small or capital."""
+    """Whether a topic's name contains one of some words, ignoring case."""
     return any(word in topic.lower() for word in words)
 
 

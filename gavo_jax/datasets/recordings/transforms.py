@@ -1,4 +1,4 @@
-"""How the frames of a device lie to each other, from the transforms that ROS publishes and that never change."""
+"""Fixed transforms between the coordinate frames of a device, from ROS's tf messages."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,20 +10,19 @@ from gavo_jax.trajectory import inverse, rotation_from_quaternion
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIXED_TOPIC, ANY_TOPIC = "/tf_static", "/tf"
-"""Topics of transforms that are published once, and of those that are published over and over, changed or not."""
+"""Topics of transforms that are published once, and of those published repeatedly, whether they change or not."""
 
 LONGEST_OFF = 0.01
-"""How far a quaternion's length may be off 1, as ROS's own library has it: zeros and what was never filled in are no
-rotation."""
+"""Tolerance of a quaternion's norm around 1, as in ROS's own library: excludes zeros and uninitialised values."""
 
 STILL = 1e-6
-"""Difference of a transform's numbers, metres among them, above which it has changed."""
+"""Largest difference of a transform's elements (metres for the translation) at which it counts as unchanged."""
 
 
 def fixed_transforms(messages: Iterable[Any]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """Return `a_T_b` by the names (a, b) of frames, both ways, of messages of the type `TRANSFORMS`.
+    """Return `a_T_b`, in both directions, by frame names (a, b), from messages of type `TRANSFORMS`.
 
-    Those that change are left out, and those that are no transforms.
+    Transforms that change and invalid ones are left out.
     """
     found, moving = {}, set()
     for message in messages:
@@ -44,7 +43,7 @@ def fixed_transforms(messages: Iterable[Any]) -> dict[tuple[str, str], Float[np.
 def between(
     transforms: dict[tuple[str, str], Float[np.ndarray, "4 4"]], a: str, b: str
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Return `a_T_b` along a chain of transforms, the shortest that there is; None where there is none."""
+    """Return `a_T_b` along the shortest chain of transforms; None if there is none."""
     a, b = a.strip("/"), b.strip("/")
     reached, edge = {a: np.eye(4)}, [a]
     while edge and b not in reached:
