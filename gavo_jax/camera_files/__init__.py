@@ -1,1 +1,1 @@
-"""The cameras of a device from a file, whoever wrote it."""
+"""Reading of cameras from files of many formats."""

@@ -1,4 +1,4 @@
-"""The cameras of an RGB-D device, from a preset's name or a file; what the numbers of any file may be."""
+"""Calibration of an RGB-D device, from a preset's name or a file, with checks of its values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,13 +31,13 @@ MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
 """Largest of OpenCV's coefficients; what is larger was meant as something else."""
 
 DEPTH_SCALE = 5000.0
-"""Where nobody says it: that of the TUM benchmark."""
+"""Default depth scale, units per metre: the TUM benchmark's."""
 
 LARGEST_SHIFT = 10.0
 """Metres between the colour and the depth camera of one device; more is a unit mistaken."""
 
 ROTATION_TOLERANCE = 1e-3
-"""How far a rotation, printed with a few digits, may be off one."""
+"""Tolerance of rotation matrices, which may be printed with few digits."""
 
 RIG_KEYS = ("depth", "colour_T_depth", "color_T_depth")
 
@@ -54,10 +54,10 @@ class Calibration:
         color: the colour camera; its `depth_scale` is that of the depth images.
         depth: the depth camera; None where depth is registered to colour, so that one camera is both.
         color_T_depth: maps points of the depth camera into the colour camera, metres.
-        origin: where the numbers are from, for people.
-        states_depth_scale: whether that source says the depth scale; else `color.depth_scale` is only an assumption.
-        preset: the preset's name, if it is one: the sensor is known then.
-        depth_delay: seconds that depth is taken after what its stamp says, or the colour image's where it has none.
+        origin: where the numbers come from, for messages.
+        states_depth_scale: whether that source states the depth scale; else `color.depth_scale` is an assumption.
+        preset: the preset's name, if it is one, so that the sensor is known.
+        depth_delay: seconds from depth's stamp (the colour image's, if it has none) to its actual time.
     """
 
     color: Camera
@@ -69,7 +69,7 @@ class Calibration:
     depth_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise GavoError where the depth camera's place is missing, or is none."""
+        """Raise GavoError if the depth camera's pose is missing or not a rigid transform."""
         if (self.depth is None) != (self.color_T_depth is None):
             raise GavoError("a calibration has a depth camera and color_T_depth, or neither: depth is registered then")
         place = self.color_T_depth
@@ -77,13 +77,13 @@ class Calibration:
             raise GavoError("color_T_depth: a 4x4 matrix is needed, of a rotation and a translation")
 
     def with_depth_scale(self, scale: float) -> "Calibration":
-        """The same with a depth scale that is known."""
+        """The same calibration with a known depth scale."""
         return replace(self, color=replace(self.color, depth_scale=scale), states_depth_scale=True)
 
     def with_depth_of_size(self, width: int, height: int) -> "Calibration":
-        """The same where depth is of colour's view at a size of its own, as phones and their like have it.
+        """The same calibration for depth of another size that is registered to colour, as from phones.
 
-        Itself where depth has a camera already, has colour's size, or cannot be of that view: of another shape.
+        Unchanged if there is a depth camera, if depth has colour's size, or if the aspect ratios differ.
         """
         color = self.color
         if self.depth is not None or (width, height) == (color.width, color.height):
@@ -93,7 +93,7 @@ class Calibration:
         return replace(self, depth=color.resized(width, height), color_T_depth=np.eye(4))
 
     def with_color(self, color: Camera) -> "Calibration":
-        """The same with another colour camera, which is depth's, too, where depth is of its view."""
+        """The same calibration with another colour camera; depth's is scaled from it if depth is registered."""
         depth, moved = self.depth, self.color_T_depth
         if depth is None or moved is None:
             return replace(self, color=color)
@@ -119,7 +119,7 @@ def load_calibration(
     depth_scale: float = DEPTH_SCALE,
     is_rectified: bool = False,
 ) -> Calibration:
-    """Return the calibration that a preset's name stands for or a file holds.
+    """Return the calibration of a preset or from a file.
 
     TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
     "fisheye"), depth_scale, readout and depth_delay (seconds). Depth that is not registered to colour: a table [depth]
@@ -129,8 +129,8 @@ def load_calibration(
 
     Args:
         path_or_name: fr1, fr2, fr3, bonn, icl, or a file.
-        size: width and height of the images, for files that do not say it; or what finds them out.
-        depth_scale: for files that do not say it, raw units per metre.
+        size: width and height of the images, or a function that finds them, for files that do not state them.
+        depth_scale: raw units per metre, for files that do not state them.
         is_rectified: whether the images come from ROS without distortion, so that the lens of a ROS camera_info is not
             theirs.
 

@@ -99,14 +99,14 @@ FOCUS_KEYS = ("fx", "fl_x", "fy", "fl_y", "cx", "cy")
 
 
 def common_camera(place: str, cameras: list[Table]) -> Table:
-    """The one camera of frames that each have their own, where these differ by no more than focus moves them.
+    """Combine the frames' cameras into one, if they differ by no more than autofocus explains.
 
     Args:
         place: names the file in messages.
-        cameras: of the frames, by the same keys.
+        cameras: cameras of the frames, with the same keys.
 
     Returns:
-        The median of what the focus moves, and the rest, which has to be the same.
+        The median of the values that focus changes; the others have to be equal.
 
     Raises:
         GavoError: they differ by more.

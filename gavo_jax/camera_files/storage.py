@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage: YAML, XML or JSON of its own kind, as numbers, text, lists and tables."""
+"""Reading of OpenCV's FileStorage (its dialects of YAML, XML and JSON) to numbers, text, lists and tables."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ Read = TypeVar("Read")
 
 
 def read_storage(path: Path, text: str, read: Callable[[Any], Read], what: str = "a camera") -> Read:
-    """What is read from a FileStorage while it is open.
+    """Open a FileStorage and return what `read` makes of it.
 
     Args:
         path: names the file in messages.
@@ -39,7 +39,7 @@ def read_storage(path: Path, text: str, read: Callable[[Any], Read], what: str =
 
 
 def values_of(storage: Any) -> dict[str, Any]:
-    """All that a FileStorage holds, by its names; see `plain_value`."""
+    """All entries of a FileStorage by name; see `plain_value`."""
     root = storage.root()
     return {name: plain_value(root.getNode(name)) for name in root.keys()}
 

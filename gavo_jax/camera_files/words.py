@@ -1,7 +1,7 @@
-"""What programs call the numbers that stand beside a camera's matrix: size, lens, unit of depth.
+"""Names that programs give to a camera's size, distortion and depth unit.
 
-Names are compared without case and punctuation. What looks like a lens or a unit and is neither known is refused: a
-camera that loses its lens in silence drifts.
+Names are compared without case and punctuation. Unknown names that look like distortion or a depth unit are refused,
+since silently ignoring distortion causes drift.
 """
 
 import re

@@ -10,8 +10,8 @@ JITTER = 0.5
 """Largest step back of stamps in the order of arrival, seconds; after a larger one the clock was reset."""
 
 HOLE, AMID = 1.5, 2
-"""Smallest gap that a late message leaves, in median steps; its stamp falls into that gap. `AMID` successive stamps that
-go back, but fall into no gap, mean a clock that was reset by less than `JITTER`."""
+"""Smallest gap left by a late message, whose stamp falls into it, in median steps. `AMID` successive stamps that go
+back but fall into no gap mean that the clock was reset by less than `JITTER`."""
 
 
 class Topic(NamedTuple):
