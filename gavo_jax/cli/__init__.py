@@ -1,4 +1,4 @@
-"""The command `gavo`: parses, hands over to a subcommand, and turns bad input into one line and exit status 2."""
+"""The `gavo` command: parses the arguments, runs a subcommand, and reports bad input in one line with status 2."""
 
 import contextlib
 import errno
@@ -23,14 +23,14 @@ from gavo_jax.errors import GavoError, GavoWarning, shown, tell
 from gavo_jax.version import __version__
 
 BAD_INPUT, BROKEN_PIPE = 2, 141
-"""Exit statuses; 0 is done, 130 `early.INTERRUPTED`, 3 `early.LOST` (`--strict`)."""
+"""Exit statuses; others are 0 for success, 130 for `early.INTERRUPTED` and 3 for `early.LOST` (`--strict`)."""
 
 NARROWEST = 20
-"""Columns of a screen for which help is laid out at least."""
+"""Smallest terminal width, in columns, that help is laid out for."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a full disk, quota or file."""
+"""Errors raised when a disk or quota is full, or a file is too large."""
 BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
-"""Errors of a name that no file can have, that leads in a circle, or to where this user may not go."""
+"""Errors for paths that are too long, contain a cycle of links, or may not be accessed by this user."""
 
 DESCRIPTION = (
     "RGB-D visual odometry: the camera's motion between frames by a genetic algorithm, particle swarm, Gauss-Newton "
@@ -39,9 +39,9 @@ DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with the arguments (of the process unless given) and return its exit status.
+    """Run the command with the given arguments (by default the process's) and return its exit status.
 
-    Nothing is raised for bad input: one line on standard error names the file and the fault, and the status is 2.
+    Bad input raises nothing: one line on standard error names the file and the fault, and the status is 2.
     """
     _open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as interrupt:
             status = _stop(str(interrupt))
         except Exception:
-            if not interrupts.came():  # else it is what a library made of the interrupt
+            if not interrupts.came():  # otherwise a library turned the interrupt into this exception
                 raise
             status = _stop("")
     interrupts.leave(status)
@@ -91,7 +91,7 @@ def _run(arguments: list[str]) -> int:
 
 @contextlib.contextmanager
 def _told_warnings() -> Iterator[None]:
-    """Print this package's warnings as one line each; others as they always are."""
+    """Print each of this package's warnings on one line; leave other warnings unchanged."""
     show = warnings.showwarning
 
     def show_line(message: Any, category: type[Warning], *where: Any) -> None:
@@ -108,8 +108,9 @@ def _told_warnings() -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Make standard output and error take whatever is printed: closed ones swallow it, and where the encoding lacks a
-    character a question mark stands for it.
+    """Make standard output and error accept any text.
+
+    Closed streams discard it; characters missing from the encoding become question marks.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -120,11 +121,12 @@ def _open_streams() -> None:
 
 
 def _execute(command: Command) -> int:
-    """Import the subcommand only now, so that help and usage errors do not wait for JAX: the function of its name, in
-    the module of its name.
+    """Import and run the subcommand: the function in the module of the same name.
+
+    It is imported this late so that help and usage errors don't wait for JAX.
 
     Raises:
-        GavoError: this JAX is ruled out, and the subcommand is not the one that says what is wrong.
+        GavoError: this version of JAX is unusable, and the subcommand is not `doctor`, which explains why.
     """
     fault = compiler.unfit_compiler()
     if fault and not isinstance(command, Doctor):
@@ -134,7 +136,7 @@ def _execute(command: Command) -> int:
 
 
 def _parse(arguments: list[str]) -> Command | None:
-    """Return the subcommand with its options, or None where help was printed.
+    """Return the subcommand with its options, or None if help was printed.
 
     Raises:
         GavoError: unknown or missing arguments.
@@ -143,7 +145,7 @@ def _parse(arguments: list[str]) -> Command | None:
         raise GavoError(fault)
     messages, page = io.StringIO(), HelpPage(sys.stdout)
     if shutil.get_terminal_size().columns < NARROWEST:
-        os.environ["COLUMNS"] = str(NARROWEST)  # in less, the page of help never ends
+        os.environ["COLUMNS"] = str(NARROWEST)  # in a narrower one, laying out the help never ends
     try:
         with contextlib.redirect_stderr(messages), contextlib.redirect_stdout(page):
             return tyro.cli(
@@ -161,7 +163,7 @@ def _parse(arguments: list[str]) -> Command | None:
 
 
 def _silence_output() -> None:
-    """Point standard output, which takes no more, elsewhere, so that closing it at exit stays quiet."""
+    """Redirect the broken standard output to the null device, so that closing it at exit raises no error."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,4 +1,4 @@
-"""`gavo align`: one pair of images, the motion between them as JSON."""
+"""`gavo align`: aligns one pair of RGB-D images and prints the motion as JSON."""
 
 import itertools
 import sys
@@ -34,11 +34,11 @@ from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import inverse
 
 MATRIX_DIGITS, TWIST_DIGITS = 7, 4
-"""Significant ones of four and of six numbers in a row, or of one, on a terminal; a pipe gets all."""
+"""Significant digits shown on a terminal, for rows of four numbers and for everything else; a pipe gets all."""
 
 
 def align(options: Align) -> int:
-    """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance`, `status` and more of one pair."""
+    """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance`, `status` and more for one pair."""
     as_seed(options.seed, "--seed")
     check_positive("--depth-scale", options.depth_scale, 1e6)
     settings = choose_settings(options).settings
@@ -80,7 +80,7 @@ def align(options: Align) -> int:
 
 
 def rounded(value: Any) -> Any:
-    """What was found, with as many digits as let its rows fit 80 columns; anything else as it is."""
+    """Round arrays and scalars so that rows fit 80 columns; return anything else unchanged."""
     if not isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
     numbers = np.asarray(value)
@@ -91,7 +91,7 @@ def rounded(value: Any) -> Any:
 
 
 def in_words(found: Alignment) -> str:
-    """How the camera moved, and what is known of that, in sentences."""
+    """Describe in sentences how the camera moved and how well this is known."""
     reference_T_target = inverse(np.asarray(found.target_T_reference, np.float64))
     right, down, forward = 1e3 * reference_T_target[:3, 3]
     ways = (
@@ -108,10 +108,10 @@ def in_words(found: Alignment) -> str:
 
 
 def _cameras(options: Align) -> tuple[Calibration, float | None]:
-    """The cameras, and units per metre if they are known: those of the source that the images are of, if of one.
+    """Return the calibration and, if known, the depth units per metre, from the images' source if they belong to one.
 
     Raises:
-        GavoError: there is no camera, or it cannot be read; or the source cannot, and nothing else tells the unit.
+        GavoError: no camera is found or readable, or the source is unreadable and nothing else states the unit.
     """
     source, fault = source_around(options.rgb0), None
     if source is not None:
@@ -119,7 +119,7 @@ def _cameras(options: Align) -> tuple[Calibration, float | None]:
             sequence = open_source(source, Reading(options.camera, options.depth_scale))
             if isinstance(sequence, FileSequence):
                 return sequence.calibration.with_depth_scale(sequence.depth_unit.file), options.depth_scale
-        except GavoError as error:  # what is wrong with its other frames is nothing to this pair
+        except GavoError as error:  # faults of the source's other frames don't affect this pair
             fault = error
     size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
     if options.camera == "auto":

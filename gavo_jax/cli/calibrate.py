@@ -1,4 +1,4 @@
-"""`gavo calibrate`: what a recording does not say of its camera, found from its images, as a camera file."""
+"""`gavo calibrate`: estimates missing camera parameters from a recording's images and writes a camera file."""
 
 import os
 from dataclasses import replace
@@ -19,7 +19,7 @@ from gavo_jax.output.screen import print_table, say, waiting
 
 
 def calibrate(options: Calibrate) -> int:
-    """Find it, print a table (or JSON), and write the camera file."""
+    """Estimate the camera, print a table (or JSON), and write the camera file."""
     output = options.output or Path("camera.toml")
     if output.suffix.lower() != ".toml":
         raise GavoError(f"{output}: a camera file ends in .toml")
@@ -53,10 +53,10 @@ def calibrate(options: Calibrate) -> int:
 
 
 def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
-    """The cameras as they record, with what was found; a delay that they had already counts on."""
+    """Return the cameras as recorded, updated with the estimates; the new depth delay adds to the known one."""
     before = getattr(sequence, "calibration", None) or Calibration(sequence.camera)
     unit = getattr(sequence, "depth_unit", None)
-    if unit is not None:  # what files of floats count, their camera seldom says
+    if unit is not None:  # cameras rarely state the unit of floating-point depth files
         before = before.with_depth_scale(unit.file)
     values = {
         name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
@@ -68,7 +68,7 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
 
 
 def in_all(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:
-    """What was found, with the delay that the camera has in all: it is found beyond the one that was known."""
+    """Return the estimates with the total depth delay; the estimate itself is relative to the delay already known."""
     beyond = found.get("depth_delay")
     if beyond is None or beyond.value is None or beyond.value == depth_delay:
         return found

@@ -1,4 +1,4 @@
-"""`gavo compare`: the same frames through several methods, other libraries' too."""
+"""`gavo compare`: runs several methods, including other libraries', over the same frames."""
 
 import re
 from pathlib import Path
@@ -62,7 +62,7 @@ COLUMNS = (
 )
 """Columns of the table: heading, key in comparison.json, decimals. The errors per frame stand in for the drift."""
 OF_PATH = ("path m", "end m: x y z")
-"""Columns where nothing is known of the errors."""
+"""Columns shown when no errors are known."""
 HEADINGS = ("method", *OF_PATH, *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
 TABLE_CAPTION = (
     "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
@@ -84,17 +84,17 @@ MEANINGS = {
     "ms/pair": "ms/pair: from two decoded images to their motion",
     "frames/s": "frames/s: from frame to pose, {cost} included",
 }
-"""What the columns that are shown are."""
+"""Explanations of the columns, printed for those that are shown."""
 
 
 class Contender(NamedTuple):
-    """Who is compared."""
+    """A method to compare, with its preset."""
 
     label: str
-    """As it was asked for: `ga`, or `ga:fast` for a preset of its own."""
+    """Name as requested: `ga`, or `ga:fast` with its own preset."""
     method: str
     preset: str | None
-    """None of another library's."""
+    """None for another library's method."""
 
 
 class Entry(NamedTuple):
@@ -134,7 +134,7 @@ def compare(options: Compare) -> int:
 
 
 def _earlier_trajectories(folder: Path) -> list[str]:
-    """Names of the trajectories that an earlier comparison left, of whatever methods and seeds."""
+    """Return the names of trajectory files left by an earlier comparison, whatever its methods and seeds."""
     methods = "|".join(map(re.escape, (*presets.methods(), *PEERS)))
     form = rf"({methods})(-({'|'.join(presets.PRESETS)}))?(-seed\d+)?\.txt"
     return [path.name for path in folder.iterdir() if re.fullmatch(form, path.name)]
@@ -143,10 +143,10 @@ def _earlier_trajectories(folder: Path) -> list[str]:
 def _run_contenders(
     options: Compare, contenders: list[Contender], sequence: Sequence, peers: dict[str, Odometry], folder: Path
 ) -> tuple[list[Entry], int]:
-    """Run them one after the other, each with its seeds; return what came of them, and the exit status.
+    """Run them one after the other, each with its seeds; return the finished runs and the exit status.
 
     Raises:
-        KeyboardInterrupt: the user stopped it before the first run was done.
+        KeyboardInterrupt: the user interrupted before the first run finished.
     """
     entries: list[Entry] = []
     try:
@@ -164,7 +164,7 @@ def _run_contenders(
 
 
 def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: Path, cut_short: str) -> None:
-    """Write comparison.json, then print the table, then write figures and report; that says if runs are missing."""
+    """Write comparison.json, print the table, then write figures and the report, which says if runs are missing."""
     typical = _typical_runs(entries)
     write_json(folder / COMPARISON, [entry.metrics for entry in entries])
     title = f"{sequence.name}, {len(sequence)} frames, preset {options.preset}"
@@ -192,7 +192,7 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
 
 
 def _print(title: str, rows: list[list[Any]], seeds: int, cost: str) -> None:
-    """Print the table; what tells seeds apart only where there are several. `cost` is what frames take beside poses."""
+    """Print the table, with the columns about seeds only if there are several; `cost` names the work besides poses."""
     shown = len(HEADINGS) if seeds > 1 else 1 + len(OF_PATH) + len(COLUMNS)
     columns, cells = known_columns(HEADINGS[:shown], [row[:shown] for row in rows])
     print_table(title, columns, cells)
@@ -214,10 +214,10 @@ def _draw(entries: list[Entry], typical: list[Entry], sequence: Sequence, folder
 
 
 def _parse_methods(text: str, preset: str) -> list[Contender]:
-    """Return the methods between the commas, each with the preset or, after a colon, one of its own.
+    """Return the methods between the commas, each with the common preset or its own after a colon.
 
     Raises:
-        GavoError: one is unknown, repeated or without the preset.
+        GavoError: a method is unknown, repeated, or lacks the preset.
     """
     found: list[Contender] = []
     for label in (name.strip() for name in text.split(",")):
@@ -240,10 +240,10 @@ def _parse_methods(text: str, preset: str) -> list[Contender]:
 
 
 def _run_contender(sequence: Sequence, contender: Contender, seed: int | None, peer: Odometry | None) -> Entry:
-    """Run one of them once; a peer has no seed.
+    """Run one contender once; a peer has no seed.
 
     Raises:
-        KeyboardInterrupt: the user stopped it; an unfinished run is not compared.
+        KeyboardInterrupt: the user interrupted the run; an unfinished run is not compared.
     """
     label, method, preset_name = contender
     if preset_name is not None:
@@ -264,7 +264,7 @@ def _run_contender(sequence: Sequence, contender: Contender, seed: int | None, p
 
 
 def _typical_runs(entries: list[Entry]) -> list[Entry]:
-    """Return for each contender its run of median drift (the better of the two middle ones), in their order."""
+    """Return each contender's run of median drift, in order; of two middle runs, the better."""
     by_label: dict[str, list[Entry]] = {}
     for entry in entries:
         by_label.setdefault(entry.label, []).append(entry)
@@ -279,7 +279,10 @@ def _median(runs: list[Entry]) -> Entry:
 
 
 def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
-    """Return translation (m/s) and rotation (deg/s) of every run, by contender; empty where there is no truth."""
+    """Return the drift in translation (m/s) and rotation (deg/s) of every run, by contender.
+
+    Empty if any run has no drift.
+    """
     if any(entry.metrics[DRIFT] is None for entry in entries):
         return {}
     runs: dict[str, list[list[float]]] = {}
@@ -289,8 +292,9 @@ def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
 
 
 def _shown(metrics: dict[str, Any], key: str) -> float | None:
-    """A figure as the table has it: errors per frame only where there is no drift over a second, segments only where
-    there are several.
+    """Return a metric as the table shows it.
+
+    Errors per frame appear only without drift over a second, segments only if there are several.
     """
     is_left_out = metrics[DRIFT] is not None if key == DRIFT_PER_FRAME else key == "segments" and metrics[key] == 1
     return None if is_left_out else metrics[key]

@@ -1,4 +1,4 @@
-"""`gavo doctor`: what somebody who is asked for help wants to know first, and whether JAX computes right numbers."""
+"""`gavo doctor`: prints what a support request needs, and checks that JAX computes correct numbers."""
 
 import os
 import platform
@@ -22,7 +22,7 @@ from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
 OFF = 1
-"""Exit status where something is not as it should be."""
+"""Exit status if a check fails."""
 NOT_INSTALLED = "not installed"
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
 
@@ -62,7 +62,7 @@ def doctor(command: Doctor) -> int:
 
 
 def _print_checks() -> list[str]:
-    """Run and print checks and speed; the names of those that are wrong."""
+    """Run the checks, print them and the speed, and return the names of failed checks."""
     wrong = []
     for outcome in checks.full_size():
         verdict = "ok" if outcome.is_right else "WRONG"
@@ -75,7 +75,7 @@ def _print_checks() -> list[str]:
 
 
 def _device(platform_name: str, kind: str) -> str:
-    """A device in words; a CPU's kind says no more than its platform."""
+    """Describe a device; for a CPU the kind only repeats the platform."""
     return kind if kind.lower() == platform_name.lower() else f"{platform_name} {kind}"
 
 
@@ -87,12 +87,12 @@ def _version(package: str) -> str | None:
 
 
 def _usable_cores() -> int | None:
-    """Cores that the system lets this process run on; all where it does not say."""
+    """Return the number of cores this process may use, or of all cores if the system doesn't say."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def _cache() -> tuple[str, bool]:
-    """What there is to say about the cache folder, and whether programs can be kept there."""
+    """Describe the cache folder, and return whether compiled programs can be kept there."""
     folder = cache_folder()
     if folder is None:
         return "none: there is no home folder, and GAVO_CACHE_DIR is not set", False
@@ -111,7 +111,7 @@ def _cache() -> tuple[str, bool]:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file; none where another process has just removed it."""
+    """Return a file's size in bytes, or 0 if another process has just removed it."""
     try:
         return path.stat().st_size
     except OSError:
@@ -119,7 +119,7 @@ def _size(path: Path) -> int:
 
 
 def _without_home(path: Path) -> str:
-    """A path that does not tell whose it is."""
+    """Return the path with `~` for the home folder, to hide the user's name."""
     try:
         return f"~/{path.absolute().relative_to(Path.home())}"
     except (RuntimeError, ValueError):
@@ -127,7 +127,7 @@ def _without_home(path: Path) -> str:
 
 
 def _extras() -> Iterator[str]:
-    """A line for each optional extra: its packages with versions."""
+    """Yield a line for each optional extra: its packages and their versions."""
     try:
         extras = metadata("gavo-jax").get_all("Provides-Extra") or []
         requirements = [Requirement(line) for line in requires("gavo-jax") or []]
@@ -142,5 +142,5 @@ def _extras() -> Iterator[str]:
 
 
 def _packages(requirement: Requirement) -> list[str]:
-    """A requirement's package; of jax[cuda12], which is JAX itself, the plugin that makes the difference."""
+    """Return a requirement's package, or for extras such as jax[cuda12] the plugin packages they add."""
     return [f"{requirement.name}-{extra}-plugin" for extra in requirement.extras] or [requirement.name]

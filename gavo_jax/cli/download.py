@@ -1,4 +1,4 @@
-"""`gavo download`: a sequence of the TUM RGB-D benchmark, unpacked."""
+"""`gavo download`: downloads and unpacks a sequence of the TUM RGB-D benchmark."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ SERVER_VARIABLE = "GAVO_TUM_SERVER"
 
 
 def download(options: Download) -> int:
-    """Get the sequence under a progress bar on standard error; print its folder."""
+    """Download the sequence with a progress bar on standard error; print its folder."""
     to = options.to or Path(os.environ.get("GAVO_DATA") or "data")
     with progress_bar(DownloadColumn(), TransferSpeedColumn()) as bar:
         task = bar.add_task(printable(options.name), total=None)

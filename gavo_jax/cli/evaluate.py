@@ -26,10 +26,10 @@ from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import Trajectory, associate
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-"""What stamps count instead of seconds."""
+"""Units, in seconds, that timestamps may have instead of seconds."""
 
 ALIKE = 0.1
-"""Two trajectories whose lengths in time differ by no more of it are of one recording."""
+"""Relative difference in duration below which two trajectories are taken to be of one recording."""
 
 
 def evaluate(options: Evaluate) -> int:
@@ -57,7 +57,7 @@ def evaluate(options: Evaluate) -> int:
 
 
 def _check(options: Evaluate) -> None:
-    """Raise GavoError for a span that is none, and for figures that cannot be."""
+    """Raise GavoError for an invalid span, or for figures that cannot be drawn."""
     if not 0 < options.delta < np.inf:
         raise GavoError(f"--delta: must be a positive number, not {options.delta:g}")
     if options.unit == "frames" and options.delta != int(options.delta):
@@ -71,7 +71,7 @@ def _check(options: Evaluate) -> None:
 
 
 def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:
-    """How each file was understood, where it was not as it is written."""
+    """Yield a remark for each file that was not read literally."""
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
             yield f"{path}: its stamps are taken for {UNITS[unit]}"
@@ -80,14 +80,14 @@ def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> 
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")
-"""Names of the errors, in the order in which they are told."""
+"""Names of the errors, in the order they are printed."""
 
 
 def _errors(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> tuple[dict[str, ErrorSeries], list[str]]:
-    """The errors by name, and why those of the whole trajectory cannot be had where they cannot.
+    """Return the errors by name, and why any errors of the whole trajectory are missing.
 
     Raises:
-        GavoError: no two poses are as far apart as the relative error asks, or stamps are of another unit.
+        GavoError: no two poses are as far apart as the relative error needs, or the timestamps' units differ.
     """
     try:
         _check_units(estimate.timestamps, truth.timestamps)
@@ -105,8 +105,9 @@ def _errors(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> tuple
 
 
 def _read(*paths: Path) -> list[tuple[Trajectory, float]]:
-    """Trajectories with stamps in seconds, and the seconds of what they count in the files: where most of the stamps of
-    two files are alike as they stand, they count the same.
+    """Read two trajectories; return each with timestamps in seconds, and the unit in its file, in seconds.
+
+    If most timestamps of the two files match as written, both are taken to be in seconds.
     """
     written = [Trajectory.read_tum(path) for path in paths]
     units = [counted_in(one) for one in written]
@@ -118,7 +119,7 @@ def _read(*paths: Path) -> list[tuple[Trajectory, float]]:
 
 
 def _check_units(estimate: np.ndarray, truth: np.ndarray) -> None:
-    """Refuse stamps that seem to count something else than the other ones; nothing else tells what they count."""
+    """Raise GavoError if the two trajectories' timestamps seem to be in different units; files don't state the unit."""
     for whose, stamps, others in (("estimate", estimate, truth), ("truth", truth, estimate)):
         if min(len(stamps), len(others)) < 2:
             return
@@ -135,7 +136,7 @@ def _meet(stamps: np.ndarray, others: np.ndarray) -> bool:
 
 
 def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
-    """Why the stamps may lead to no error, and what would help."""
+    """Explain why the timestamps may yield no error, and what would help."""
     stamps = estimate.timestamps, truth.timestamps
     if min(map(len, stamps)) < 2 or not 0 < options.delta < np.inf:
         return ""
@@ -150,7 +151,7 @@ def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
 
 
 def _print(options: Evaluate, series: dict[str, ErrorSeries]) -> None:
-    """Print a row for each kind of error, and below what each is."""
+    """Print a row for each kind of error, and the definitions below."""
     span = _span(options.delta, options.unit)
     heads = (f"RPE translation, m/{span}", f"RPE rotation, deg/{span}", "ATE, m", "distance error, m")
     names: dict[str, str] = dict(zip(NAMES, heads, strict=True))
@@ -166,6 +167,6 @@ def _print(options: Evaluate, series: dict[str, ErrorSeries]) -> None:
 
 
 def _span(delta: float, unit: str) -> str:
-    """Return what one value of the relative pose error spans: `s`, `0.5 s`, `frame`, `10 frames`."""
+    """Return the span of the relative pose error as text: `s`, `0.5 s`, `frame`, `10 frames`."""
     one = {"s": "s", "frames": "frame"}[unit]
     return one if delta == 1 else f"{delta:g} {unit}"

@@ -1,4 +1,4 @@
-"""`gavo experiment`: a file of runs to a table of results, and a table of results to a report."""
+"""`gavo experiment`: runs an experiment file into a table of results, and reports on that table."""
 
 from contextlib import closing, nullcontext
 
@@ -20,7 +20,7 @@ REPORT = "report"
 
 
 def experiment(options: Experiment) -> int:
-    """Print the plan, run what the table does not have yet, print and write the report; return the exit status."""
+    """Print the plan, run what the table lacks, print and write the report; return the exit status."""
     if options.file == REPORT:
         if options.folder is None:
             raise GavoError("report: which folder? gavo experiment report DIR")
@@ -42,11 +42,11 @@ def experiment(options: Experiment) -> int:
 
 
 def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:
-    """Say what will be run, and run it.
+    """Print the plan, then run it.
 
     Raises:
         GavoError: a batch failed, or the table cannot be written.
-        KeyboardInterrupt: it says how far the runs have come.
+        KeyboardInterrupt: the user interrupted; the message says how many runs are done.
     """
     with closing(RayExecutor(plan.ray)) if executor_name == "ray" else nullcontext(LocalExecutor()) as executor:
         runs = missing(plan, table)
@@ -73,7 +73,7 @@ def _news(outcome: Outcome) -> str:
 
 
 def _print_plan(plan: Plan, table: Table, runs: list[Run], slots: int) -> None:
-    """Say what will be run, before it is."""
+    """Print which runs are planned, and the estimated time."""
     todo = fitted_batches(runs, plan.batch, slots)
     ours = {run.id for run in runs}
     rows = []

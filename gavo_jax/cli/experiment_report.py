@@ -1,4 +1,4 @@
-"""A table of results to a report: its tables, a figure and a page."""
+"""Turns a table of results into a report: tables, a figure and an HTML page."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,7 +47,7 @@ MEANINGS = {
     "ms/frame": "ms/frame: time, decoding included, median over the runs.",
     "together": "together: most runs that shared the machine and its time.",
 }
-"""What the columns of the table are."""
+"""Explanations of the table's columns."""
 TEST = (
     "Methods paired by sequence and seed: median of the ratio of their drifts, and p of the two-sided Wilcoxon "
     "signed-rank test, not corrected for the number of comparisons"
@@ -55,7 +55,7 @@ TEST = (
 
 
 def report(folder: Path, markdown: bool = False) -> int:
-    """Print the tables of an experiment's folder, as Markdown if so asked; write report.html and the figure there."""
+    """Print the tables of an experiment's folder, optionally as Markdown; write report.html and the figure there."""
     if not folder.is_dir():
         raise GavoError(f"{folder}: no results of an experiment: no such folder")
     with hold(prepare_folder(folder)):
@@ -63,7 +63,7 @@ def report(folder: Path, markdown: bool = False) -> int:
 
 
 def report_held(folder: Path, markdown: bool) -> int:
-    """`report` of a folder that is held already."""
+    """Do the same as `report` for a folder whose lock is already held."""
     record = read_record(folder)
     rows = tell_apart(Table(folder).read(), record.runs)
     order = record.order
@@ -95,11 +95,11 @@ def report_held(folder: Path, markdown: bool) -> int:
 
 
 class Shown(NamedTuple):
-    """A table as it is printed, and as it stands on the page."""
+    """A table for the terminal and for the HTML page."""
 
     title: str
     caption: str
-    """On the page, instead of the title."""
+    """Replaces the title on the page."""
     columns: Sequence[str]
     cells: Sequence[Sequence[Any]]
 
@@ -128,7 +128,7 @@ def _comparison_tables(comparisons: Sequence[Comparison]) -> Iterator[Shown]:
 def _notes(
     rows: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]], summaries: Sequence[Summary]
 ) -> list[str]:
-    """What a reader has to know of the tables; `others` are rows of runs that are none of the experiment's."""
+    """Return notes on the tables; `others` are rows of runs that are not in the experiment's current plan."""
     notes = _without_drift(summaries)
     if (states := len({_state(row) for row in rows})) > 1:
         notes.append(f"The rows come from {states} versions of the software or of what it uses.")
@@ -138,7 +138,7 @@ def _notes(
 
 
 def _without_drift(summaries: Sequence[Summary]) -> list[str]:
-    """A sentence for the sequences without drift, and why."""
+    """Return sentences that say which sequences have no drift, and why."""
     told = {summary.sequence for summary in summaries if summary.drift is not None}
     by_frame = {summary.sequence for summary in summaries if summary.per_frame is not None}
     none = [name for name in dict.fromkeys(summary.sequence for summary in summaries) if name not in told]
@@ -150,7 +150,7 @@ def _without_drift(summaries: Sequence[Summary]) -> list[str]:
 
 
 def _state(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a row's software was, without the libraries that one peer alone brings."""
+    """Return the software versions behind a row, without libraries that only one peer uses."""
     versions = json.loads(row["versions"])
     return (*(versions.get(name) for name in environment()), row["git_commit"], row["git_modified"])
 
@@ -176,7 +176,7 @@ def _comparison_row(found: Comparison) -> list[Any]:
 
 
 def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
-    """Write the drift of every method on every sequence as a figure, where matplotlib is installed."""
+    """Draw the drift of every method on every sequence, if matplotlib is installed."""
     clips: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in rows:
         if row[DRIFT] is not None:

@@ -1,4 +1,4 @@
-"""`gavo inspect`: what a source is, and which of its frames a run would use."""
+"""`gavo inspect`: describes a source, and which of its frames a run would use."""
 
 from typing import Any
 
@@ -16,11 +16,11 @@ NOTES = {
     "depth_units": "depth may be in other units; used in full",
     "moving_body": "a part of the image repeats the one before; used in full",
 }
-"""What a run makes of frames that it uses and doubts, by status."""
+"""How a run treats doubtful frames, by status."""
 
 
 def inspect(options: Inspect) -> int:
-    """Look at every chosen frame and print what there is to say, for people or as JSON."""
+    """Inspect every chosen frame and print the findings as text or JSON."""
     sequence = open_sequence(options, force=True)
     with frame_progress(sequence.name, len(sequence)) as on_frame:
         facts = inspect_sequence(sequence, on_frame)
@@ -84,7 +84,7 @@ def _is_distorted(camera: dict[str, Any]) -> bool:
 
 
 def _recorded(recorded: dict[str, Any] | None, camera: dict[str, Any]) -> list[tuple[str, str]]:
-    """The cameras before undistortion, averaging of pixels and registration, where they differ."""
+    """Describe the cameras before undistortion, pixel averaging and registration, where they differ."""
     if recorded is None:
         return []
     color = recorded["color"]

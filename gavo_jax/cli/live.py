@@ -1,4 +1,4 @@
-"""`gavo run` over a camera's frames as they come, until Ctrl-C, the camera's end or `--frames`."""
+"""`gavo run` on a live camera, until Ctrl-C, the end of the stream or `--frames`."""
 
 import contextlib
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ NOT_LIVE = "not with the live source '{}': record it and run over that"
 
 
 def run_live(options: Run) -> int:
-    """Track a camera's frames, the newest first, and write the files of a run; return the exit status."""
+    """Track a camera, always taking the newest frame, and write the files of a run; return the exit status."""
     as_seed(options.seed, "--seed")
     _refuse_what_cannot_be(options)
     shape = check_map_options(options.map, options.map_shape, options.voxel)
@@ -69,7 +69,7 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
             tracked = odometry.progress.last_index + 1
             seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
             raise end.fault or GavoError(f"{device.name}: ended after {seen}: at least two are needed")
-        steps = folder.steps()  # without what an interruption left of one, from here on
+        steps = folder.steps()  # this drops a step that an interruption left incomplete
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
         metrics: dict[str, Any] = {
@@ -95,12 +95,12 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
 
 
 class _End(NamedTuple):
-    """How tracking came to its end."""
+    """How tracking ended."""
 
     seconds: float
-    """Seconds of tracking since the first frame, those spent waiting for programs left out."""
+    """Seconds of tracking since the first frame, excluding time spent waiting for compilation."""
     waited: float
-    """Seconds spent waiting for programs."""
+    """Seconds spent waiting for compilation."""
     interrupted: bool
     """Whether Ctrl-C ended it."""
     fault: GavoError | None
@@ -117,7 +117,7 @@ def _track(
     settings: Settings,
     scene: LiveMap | None,
 ) -> _End:
-    """Track until there is no more."""
+    """Track until the stream ends, Ctrl-C, a fault, the `--frames` limit, or a lost pair with `on_lost` stop."""
     count, stopwatch = 0, Stopwatch()
     interrupted, fault = False, None
     sequence = {"name": newest.device.name, "frames": None, "camera": camera}
@@ -143,7 +143,7 @@ def _track(
             raise
         tell(f"{newest.device.name}: interrupted after {count} frames")
         interrupted = True
-    except GavoError as error:  # what was tracked counts
+    except GavoError as error:  # keep what was tracked so far
         if count < 2:
             raise
         fault = error
@@ -151,7 +151,7 @@ def _track(
 
 
 def _frames(newest: Newest, camera: Camera, *, color: bool) -> Iterator[tuple[float, Frame | FrameError]]:
-    """Stamps and frames as they come. Images that are unlike the first ones make a lost frame."""
+    """Yield timestamps and frames as they arrive; images that don't fit the first ones yield a `FrameError`."""
     images: LiveImages
     for index, images in enumerate(newest):
         try:
@@ -164,7 +164,7 @@ def _frames(newest: Newest, camera: Camera, *, color: bool) -> Iterator[tuple[fl
 
 
 def _camera(options: Run, device: LiveDevice) -> Camera:
-    """The device's own, or the one that is named, which has the device's unit of depth where it says none."""
+    """Return the device's camera or the one given by `--camera`, whose depth unit defaults to the device's."""
     camera = device.camera
     if options.camera != "auto":
         calibration = load_calibration(options.camera, (camera.width, camera.height), camera.depth_scale)
@@ -176,7 +176,7 @@ def _camera(options: Run, device: LiveDevice) -> Camera:
 
 
 def _refuse_what_cannot_be(options: Run) -> None:
-    """Raise GavoError for options that a live camera has no use for, and for formats that nobody knows."""
+    """Raise GavoError for options that don't apply to a live camera, and for unknown trajectory formats."""
     formats(options.trajectory_format)
     for option, is_given in (
         ("--resume", options.resume),

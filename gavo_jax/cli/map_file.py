@@ -1,4 +1,4 @@
-"""`gavo run --map`: the map as a file; what cannot be is refused before the run starts."""
+"""`gavo run --map`: writes the map to a file; impossible requests are refused before the run starts."""
 
 import os
 from pathlib import Path

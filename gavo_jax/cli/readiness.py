@@ -1,4 +1,4 @@
-"""What a subcommand that computes does before it begins."""
+"""Preparation shared by the subcommands that compute."""
 
 import os
 
@@ -13,12 +13,12 @@ CHOICES = ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE")
 
 
 def be_ready() -> None:
-    """Keep what is compiled, and see that JAX has a device.
+    """Enable the compilation cache, and check that JAX has a device.
 
     Raises:
-        GavoError: it has none, as where a GPU is asked for that is not there, or whose memory is somebody else's.
+        GavoError: it has none, for instance because the requested GPU is missing or its memory is taken.
     """
     enable_compilation_cache()
     chosen = "".join(f", with {name}={os.environ[name]!r}" for name in CHOICES if os.environ.get(name))
     with blamed(f"JAX has no device to compute on{chosen}"):
-        jax.block_until_ready(jax.device_put(np.zeros(1, np.float32)))  # a number there, and no program for it
+        jax.block_until_ready(jax.device_put(np.zeros(1, np.float32)))  # transfer a number: needs no compilation

@@ -1,4 +1,4 @@
-"""`gavo run`: a sequence to a trajectory, its errors and figures."""
+"""`gavo run`: estimates a sequence's trajectory, with errors and figures."""
 
 import time
 from dataclasses import replace
@@ -48,11 +48,11 @@ from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
 CHECKPOINT_SECONDS = 2.0
-"""Between two checkpoints; each takes some 20 ms."""
+"""Seconds between two checkpoints; writing one takes about 20 ms."""
 
 
 def run(options: Run) -> int:
-    """Track the sequence, write its files as it goes, print a table; return the exit status."""
+    """Track the sequence, writing its files along the way, and print a table; return the exit status."""
     if is_live(options.sequence):
         from gavo_jax.cli.live import run_live
 
@@ -84,7 +84,7 @@ def run(options: Run) -> int:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
             tell(f"{folder.path}: the run came to its end before: nothing to resume{shown}")
         else:
-            # before an earlier run is replaced: it may not open
+            # before an earlier run is replaced, as opening may fail
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
             if progress is None:
                 _start(options, sequence, folder, config)
@@ -111,7 +111,7 @@ def run(options: Run) -> int:
 
 
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:
-    """Begin the files of a run, in place of an earlier one's."""
+    """Start the files of a run, replacing an earlier run's."""
     if options.resume:
         say(f"nothing to resume in {folder.path}: a new run")
     if folder.has_run():
@@ -128,7 +128,7 @@ def _go_on(
     viewer: Viewer,
     mapper: BackgroundMapper | None,
 ) -> None:
-    """Have the driver, the viewer and the map stand where an earlier run stopped; what it wrote of its end goes."""
+    """Restore driver, viewer and map to where an earlier run stopped; remove the trajectories exported at its end."""
     remove_trajectories(folder.path)
     odometry.progress = progress
     steps = folder.steps()
@@ -139,7 +139,7 @@ def _go_on(
 
 
 def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:
-    """What config.json says of a run."""
+    """Return the contents of config.json."""
     return {
         "options": with_whole_paths(options),
         "sequence": {
@@ -164,9 +164,9 @@ def _track(
     viewer: Viewer,
     mapper: BackgroundMapper | None,
 ) -> tuple[dict[str, Any], bool]:
-    """Track the frames that are left and write the files; return what metrics.json says, and whether Ctrl-C came.
+    """Track the remaining frames and write the files; return the metrics and whether Ctrl-C interrupted.
 
-    Errors are computed from the files, so that a run that was resumed ends with the same ones as a run in one go.
+    Errors are computed from the files, so that a resumed run gets the same ones as an uninterrupted run.
     """
     saved: float | None = None
 

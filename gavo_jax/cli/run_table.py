@@ -1,4 +1,4 @@
-"""What `gavo run` prints in the end: its figures, and in words why one that people look for is missing."""
+"""The table `gavo run` prints at the end, with the reason if the drift is missing."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping
@@ -33,13 +33,13 @@ ERRORS = (
     ("absolute error after alignment, RMSE", ABSOLUTE_ERROR, 6, "m"),
     ("distance error at the end", FINAL_DISTANCE, 6, "m"),
 )
-"""Rows of the table: what, key in metrics.json, decimals, unit. Those without a figure are left out."""
+"""Rows of the table: label, key in metrics.json, decimals, unit. Rows without a value are left out."""
 
 BEFORE_LOOPS = (
     ("drift of the odometry alone, translation", f"odometry_{DRIFT}", 6, "m/s"),
     ("absolute error of the odometry alone", f"odometry_{ABSOLUTE_ERROR}", 6, "m"),
 )
-"""Rows of a run with loops."""
+"""Additional rows for a run with loop closure."""
 
 COUNTS = (
     ("frames", "frames", 0, ""),
@@ -49,7 +49,7 @@ COUNTS = (
     ("speed, reading and decoding included", FRAMES_PER_SECOND, 1, "frames/s"),
 )
 OF_RENDERED = {FRAMES_PER_SECOND: "speed, rendering included"}
-"""What a row is called where frames are rendered and not read."""
+"""Labels that differ if frames are rendered instead of read."""
 
 Row = tuple[str, str, str]
 
@@ -66,12 +66,12 @@ def print_run(
     """Print the table of a run and where its files are.
 
     Args:
-        name: of the run.
-        metrics: as in metrics.json.
-        folder: the run's.
-        trajectory: as its file has it.
-        truth: that of the sequence; None where it has none.
-        is_rendered: whether its frames are those of the synthetic room.
+        name: name of the run.
+        metrics: contents of metrics.json.
+        folder: output folder of the run.
+        trajectory: the trajectory as read from its file.
+        truth: ground truth of the sequence, if it has any.
+        is_rendered: whether the frames are of the synthetic room.
     """
     known = [row for row in ERRORS + BEFORE_LOOPS if metrics.get(row[1]) is not None]
     rows: list[Row] = [(what, number(metrics[key], digits), unit) for what, key, digits, unit in known]
@@ -100,14 +100,14 @@ def print_run(
 
 
 def _of_frozen(steps: list[Step]) -> list[Row]:
-    """How many of the pairs that are frozen are so for their image, and how many for their depth."""
+    """Return rows that count the frozen pairs whose image repeats, and those whose depth does."""
     frozen = (step.alignment.frozen for step in steps if step.alignment.status is AlignmentStatus.FROZEN)
     counted = sorted(Counter(frozen).items(), reverse=True)  # the image first
     return [(f"pairs: frozen, the {what} repeats", str(count), "") for what, count in counted]
 
 
 def _of_bodies(path: Path) -> list[Row]:
-    """What bodies.csv tells, where anything was seen to move."""
+    """Return rows that summarise bodies.csv; none if nothing was seen to move."""
     seen = read_bodies(path)
     if not seen:
         return []
@@ -122,7 +122,7 @@ def _of_bodies(path: Path) -> list[Row]:
 
 
 def path_and_end(trajectory: Trajectory) -> tuple[float, str | None]:
-    """The length of a path and where it ends, metres; of its end nothing where the way there is unknown."""
+    """Return a path's length and end position in metres; the end is None if some motion before it is unknown."""
     places = trajectory.world_T_camera[:, :3, 3]
     known = np.diff(trajectory.segments) == 0
     path = float(np.linalg.norm(np.diff(places, axis=0), axis=1)[known].sum())
@@ -131,7 +131,7 @@ def path_and_end(trajectory: Trajectory) -> tuple[float, str | None]:
 
 
 def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[Row]:
-    """What a trajectory tells without a truth beside it."""
+    """Return rows that describe a trajectory without ground truth."""
     path, end = path_and_end(trajectory)
     angle = float(np.degrees(rotation_angle(trajectory.world_T_camera[-1:, :3, :3])[0]))
     share = metrics.get("statuses", {}).get("ok", 0) / max(1, metrics.get("pairs", 0))
@@ -142,7 +142,7 @@ def _of_trajectory(trajectory: Trajectory, metrics: Mapping[str, Any]) -> list[R
 
 
 def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: bool) -> str | None:
-    """One sentence where there is no drift over a second."""
+    """Explain in a sentence why there is no drift over a second; None if there is one."""
     if metrics.get(DRIFT) is not None:
         return None
     if not has_truth:
@@ -161,7 +161,7 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
 
 
 def covered_in_part(trajectory: Trajectory, truth: Trajectory | None) -> str | None:
-    """One sentence where the truth covers only some of the poses: no error tells of the others."""
+    """Return a sentence if the ground truth covers only some of the poses, as errors ignore the others; else None."""
     if truth is None:
         return None
     covered = int(np.count_nonzero(truth.interpolate(trajectory.timestamps)[1]))

@@ -1,4 +1,4 @@
-"""From options to frames: which sequence, which of its frames, by which camera."""
+"""Turns command-line options into a sequence (frames and camera) and settings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,15 +20,15 @@ from gavo_jax.settings_file import NamedSettings, assignments, load_settings, ov
 
 
 def open_sequence(source: Source, force: bool = False, color: bool = False) -> Sequence:
-    """Return the chosen frames, checked as far as that is possible before a run.
+    """Return the chosen frames, checked as far as possible before a run.
 
     Args:
         source: the options.
-        force: as their own `force`.
-        color: whether frames carry RGB beside grey.
+        force: same as `source.force`; either suffices.
+        color: whether frames carry RGB besides grey.
 
     Raises:
-        GavoError: what is wrong with the options, the sequence or its camera; fewer than two frames.
+        GavoError: the options, the sequence or its camera are faulty, or there are fewer than two frames.
     """
     if is_live(source.sequence):
         raise GavoError(f"{source.sequence}: a live source, which `gavo run` alone takes")
@@ -46,14 +46,14 @@ def open_sequence(source: Source, force: bool = False, color: bool = False) -> S
         force=force or source.force,
         moving=source.moving,
     )
-    return without_distortion(sequence)  # somebody's own dataset may leave it in
+    return without_distortion(sequence)  # a user-defined dataset may leave distortion in
 
 
 def reading_of(source: Source) -> Reading:
-    """How the options say the source is to be read.
+    """Return how to read the source, according to the options.
 
     Raises:
-        GavoError: a number that cannot be.
+        GavoError: a number is out of range.
     """
     check_positive("--depth-scale", source.depth_scale, 1e6)
     check_positive("--rate", source.rate, 1e4)
@@ -66,10 +66,10 @@ def reading_of(source: Source) -> Reading:
 
 
 def choose_settings(search: SearchOptions) -> NamedSettings:
-    """Return the settings that the options say: a preset's or a file's, with single ones replaced.
+    """Return the settings of the preset or file, with single ones overridden by the options.
 
     Raises:
-        GavoError: what is wrong with the file or with a single setting.
+        GavoError: the method, the file or a single setting is invalid.
     """
     if search.method not in presets.methods():
         raise GavoError(f"--method: {search.method!r} is not one of {', '.join(presets.usable_methods())}")
@@ -85,11 +85,11 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
 
 
 FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_scale", "rate", "moving", "seed")
-"""Options of a run that are no settings."""
+"""Options of a run that are not settings."""
 
 
 def with_shortcuts(settings: Settings, options: Run) -> Settings:
-    """The settings with those that have an option of their own."""
+    """Return the settings with the dedicated options (`--reference`, `--on-lost`, `--bodies`, `--loops`) applied."""
     odometry = settings.odometry
     if options.reference is not None:
         odometry = replace(odometry, reference=options.reference)
@@ -101,14 +101,15 @@ def with_shortcuts(settings: Settings, options: Run) -> Settings:
 
 
 def unchanged_preset(settings: Settings, options: Run) -> str | None:
-    """The name of a run's preset; None where something else than an option of its own has changed its settings."""
+    """Return the name of a run's preset; None if more than the dedicated options has changed its settings."""
     unchanged = with_shortcuts(presets.preset(options.method, options.preset), options)
     return options.preset if presets.are_same(settings, unchanged) else None
 
 
 def settings_line(options: Run) -> str | None:
-    """Say of an earlier run's config.json that its settings alone are used, and which frames and seed it had instead of
-    these; None where the settings are of no run.
+    """Return a note that only the settings of an earlier run's config.json are used.
+
+    It lists differing options for frames and seed. None if the settings are not from a run.
     """
     path = options.settings
     if path is None or path.suffix != ".json":
@@ -126,11 +127,11 @@ def _said(value: Any) -> str:
 
 
 WORDS = (SYNTHETIC, "auto", *PRESETS)
-"""What stands for a source or a camera, whatever lies here by that name."""
+"""Names of built-in sources and cameras; they take precedence over files of the same name."""
 
 
 def with_whole_paths(options: Run) -> Run:
-    """The options with paths that hold from any folder."""
+    """Return the options with absolute paths."""
     places = {
         name: str(Path(place).resolve())
         for name, place in (("sequence", options.sequence), ("camera", options.camera), ("settings", options.settings))
@@ -140,7 +141,7 @@ def with_whole_paths(options: Run) -> Run:
 
 
 def check_positive(option: str, value: float | None, most: float) -> None:
-    """Raise GavoError for a number that is given and is not from 0.001 to `most`."""
+    """Raise GavoError if a number is given and is not from 0.001 to `most`."""
     if value is not None and not 1e-3 <= value <= most:
         raise GavoError(f"{option}: must be a number from 0.001 to {most:g}, not {value:g}")
 

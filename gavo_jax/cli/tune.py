@@ -1,4 +1,4 @@
-"""`gavo tune`: settings of small drift and little time, as a Pareto front."""
+"""`gavo tune`: searches the Pareto front of settings with small drift and short run time."""
 
 import re
 import shlex
@@ -20,7 +20,7 @@ from gavo_jax.settings_file import override, save_settings
 
 STUDY, FRONT = "study.db", "front.json"
 TRIAL = re.compile(r"trial-\d+\.toml")
-"""The settings of a trial on the front."""
+"""Name of the file with the settings of a trial on the front."""
 
 
 def tune(options: Tune) -> int:

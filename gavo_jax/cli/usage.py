@@ -1,6 +1,4 @@
-"""What tyro says, in this command's words: of arguments that it does not take one line, with what would help; and pages
-of help that fit the screen.
-"""
+"""Rewords tyro's output: one-line usage errors with a hint, and help pages that fit the screen."""
 
 import difflib
 import io
