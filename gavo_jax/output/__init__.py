@@ -1,1 +1,1 @@
-"""What a run leaves: files, figures, reports, and words on the screen."""
+"""Output of a run: files, figures, reports and terminal text."""

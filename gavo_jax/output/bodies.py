@@ -27,7 +27,7 @@ def body_rows(step: Step) -> list[list[Any]]:
 
 
 class BodyRow(NamedTuple):
-    """What a row of bodies.csv says, but for the status."""
+    """A row of bodies.csv, without the status."""
 
     timestamp: float
     """Colour stamp, seconds."""
@@ -41,7 +41,7 @@ class BodyRow(NamedTuple):
 
 
 def read_bodies(path: Path) -> list[BodyRow]:
-    """The rows of bodies.csv; none where there is no such file.
+    """Return the rows of bodies.csv; none if there is no such file.
 
     Raises:
         GavoError: It cannot be read.

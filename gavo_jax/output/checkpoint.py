@@ -1,6 +1,6 @@
 """A driver's progress as one file, so that a run that was cut short can go on: arrays and numbers, no code.
 
-A digest seals it: what was altered by accident or by hand is not gone on with.
+A digest seals it: an altered checkpoint is refused.
 """
 
 import hashlib
@@ -116,7 +116,7 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
         progress = _progress_of(numbers, arrays)
     except GavoError:
         raise
-    except Exception:  # what the readers of damaged archives, arrays and numbers raise has no end
+    except Exception:  # reading damaged archives may raise almost anything
         raise GavoError(f"{path}: not a whole checkpoint: run again without --resume") from None
     if leaves is None:
         return Checkpoint(progress, files, images)
@@ -127,7 +127,7 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
 
 
 def _sealed_arrays(path: Path, most: int) -> dict[str, np.ndarray]:
-    """The arrays of a file of at most so many bytes, as they were sealed."""
+    """Return the sealed arrays of a file of at most `most` bytes, uncompressed; raise if they were altered."""
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > most:
             raise GavoError(f"{path}: larger than a checkpoint of this camera")

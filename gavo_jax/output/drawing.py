@@ -78,7 +78,7 @@ def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: lis
 
 
 def _beside_the_pair(odometry: Odometry) -> list[str]:
-    """What a run's motions are found with that the landscape of two images does not know."""
+    """Name what a run's motions depend on besides the two images of a pair."""
     options = odometry.settings.odometry
     keyframe = ["a keyframe"] if options.reference == "keyframe" else []
     shutter = ["the shutter's readout"] if options.rolling_shutter and odometry.camera.readout else []

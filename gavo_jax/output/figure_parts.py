@@ -26,13 +26,13 @@ GREYS = (0.3, 0.6)
 LINES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 CAPTION_WIDTH, CAPTION_SIZE = 15, 8.5
-"""Letters of a caption an inch of the figure, and their size in points: read where a page shows the figure smaller."""
+"""Letters of a caption per inch of figure width, and their size in points; legible when the figure is scaled down."""
 SMALL = 0.1
-"""Metres: what is smaller is drawn in millimetres."""
+"""Extent, metres, below which millimetres are drawn."""
 
 
 def shown_name(name: str) -> str:
-    """A name of other people's as a figure shows it: no formula, no command, and none that is left out for its `_`."""
+    """Escape a user-given name for matplotlib, which would read `$` as a formula and hide names that start with `_`."""
     shown = printable(name).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
@@ -68,7 +68,7 @@ def number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
 
 
 LABEL_HEIGHT = 0.05
-"""Share of the panel's height between the labels of two curves at least."""
+"""Smallest distance between the labels of two curves, as a share of the panel's height."""
 
 
 def label_ends(axes: Any) -> None:
@@ -126,7 +126,7 @@ def _draw_sample(axes: Any, line: Any, place: float) -> None:
 
 
 def apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float, float]) -> Float[np.ndarray, " n"]:
-    """Places in falling order, moved as little as it takes to keep a distance and, if there is room, the limits."""
+    """Move descending places as little as needed to keep a distance and, if there is room, the limits."""
     steps = -distance * np.arange(len(places))
     flat = places - steps  # falling by at least the distance where this does not rise
     level, blocks = [], []
@@ -176,7 +176,7 @@ def draw_scale(axes: Any, unit: str) -> None:
 
 
 def unit_of(extent: float) -> tuple[float, str]:
-    """Values a metre and their unit, for what is so many metres large."""
+    """Return the factor from metres, and the unit, in which to draw an extent in metres."""
     return (1e3, "mm") if extent < SMALL else (1.0, "m")
 
 

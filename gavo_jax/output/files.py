@@ -25,16 +25,16 @@ from gavo_jax.version import __version__
 
 TRAJECTORY, FRAMES, METRICS, CONFIG = "trajectory.txt", "frames.csv", "metrics.json", "config.json"
 ODOMETRY, LOOPS = "odometry.txt", "loops.csv"
-"""What a run with loops adds: the trajectory as it was before they corrected it, and the loops."""
+"""Files that a run with loops adds: the trajectory before loop closure, and the loops."""
 BODIES = "bodies.csv"
 MOTIONS = "motions.csv"
 CHECKPOINT = "checkpoint.npz"
 COMPARISON = "comparison.json"
 """File that `gavo compare` writes."""
 RECORDING = "run.rrd"
-"""What `--viewer save` writes."""
+"""File that `--viewer save` writes."""
 VIEW = "view.rrd"
-"""What `gavo view --viewer save` writes."""
+"""File that `gavo view --viewer save` writes."""
 
 
 def environment() -> dict[str, str]:
@@ -101,7 +101,7 @@ def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, 
 
 
 def prepare_folder(folder: str | Path) -> Path:
-    """Make a folder where it is missing, see that files can be made in it, and return it.
+    """Create a folder if it is missing, check that it is writable, and return it.
 
     Raises:
         GavoError: it is no folder or cannot be written to.
@@ -133,7 +133,7 @@ def refuse_foreign(folder: Path, file: str, what: str) -> None:
 
 
 def remove_files(folder: Path, *names: str) -> None:
-    """Remove files of an earlier run, and what a kill left half written, where there are any.
+    """Remove files of an earlier run, and any that a killed process left half written.
 
     Raises:
         GavoError: one cannot be removed.

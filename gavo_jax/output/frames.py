@@ -32,7 +32,7 @@ end."""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
-    """The steps of a run as its trajectory.txt and frames.csv tell them.
+    """Read the steps of a run from its trajectory.txt and frames.csv.
 
     Motions are those between the poses as they were found: of odometry.txt, where loops have corrected them since.
     Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame whose stamp is in
@@ -171,7 +171,7 @@ def frame_row(step: Step) -> list[Any]:
 
 
 class RecordedRun(NamedTuple):
-    """What a run folder tells of its run."""
+    """A run as read from its folder."""
 
     config: dict[str, Any]
     trajectory: Trajectory
@@ -180,7 +180,7 @@ class RecordedRun(NamedTuple):
 
 
 def read_run(folder: str | Path) -> RecordedRun:
-    """Read the files of a run, whether it came to its end or not.
+    """Read the files of a run, finished or not.
 
     Raises:
         GavoError: a file is missing or damaged, or trajectory.txt and frames.csv are not of the same run.

@@ -50,7 +50,7 @@ def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width
 
 
 def read_labels(folder: Path, timestamp: float) -> Integer[np.ndarray, "height width"] | None:
-    """Number of the body at each pixel of a frame, 0 beside them; None where the run saw none.
+    """Return the number of the body at each pixel of a frame, 0 for background; None if the run saw no body.
 
     Args:
         folder: Of the run.

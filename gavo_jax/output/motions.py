@@ -1,4 +1,4 @@
-"""motions.csv: of each pair all digits of what a map is made of, so that a run that is resumed makes the same map."""
+"""motions.csv: each pair's motion at full precision, so that a resumed run builds the same map."""
 
 import csv
 from dataclasses import replace
@@ -32,7 +32,7 @@ def motion_row(step: Step) -> list[Any]:
 
 
 def with_motions(steps: list[Step], path: Path) -> list[Step]:
-    """Steps with what a motions.csv says of them.
+    """Return steps updated with the values of motions.csv.
 
     Raises:
         GavoError: It cannot be read, or is of other steps.

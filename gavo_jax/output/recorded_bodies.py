@@ -1,4 +1,4 @@
-"""The bodies of a run that has ended, as bodies.csv and masks/ tell of them."""
+"""The bodies of a finished run, read from bodies.csv and masks/."""
 
 from dataclasses import replace
 from pathlib import Path

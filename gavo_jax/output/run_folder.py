@@ -51,7 +51,7 @@ from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, s
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
 IDENTITY_OPTIONS = ("method", "preset", "seed")
 IDENTITY_VERSIONS = ("gavo-jax", "jax", "numpy", "opencv")
-"""What has to be the same in config.json for a run to go on to the same end."""
+"""Packages whose versions in config.json must be unchanged for a run to be resumed."""
 
 
 CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
@@ -61,9 +61,9 @@ class _GrowingFile:
     """A text file that grows by whole lines: each is in the file, or the file ends where it did before."""
 
     def __init__(self, path: Path, mark: Mark | None = None) -> None:
-        """Make it, or open it and cut it to where it was; raise GavoError where that cannot be.
+        """Create the file, or open it and truncate it to the mark; raise GavoError on failure.
 
-        No link is followed: what it leads to is not this run's.
+        Links are not followed: their targets don't belong to this run.
         """
         self.path = path
         kind = os.O_CREAT | os.O_EXCL if mark is None else 0
@@ -89,11 +89,11 @@ class _GrowingFile:
         self.size += len(data)
 
     def mark(self) -> Mark:
-        """Return where it ends, and a digest of all before."""
+        """Return the file's length and digest."""
         return Mark(self.size, self._sha256.hexdigest())
 
     def cut(self, size: int) -> None:
-        """Take away what comes after so many bytes."""
+        """Truncate the file to a size in bytes."""
         if os.fstat(self._file).st_size > size:
             os.ftruncate(self._file, size)
         os.lseek(self._file, 0, os.SEEK_SET)
@@ -322,7 +322,7 @@ class RunFolder:
         return {name: file.mark() for name, file in self._files.items()}
 
     def _cut(self) -> None:
-        """Take away the part of a frame that an interruption left."""
+        """Remove an incomplete frame left by an interruption."""
         for name, mark in self._whole[0].items():
             self._files[name].cut(mark.size)
 

@@ -35,7 +35,7 @@ class _Console(Console):
 
 
 DASH = "–"
-"""A cell for what is not known."""
+"""Table cell for an unknown value."""
 
 
 def say(line: str) -> None:
@@ -120,7 +120,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
 
 
 def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], list[list[Any]]]:
-    """A table without the columns of which nothing is known in any row: those of dashes alone."""
+    """Return the table without columns that contain only dashes."""
     kept = [i for i in range(len(columns)) if not rows or any(row[i] != DASH for row in rows)]
     return [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
@@ -139,7 +139,7 @@ def _parts(columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int) ->
 def _columns(
     columns: Sequence[str], rows: Sequence[Sequence[Any]], start: int, end: int
 ) -> tuple[list[str], list[list[Any]]]:
-    """The first column, and those from start to before end."""
+    """Return the first column and columns start to end - 1."""
     return [columns[0], *columns[start:end]], [[row[0], *row[start:end]] for row in rows]
 
 

@@ -28,7 +28,7 @@ class SeenImages:
 
 
 def _fingerprint(path: Path) -> bytes:
-    """Size and end of a file; of one that cannot be read, that it cannot."""
+    """Return a file's size and last bytes, or a marker if it is unreadable."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, 2)

@@ -1,4 +1,4 @@
-"""A sequence through a driver under the eyes of a user, who may stop it with Ctrl-C."""
+"""Tracks a sequence with progress display, interruptible by Ctrl-C."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from gavo_jax.viewer.base import NO_VIEWER, Viewer
 
 
 class Tracked(NamedTuple):
-    """What came of a sequence; where the user stopped it, up to there."""
+    """Result of tracking a sequence, possibly only up to an interruption."""
 
     steps: list[Step]
     """As they came."""

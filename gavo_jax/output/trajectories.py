@@ -28,7 +28,7 @@ POSES, POSE_TYPE = "/gavo/pose", "geometry_msgs/msg/PoseStamped"
 """Topic and type of a bag's messages; the pose is that of the camera (x right, y down, z forward) in the world."""
 
 BAG_METADATA = "metadata.yaml"
-"""What is in every bag's folder."""
+"""File that every bag's folder contains."""
 
 WORLD = "world"
 """Frame in the messages' headers."""

@@ -1,1 +1,1 @@
-"""A run as people watch it."""
+"""Viewers of a run."""

@@ -1,4 +1,4 @@
-"""Where the viewer's window shows what."""
+"""Layout of the viewer's window."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 UNFINISHED = ".part"
 """After the name of a recording that is being written; not the ending of what a new run clears away."""
 WAITING_FRAMES = 8
-"""Frames that wait to be shown before the run waits for them."""
+"""Frames that may be queued before the run has to wait."""
 SECONDS_TOGETHER = 0.25
 """What is shown within this time is sent together; a window lags behind the run by at most this."""
 MEMORY = "512MiB"
@@ -129,7 +129,7 @@ class RerunViewer(Viewer):
         self._queue.put(lambda scene: scene.add(frame, step, populations))
 
     def show_corrected(self, trajectory: Trajectory, loops: Loops) -> None:
-        """Queue what is known in the end."""
+        """Queue the corrected trajectory and the loops."""
         self._raise_fault()
         self._queue.put(lambda scene: scene.add_loops(trajectory, loops))
 

@@ -1,4 +1,4 @@
-"""From frames, steps and populations to what Rerun is sent."""
+"""Converts frames, steps and populations to Rerun data."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CLOUD_STRIDE = 4
 
 
 NOTHING = encode_jpeg(np.zeros((3, 4), np.uint8))
-"""In the place of a picture that there is not."""
+"""Placeholder for a missing picture."""
 
 
 class Rows(NamedTuple):
@@ -166,7 +166,7 @@ class Scene:
         self._waiting[path].append(Rows(generations, sizes, values, self._frame))
 
     def _send_static(self) -> None:
-        """Send what stays as it is, among it the looks of what does not."""
+        """Send static data, including the styles of entities that change."""
         import rerun as rr
 
         camera, points = self._camera, rr.Radius.ui_points

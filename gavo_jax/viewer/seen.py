@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 CUBE = 0.03
 """Side of the cubes, metres."""
 FARTHEST = 4.0
-"""Metres; the depth of what is beyond is too uncertain."""
+"""Largest depth shown, metres; beyond it, depth is too uncertain."""
 MOST_POINTS = 300_000
 """Points that a viewer is sent; some 80 m² of surface at 3 cm."""
 _BITS, _MIDDLE = 21, 1 << 20
