@@ -118,7 +118,7 @@ def _nothing(place: Place) -> str | None:
 
 
 def _frames_apart(place: Place) -> str | None:
-    """Of a folder for each frame, as SUN RGB-D has it."""
+    """Advice on a folder with one subfolder per frame, as in SUN RGB-D."""
     folders = list(filter(_is_open_folder, place.inside))
     if len(folders) < 2 or any(tuple(map(len, plain_files(folder))) != (1, 1) for folder in folders):
         return None
