@@ -1,9 +1,9 @@
-"""What each ingredient buys: a preset of the GA with one ingredient switched off at a time.
+"""Ablation of the GA: a preset with one ingredient switched off at a time.
 
-Prints, for each clip, a row a variant: drift of translation (m/s) and rotation (deg/s), median over the seeds with its
-spread, lost pairs of the worst run, milliseconds per pair; then a row a variant with the ratios of its medians to those
-of the full preset, as geometric means over the clips and as the best and the worst clip. An ingredient whose ratio
-without it is 1 buys nothing.
+Prints, for each clip, one row per variant: drift of translation (m/s) and rotation (deg/s), median over the seeds with
+its spread, lost pairs of the worst run, milliseconds per pair. A last table has the ratios of each variant's medians to
+the full preset's: geometric mean over the clips, best and worst clip. A ratio of 1 means that the ingredient gains
+nothing.
 
     python benchmarks/ablation.py
     python benchmarks/ablation.py --clips fr1_desk:40 --variants depth,prior --seeds 2 --json ablation.json
@@ -37,7 +37,7 @@ def _odometry(**changes: Any) -> Callable[[Settings], Settings]:
 
 
 def _without_preconditioner(preset: Settings) -> Settings:
-    """Plain genes: first population, mutation and bounds as in the paper, which are in metres and radians."""
+    """The preset with plain genes: first population, mutation and bounds in metres and radians, as in the paper."""
     return replace(
         preset,
         solver=replace(preset.solver, spread=None, mutation_step=None),
@@ -74,9 +74,9 @@ VARIANTS: dict[str, tuple[str, Callable[[Settings], Settings]]] = {
         lambda preset: replace(preset, solver=replace(preset.solver, patience=max(preset.solver.iterations))),
     ),
 }
-"""Ingredient: what is there without it, and the preset without it."""
+"""For each ingredient: what a run without it is called, and the function that switches it off."""
 OF_DEFAULT = ",".join(name for name in VARIANTS if name != "stagnation")
-"""The default preset never stops a level before its last generation."""
+"""Ingredients of the default preset, which never stops a level before its last generation."""
 
 
 def contenders(variants: str, preset_name: str = "default") -> list[common.Contender]:
@@ -116,10 +116,10 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: as for drift.py, with commas between.
-        variants: ingredients to switch off, with commas between.
+        clips: comma-separated, as for drift.py.
+        variants: comma-separated ingredients to switch off.
         seeds: runs of each variant.
-        preset: settings that the ingredients are taken from.
+        preset: preset of the GA to start from.
         json: file for all runs and the summary.
     """
     runs = common.measure_drift(common.names(clips), contenders(variants, preset), seeds)

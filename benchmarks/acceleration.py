@@ -1,8 +1,8 @@
-"""How fast the cameras of real clips change their motion, by the ground truth.
+"""Speeds and accelerations of the cameras of real clips, by the ground truth.
 
-Prints one row per clip and interval: largest speed and largest change of speed a second, of translation and rotation,
-which `odometry.plausibility` allows for. Then how much the mean velocity changes from interval to interval, and how far
-the velocity at an interval's end is from its mean (RMS of an axis): what `alignment.sway` expects.
+Prints one row per clip and interval: the largest speed and acceleration of translation and rotation, which
+`odometry.plausibility` allows for. A second table has what `alignment.sway` expects, as RMS per axis: the change of the
+mean velocity from interval to interval, and the difference between the velocity at an interval's end and its mean.
 
     python benchmarks/acceleration.py
 """
@@ -21,25 +21,25 @@ from gavo_jax.trajectory import Trajectory, inverse
 INTERVALS = (1 / 30, 2 / 30, 4 / 30)
 """Seconds from frame to frame."""
 MOMENT = 0.016
-"""Seconds over which a velocity is taken for that of a moment: motion capture comes every 10 ms."""
+"""Seconds over which the mean velocity counts as instantaneous: motion capture comes every 10 ms."""
 PARTS = (slice(3), slice(3, 6))
-"""Of a twist: translation, rotation."""
+"""Slices of a twist: translation, rotation."""
 
 
 def velocities(truth: Trajectory, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Mean twists of the points in the camera between moments [n], m/s and rad/s; not-a-number where unknown."""
+    """Mean velocities [n, 6] of the points in the camera between moments [n], m/s and rad/s; NaN where unknown."""
     (first, known_first), (last, known_last) = truth.interpolate(begin), truth.interpolate(end)
     twists = np.asarray(jax.vmap(se3.log)(jnp.asarray(inverse(last) @ first)), float) / (end - begin)[:, None]
     return np.where((known_first & known_last)[:, None], twists, np.nan)
 
 
 def largest(twists: np.ndarray) -> list[float]:
-    """Return the largest of the translations' lengths, and of the rotations'."""
+    """Return the largest length of the translations, and of the rotations."""
     return [float(np.nanmax(np.linalg.norm(twists[:, part], axis=1))) for part in PARTS]
 
 
 def typical(twists: np.ndarray) -> list[float]:
-    """RMS of an axis, of the translations and of the rotations."""
+    """RMS per axis of the translations, and of the rotations."""
     return [float(np.sqrt(np.nanmean(np.square(twists[:, part])))) for part in PARTS]
 
 
@@ -47,7 +47,7 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between.
+        clips: comma-separated names.
         json: file for the figures.
     """
     rows, sways = [], []

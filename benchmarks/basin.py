@@ -1,14 +1,14 @@
-"""How large a motion each method still finds: success rate on pairs that lie k frames apart, from a zero guess.
+"""How large a motion each method still finds: success rate on pairs k frames apart, from the identity.
 
 A pair counts as found when its motion is within 5 cm and 3 degrees of the ground truth, interpolated at the colour
-stamps. A gap is in frames of the clip: one that keeps every 4th frame of a sequence has four times the motion.
+timestamps. Gaps count frames of the clip: if it keeps every 4th frame of a sequence, the motion is four times larger.
 
 Prints one row per method (presets as METHOD:PRESET, peers by name): its success rate for each gap, median over the
-seeds. The last rows have the number of pairs and their median motion, and how many of them see at least a tenth of each
-other's points. A second table has the median errors of the pairs that were found, a third those of the pairs that every
-method found. The last one says how often a method's status was right about failure: precision (share of the flagged
-pairs that had failed), recall (share of the failed pairs that were flagged), and milliseconds per pair. A peer's status
-is the flag that it returns.
+seeds. The last rows have the number of pairs, their median motion, and how many of them see at least a tenth of each
+other's points. A second table has the median errors of the pairs found, a third those of the pairs that every method
+found. The last table rates the status as a detector of failure: precision (share of the flagged pairs that had failed),
+recall (share of the failed pairs that were flagged), and milliseconds per pair. A peer's status is the flag that it
+returns.
 
     python benchmarks/basin.py
     python benchmarks/basin.py --clip fr1_desk --gaps 3,10 --methods ga:wide,opencv-rgbd --json basin.json
@@ -43,9 +43,9 @@ from gavo_jax.trajectory import inverse
 METHODS = "ga:wide,ga,pso:wide,gauss-newton:wide,gauss-newton," + common.installed_peers()
 TITLE = "success rate on "
 MAX_TRANSLATION, MAX_ROTATION = 0.05, 3.0
-"""Metres and degrees: errors of a found motion stay below."""
+"""Metres and degrees: a motion counts as found if its errors are smaller."""
 LEAST_OVERLAP = 0.1
-"""Share of either frame's points that the other one sees in a pair that overlaps."""
+"""Share of each frame's points that the other must see for the pair to count as overlapping."""
 
 
 class Pair(NamedTuple):
@@ -57,15 +57,15 @@ class Pair(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """What a method made of a pair."""
+    """A method's result on a pair."""
 
     target_T_reference: np.ndarray
     flagged: bool
-    """Whether the method itself says that something is wrong."""
+    """Whether the method itself reports a failure."""
 
 
 Aligner = Callable[[Frame, Frame, int], Attempt]
-"""From reference, target and seed."""
+"""Aligns a pair, given reference, target and seed."""
 
 
 def pairs_apart(sequence: Sequence, gap: int, step: int) -> list[Pair]:
@@ -85,7 +85,7 @@ def pairs_apart(sequence: Sequence, gap: int, step: int) -> list[Pair]:
 
 
 def make_aligner(name: str, camera: Camera) -> Aligner:
-    """The method or peer of that name.
+    """Make the aligner of a method or peer by its name.
 
     Raises:
         GavoError: unknown name.
@@ -128,7 +128,7 @@ def overlap(reference: Frame, target_T_reference: np.ndarray, camera: Camera) ->
 def attempt_pairs(
     sequence: Sequence, pairs: list[Pair], aligners: dict[str, Aligner], seeds: int
 ) -> list[dict[str, Any]]:
-    """Let every method try every pair, pair after pair; a peer tries once."""
+    """Run every method on every pair, once per seed; a peer runs once."""
     records = []
     for pair in pairs:
         reference, target = sequence[pair.reference], sequence[pair.target]
@@ -181,8 +181,9 @@ def success_rates(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def median_errors(records: list[dict[str, Any]], of_all: bool = False) -> list[dict[str, Any]]:
-    """A row a gap and method: median errors of the pairs that were found, metres and degrees; None where none was.
-    `of_all` takes the pairs that every method found, so that methods can be compared.
+    """One row per gap and method: median errors of the pairs found, metres and degrees; None where there are none.
+
+    `of_all` takes only the pairs that every method found, so that methods can be compared.
     """
     rows = []
     for gap in dict.fromkeys(r["gap"] for r in records):
@@ -198,9 +199,7 @@ def median_errors(records: list[dict[str, Any]], of_all: bool = False) -> list[d
 
 
 def status_agreement(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per method: precision and recall of its status as a sign of failure; None where there is nothing to
-    count.
-    """
+    """One row per method: precision and recall of its status as a sign of failure; None where undefined."""
     rows = []
     for name in dict.fromkeys(r["method"] for r in records):
         own = [r for r in records if r["method"] == name]
@@ -233,14 +232,14 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clip: as for drift.py, one of them.
-        gaps: frames between the two of a pair, with commas between.
-        methods: METHOD, METHOD:PRESET or the name of a peer, with commas between.
-        step: frames from a pair to the next one.
-        seeds: tries of each of our methods.
+        clip: one clip, named as for drift.py.
+        gaps: comma-separated distances of a pair's frames, in frames.
+        methods: comma-separated METHOD, METHOD:PRESET or names of peers.
+        step: frames between the starts of two pairs.
+        seeds: runs of each of our methods per pair.
         json: file for every attempt and the rates.
         figure: folder for basin.png and basin.svg.
-        recorded: files of earlier `json`, or of earlier `--record`, with commas between, to draw together; nothing is
+        recorded: comma-separated files that `--json` or `--record` wrote before, to draw together; nothing is
             measured.
     """
     if recorded.endswith(".toml"):
@@ -304,7 +303,7 @@ def _draw(records: list[dict[str, Any]], clip: str, folder: Path) -> None:
 
 
 def _draw_records(found: Iterable[Record], folder: Path) -> None:
-    """Draw the success rates of records; a method was not tried at every gap."""
+    """Draw the success rates of records; a method may lack some of the gaps."""
     tables = [table for record in found for table in record.tables if table.title.startswith(TITLE)]
     gaps = sorted({float(heading.split(", ")[1].rstrip("°")) for table in tables for heading in table.columns[1:]})
     success: dict[str, np.ndarray] = {}

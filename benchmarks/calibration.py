@@ -1,9 +1,9 @@
-"""Whether the covariance of a motion tells its error: eᵀΣ⁻¹e over pairs of synthetic sequences and of real clips.
+"""Whether the covariance of a motion matches its error: eᵀΣ⁻¹e over pairs of synthetic sequences and of real clips.
 
-With e the twist between the true and the estimated motion, in the tangent that Σ is stated in, eᵀΣ⁻¹e of an honest
-covariance has a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints one row per sequence: the pairs,
-the mean and median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the error is against
-motion capture, whose own errors and time offset count as the odometry's.
+Let e be the twist between the true and the estimated motion, in the tangent space of Σ. If Σ is consistent, eᵀΣ⁻¹e has
+a mean of 6, and 95 % of the pairs lie within the 95 % ellipsoid. Prints one row per sequence: the pairs, the mean and
+median of eᵀΣ⁻¹e, the share within the ellipsoid, and the median errors. On real clips the truth is motion capture,
+whose own errors and time offset count as the odometry's.
 
     python benchmarks/calibration.py
     python benchmarks/calibration.py --frames 30 --clips fr1_xyz --json calibration.json
@@ -39,8 +39,7 @@ NOISE = {
 
 
 def normalised_errors(sequence: Sequence, method: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Errors e of [pairs, 6] and eᵀΣ⁻¹e of [pairs] over consecutive frames; pairs that are not ok,
-    or without ground truth, are left out.
+    """Errors e [pairs, 6] and eᵀΣ⁻¹e [pairs] of consecutive frames that are ok and have ground truth.
 
     Raises:
         GavoError: there is no ground truth.
@@ -87,8 +86,8 @@ def main(
 
     Args:
         frames: of each synthetic sequence.
-        seeds: synthetic sequences a noise level; each has a path and textures of its own.
-        clips: real ones, with commas between; none leaves them out.
+        seeds: synthetic sequences per noise level, each with its own path and textures.
+        clips: comma-separated real clips; none if empty.
         method: METHOD or METHOD:PRESET.
         json: file for the figures.
     """

@@ -1,4 +1,4 @@
-"""What the benchmarks share: clips and methods by name, drift over seeds, tables and the record of a run."""
+"""Shared code of the benchmarks: clips and methods by name, drift over seeds, tables and the record of a run."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the package sets it where it is the first to import JAX
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the package does if it imports JAX first
 
 import jax
 import numpy as np
@@ -39,13 +39,13 @@ from gavo_jax.trajectory import Trajectory
 
 CLIPS = "fr1_xyz,fr1_desk,fr1_rpy"
 CLIP_FRAMES = {"fr1_xyz": 90}
-"""Frames taken of a clip where its name says nothing: the paper's first experiment uses 90 of fr1_xyz."""
+"""Frames taken of a clip whose name gives no number: the paper's first experiment uses 90 of fr1_xyz."""
 
 
 def command(main: Callable[..., Any]) -> None:
     """Run a benchmark's `main` as a command: its arguments are the options, the module's docstring the help text.
 
-    Beside them there is `--record FILE`.
+    The option `--record FILE` is added.
     """
     enable_compilation_cache()
     try:
@@ -63,11 +63,11 @@ RECORD_HELP = "With --record FILE the tables that are printed are written as a r
 
 _printed: list[records.Table] = []
 _told: list[str] = []
-"""Tables and sentences of this process, in the order in which they were printed."""
+"""Tables and sentences that this process has printed, in order."""
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table whose first column is text and whose others are numbers, and keep it for the record."""
+    """Print a table of a text column and number columns, and keep it for the record."""
     screen.print_table(title, columns, rows)
     cells = tuple(tuple(str(cell) or records.UNKNOWN for cell in row) for row in rows)
     _printed.append(records.Table(title, tuple(columns), cells))
@@ -80,7 +80,7 @@ def tell(sentence: str) -> None:
 
 
 def take_record(arguments: Sequence[str]) -> tuple[list[str], Path | None]:
-    """The arguments without `--record FILE`, and that file.
+    """Split `--record FILE` off: return the other arguments, and the file.
 
     Raises:
         GavoError: no file is named.
@@ -113,15 +113,15 @@ def printed_record(benchmark: str, arguments: Sequence[str]) -> records.Record:
 
 
 def names(text: str) -> list[str]:
-    """Return the names between the commas."""
+    """Split comma-separated names."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def names_among(known: Collection[str], what: str, text: str) -> list[str]:
-    """Return the names between the commas.
+    """Split comma-separated names, all of which must be known.
 
     Raises:
-        GavoError: one is not known.
+        GavoError: a name is unknown.
     """
     for name in (chosen := names(text)):
         if name not in known:
@@ -130,10 +130,10 @@ def names_among(known: Collection[str], what: str, text: str) -> list[str]:
 
 
 def counts(text: str) -> list[int]:
-    """Return the whole numbers between the commas.
+    """Split comma-separated whole numbers.
 
     Raises:
-        GavoError: something else is between them.
+        GavoError: an entry is not a whole number, or there is none.
     """
     if not names(text) or not all(name.isdecimal() for name in names(text)):
         raise GavoError(f"{text}: not whole numbers with commas between")
@@ -141,14 +141,14 @@ def counts(text: str) -> list[int]:
 
 
 def open_clip(text: str) -> FrameSequence:
-    """Return the frames of a clip.
+    """Open a clip by its name.
 
     Args:
-        text: NAME or NAME:FRAMES, the first so many frames. NAME is a folder of any layout that `gavo inspect` knows,
+        text: NAME, or NAME:FRAMES for its first FRAMES frames. NAME is a folder of a layout that `gavo inspect` knows,
             one of GAVO_DATA's folders, or the word synthetic.
 
     Raises:
-        GavoError: no such folder, GAVO_DATA not set, or the frames are not a number.
+        GavoError: no such folder, GAVO_DATA not set, or FRAMES is not a number of at least 2.
     """
     name, _, count = text.partition(":")
     if count and not (count.isdecimal() and int(count) >= 2):
@@ -166,7 +166,7 @@ def open_clip(text: str) -> FrameSequence:
 
 
 def open_true_clip(text: str) -> tuple[FrameSequence, Trajectory]:
-    """Return the frames of a clip, as `open_clip` does, and its ground truth.
+    """Open a clip, as `open_clip` does, and return it with its ground truth.
 
     Raises:
         GavoError: as by `open_clip`, or there is no ground truth.
@@ -178,17 +178,17 @@ def open_true_clip(text: str) -> tuple[FrameSequence, Trajectory]:
 
 
 class Contender(NamedTuple):
-    """What takes part in a table."""
+    """A method in a comparison."""
 
     name: str
     make: Callable[[Camera, int], Odometry]
-    """A new driver for a camera and a seed."""
+    """Makes a new driver for a camera and a seed."""
     random: bool
     """Whether the seed can change the result; a peer's cannot."""
 
 
 def preset_contender(name: str, settings: Settings) -> Contender:
-    """One of our own methods with its settings."""
+    """Make a contender of one of our own methods."""
 
     def make(camera: Camera, seed: int) -> Odometry:
         return Odometry(camera, settings, seed=seed)
@@ -200,7 +200,7 @@ def preset_of(name: str) -> Settings:
     """The settings of METHOD, METHOD:PRESET or METHOD:PRESET:BODIES, where BODIES is what `--bodies` takes.
 
     Raises:
-        GavoError: unknown method or preset, or no such way with bodies.
+        GavoError: unknown method or preset, or invalid BODIES.
     """
     method, _, rest = name.partition(":")
     preset, _, bodies = rest.partition(":")
@@ -228,12 +228,12 @@ def installed_peers() -> str:
 
 
 def measure_drift(clips: Sequence[str], contenders: Sequence[Contender], seeds: int) -> list[dict[str, Any]]:
-    """Run every contender over every clip with every seed; a peer runs once a clip.
+    """Run every contender over every clip with every seed; a peer runs once per clip.
 
-    Seed after seed, and within each one contender after the other, so that a slow spell of the machine meets all.
+    Contenders take turns within each seed, so that a slow spell of the machine affects all of them.
 
     Returns:
-        The metrics of each run (as `metrics.json`, times included) with `clip`, `name`, `seed` and `random`.
+        The metrics of each run (as in `metrics.json`, times included) with `clip`, `name`, `seed` and `random`.
 
     Raises:
         GavoError: a clip cannot be read, or its ground truth covers less than a second.
@@ -302,7 +302,7 @@ DRIFT_COLUMNS = ("method", "m/s", "max/min", "deg/s", "max/min", "lost", "ms/pai
 
 
 def drift_row(summary: Summary) -> list[str]:
-    """The cells of `DRIFT_COLUMNS`."""
+    """Format a summary as cells of `DRIFT_COLUMNS`."""
     return [
         summary.name,
         number(summary.translation, 4),
@@ -321,13 +321,13 @@ def geometric_mean(values: Sequence[float]) -> float:
 
 
 def record(path: Path | None, benchmark: str, results: dict[str, Any]) -> None:
-    """Write the results as JSON beside what they depend on: date, machine, versions; nothing where path is None."""
+    """Write the results as JSON with date, machine and versions; do nothing if path is None."""
     if path is not None:
         write_json(path, {"benchmark": benchmark, **machine(), **results})
 
 
 def read_records(paths: str, benchmark: str) -> list[dict[str, Any]]:
-    """Return what `record` wrote into files, with commas between.
+    """Read comma-separated files that `record` wrote.
 
     Raises:
         GavoError: a file cannot be read or is not of that benchmark.
@@ -345,9 +345,9 @@ def read_records(paths: str, benchmark: str) -> list[dict[str, Any]]:
 
 
 def save_figure(figure: Any, folder: Path, name: str, drawn: Any) -> None:
-    """Write a figure of `plots` into a folder, which is made where it is missing, as PNG and SVG.
+    """Save a figure of `plots` as PNG and SVG in a folder, which is created if missing.
 
-    The PNG holds a digest of what is drawn, so that a test can tell a picture of older figures.
+    The PNG holds a digest of the data drawn, so that a test can detect an outdated picture.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo

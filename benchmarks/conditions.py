@@ -1,10 +1,12 @@
-"""What other images of the same way do to a run: other light, lenses, sensors, sizes and rates, with nothing wrong.
+"""Robustness to other light, lenses, sensors, image sizes and frame rates, none of which is a fault.
 
-Every frame of a clip is changed as another camera or room would have it. Nothing moves in the clips but the camera, so
-bodies are false alarms. Prints, for each clip and condition, the share of the pairs that are not ok once the run has
-ended, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, the share of the images that
-show a body, and the drift (RPE over 1 s, RMSE; a dash where no segment is that long), also over that of the clip as it
-is at the same frames.
+Every frame of a clip is changed as if another camera or room had produced it. Only the camera moves in the clips, so
+bodies are false alarms. Prints for each clip and condition:
+
+- the share of the pairs that are not ok at the end of the run;
+- how many pairs are off by more than 5 cm or 3 degrees, and how many of these are ok;
+- the share of the images in which a body was found;
+- drift (RPE over 1 s, RMSE; a dash where no segment is that long), also over the unchanged clip's at the same frames.
 
     python benchmarks/conditions.py
     python benchmarks/conditions.py --conditions "bands of 4 %,vignette" --method gauss-newton --json conditions.json
@@ -34,12 +36,12 @@ AS_IT_IS = "as it is"
 
 Image = np.ndarray
 Grey = Callable[[int, Image], Image]
-"""Makes a frame's grey levels, as floats, from its index and the clip's."""
+"""Changes the grey levels of a frame, as floats, given its index and them."""
 Condition = Callable[[FrameSequence], Damaged]
 
 
 def grey(make: Grey) -> Condition:
-    """All grey images are changed."""
+    """Change all grey images."""
 
     def alter(_: FrameSequence, index: int, frame: Frame) -> Frame:
         levels = make(index, frame.grey.astype(np.float32))
@@ -49,17 +51,17 @@ def grey(make: Grey) -> Condition:
 
 
 def depth(make: Callable[[int, Image], Image]) -> Condition:
-    """All depth images are changed, in the clip's unit; 0 is no reading."""
+    """Change all depth images, in the clip's unit; 0 is no reading."""
     return every_frame(lambda _, index, frame: replace(frame, depth=make(index, frame.depth).astype(np.uint16)))
 
 
 def frames(chosen: Callable[[int], bool]) -> Condition:
-    """Only some of the frames are there."""
+    """Keep only some of the frames."""
     return lambda clip: Damaged(clip, [index for index in range(len(clip)) if chosen(index)])
 
 
 def gain(of_place: Callable[[int, Image, Image], Image]) -> Condition:
-    """A gain of every place's own, by the frame's index and the place, column and row from -1 to 1."""
+    """Apply a gain to each pixel, given the frame's index and the pixel's column and row from -1 to 1."""
 
     def shone(index: int, levels: Image) -> Image:
         height, width = levels.shape
@@ -70,7 +72,7 @@ def gain(of_place: Callable[[int, Image, Image], Image]) -> Condition:
 
 
 def with_camera(camera_of: Callable[[Camera], Camera], grey: Callable, depth: Callable) -> Condition:
-    """Images of another size, and their camera."""
+    """Change the size of all images, and their camera with it."""
     images = every_frame(lambda _, index, frame: replace(frame, grey=grey(frame.grey), depth=depth(frame.depth)))
 
     def change(clip: FrameSequence) -> Damaged:
@@ -82,28 +84,28 @@ def with_camera(camera_of: Callable[[Camera], Camera], grey: Callable, depth: Ca
 
 
 def random(index: int) -> np.random.Generator:
-    """A frame's own random numbers."""
+    """Random generator of a frame."""
     return np.random.default_rng(index)
 
 
 def jpeg(index: int, levels: Image) -> Image:
-    """What a JPEG of quality 30 keeps."""
+    """Compress an image as JPEG of quality 30, and decode it."""
     coded = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, 30])[1]
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
 
 
 def blurred(sigma: float, levels: Image) -> Image:
-    """An image that is out of focus, by so many pixels."""
+    """Blur an image by `sigma` pixels, as out of focus."""
     return cv2.GaussianBlur(levels, (0, 0), sigma)
 
 
 def bands(amplitude: float) -> Condition:
-    """A lamp that flickers while rows are exposed, at another phase in every frame."""
+    """Bands of a lamp that flickers while rows are exposed, with another phase in every frame."""
     return gain(lambda index, columns, rows: 1.0 + amplitude * np.sin(2.0 * np.pi * rows + 2.1 * index))
 
 
 def without_edges(index: int, raw: Image) -> Image:
-    """Depth that is missing along its edges."""
+    """Remove depth along its edges."""
     steps = np.abs(cv2.Laplacian(raw.astype(np.float32), cv2.CV_32F)) > 300
     return np.where(cv2.dilate(steps.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, 0, raw)
 
@@ -176,7 +178,7 @@ CONDITIONS: dict[str, Condition] = {
 def measure(
     clip: FrameSequence, truth: Trajectory, condition: str, contender: common.Contender, clean: Trajectory | None
 ) -> tuple[dict[str, Any], Trajectory]:
-    """One run, and its trajectory; `clean` is that of the clip as it is."""
+    """Figures and trajectory of one run; `clean` is the unchanged clip's trajectory, None if this run makes it."""
     sequence = CONDITIONS[condition](clip)
     steps, trajectory = follow(sequence, contender, 0)
     drift_of = partial(known_drift, stamps=sequence.timestamps, truth=truth)
@@ -199,9 +201,9 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between, of clips with ground truth in which nothing moves; see `common.open_clip`.
+        clips: comma-separated clips with ground truth in which only the camera moves; see `common.open_clip`.
         method: METHOD or METHOD:PRESET.
-        conditions: names with commas between; the clip as it is comes first in any case.
+        conditions: comma-separated names; the unchanged clip always comes first.
         json: file for the figures.
     """
     contender, rows, cells = common.parse_methods(method)[0], [], []
