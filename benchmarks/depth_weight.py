@@ -1,14 +1,14 @@
-"""How much depth is worth beside grey: what either channel alone says of the motion, and how far the two disagree.
+"""Weight that depth deserves beside grey: the motion by each channel alone, and how far the two disagree.
 
-Tracks with Gauss-Newton. At each pair and level the optimum of the grey cost alone and that of the depth cost alone are
-found. Prints, for each clip, one row per level, with medians over the pairs:
+Tracks with Gauss-Newton, and finds the optima of the grey cost alone and of the depth cost alone at each pair and
+level. Prints, for each clip, one row per level, with medians over the pairs:
 
-- weight by scatter: the weight of depth that each channel's own scatter from tile to tile of the image would justify;
-- disagreement: how far apart the two optima lie, squared, in units of the covariance that those scatters promise for
-  their difference (1 if they told the whole truth);
-- weight by disagreement: the weight that is left when the disagreement is taken for depth's error.
+- weight by scatter: the weight of depth that each channel's own scatter from tile to tile of the image justifies;
+- disagreement: squared distance between the two optima, in units of the covariance of their difference that the
+  scatters predict (1 if they explain it);
+- weight by disagreement: the weight of depth if the disagreement is depth's error.
 
-A disagreement far above 1 is an error that a whole image shares (calibration, timing), which no scatter shows. No
+A disagreement far above 1 is an error common to a whole image (calibration, timing), which scatter does not show. No
 ground truth is used.
 
     python benchmarks/depth_weight.py
@@ -41,9 +41,9 @@ from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 
 STEPS = 5
-"""Of Gauss-Newton from the common optimum to a channel's own."""
+"""Gauss-Newton steps from the joint optimum to a channel's own."""
 DEPTH_ALONE = 1e6
-"""Weight beside which grey vanishes."""
+"""Weight of depth that makes grey negligible."""
 FIGURES = ("by_scatter", "disagreement", "by_disagreement")
 
 
@@ -51,9 +51,10 @@ FIGURES = ("by_scatter", "disagreement", "by_disagreement")
 def own_optima(
     before: TrackerState, after: TrackerState, camera: Camera, solver: Any, options: AlignmentOptions
 ) -> list[tuple[jax.Array, ...]]:
-    """Return for grey and depth, each with the levels on the leading axis, coarsest first: the optimum, in steps about
-    the motion that was tracked, the Hessian of the mean cost there, residuals in units of their scale, and the
-    covariance of its gradient.
+    """Optimum, Hessian and covariance of the gradient for grey alone and for depth alone.
+
+    Levels are on the leading axis, coarsest first. The optimum is a step from the tracked motion. The Hessian is that
+    of the mean cost there, with residuals in units of their scale; the covariance is that of its gradient.
     """
     motion = exp(after.motion)
     geometry = levels_of(camera, solver, options)
@@ -128,7 +129,7 @@ def main(clips: str = common.CLIPS, json: Path | None = None) -> dict[str, Any]:
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between; see `common.open_clip`.
+        clips: comma-separated names; see `common.open_clip`.
         json: file for the figures.
     """
     found = {clip: measure(clip) for clip in common.names(clips)}

@@ -1,9 +1,9 @@
-"""Drift of every method on every clip: ours with their presets, the peers beside them.
+"""Drift of every method on every clip: ours with their presets, and the peers.
 
 Prints, for each clip, one row per method: drift (RPE over 1 s, RMSE) of translation in m/s and of rotation in deg/s,
 each as the median over the seeds with its spread (largest over smallest), the lost pairs of the worst run, and the
-milliseconds per pair; then the ratios to the best peer of each clip (the best in translation and the best in rotation,
-which need not be the same one) and of the GA to Gauss-Newton, clip by clip, with their geometric mean and the worst.
+milliseconds per pair. A last table has the ratios to the best peer and of the GA to Gauss-Newton, clip by clip, with
+their geometric mean and the worst. The best peer is chosen for each clip, in translation and in rotation separately.
 
     python benchmarks/drift.py
     python benchmarks/drift.py --clips fr1_xyz:30 --methods ga,gauss-newton,opencv-rgb --seeds 2 --json drift.json
@@ -13,7 +13,7 @@ which need not be the same one) and of the GA to Gauss-Newton, clip by clip, wit
 
 Clips are NAME or NAME:FRAMES: a folder in TUM layout, a folder of GAVO_DATA, or the word synthetic. Methods are METHOD,
 METHOD:PRESET, or the name of a peer. On 2 cores the defaults take about half an hour, most of it for `ga:paper`, which
-is run at the full resolution as printed; without it, ten minutes.
+runs at full resolution as in the paper; without it, ten minutes.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ METHODS = "ga,pso,gauss-newton,adam,ga:paper,ga:fast," + common.installed_peers(
 
 
 class Ratio(NamedTuple):
-    """A figure against its reference, clip by clip."""
+    """Ratios of a figure to its reference, clip by clip."""
 
     name: str
     by_clip: dict[str, float]
@@ -46,12 +46,12 @@ class Ratio(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """Largest of the clips."""
+        """Largest over the clips."""
         return max(self.by_clip.values())
 
 
 def ratios(summaries: list[common.Summary]) -> list[Ratio]:
-    """Each of our methods against the best peer, and each GA preset against Gauss-Newton's of the same name."""
+    """Ratios of our methods to the best peer, and of each GA preset to Gauss-Newton's of the same name."""
     clips = list(dict.fromkeys(summary.clip for summary in summaries))
     by_key = {(summary.clip, summary.name): summary for summary in summaries}
     contenders = list(dict.fromkeys(summary.name for summary in summaries))
@@ -83,7 +83,7 @@ def drifts(runs: list[dict[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
 
 
 def medians(records: Sequence[Record]) -> dict[str, dict[str, np.ndarray]]:
-    """The same as records tell it: one row for each method, the median."""
+    """Drifts as in `drifts`, but from records: one row for each method, the median."""
     found: dict[str, dict[str, np.ndarray]] = {}
     for table in (table for record in records for table in record.tables if table.title.startswith(TITLE)):
         clip = found.setdefault(table.title.removeprefix(TITLE).partition(",")[0], {})
@@ -103,12 +103,12 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between.
-        methods: names with commas between.
+        clips: comma-separated names.
+        methods: comma-separated names.
         seeds: runs of each of our methods.
         json: file for all runs and the summary.
         figure: folder for drift.png and drift.svg.
-        recorded: files of earlier `json`, or of earlier `--record`, with commas between, to draw together; nothing is
+        recorded: comma-separated files that `--json` or `--record` wrote before, to draw together; nothing is
             measured.
     """
     if recorded.endswith(".toml"):

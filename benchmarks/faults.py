@@ -1,10 +1,13 @@
-"""What damaged frames do to a run: every fault at five places of each clip, and false alarms on clean clips.
+"""Robustness to damaged frames: every fault at five places of each clip, and false alarms on clean clips.
 
-Each fault is put into the clip at evenly spaced places, in runs of its own. Prints one row per clip and fault: whether
-the run came through, the share of the damaged pairs whose status is not ok, the share of the other pairs whose status
-is not ok, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, and the drift (RPE over
-1 s, RMSE) over the frames that were left alone, also over that of the clean run over the very same frames. Then one row
-per clip: the share of the pairs of a clean run whose status is not ok.
+Each fault is injected at evenly spaced places of the clip, in runs of its own. Prints for each clip and fault:
+
+- whether the run finished;
+- the share of the damaged pairs, and of the other pairs, whose status is not ok;
+- how many pairs are off by more than 5 cm or 3 degrees, and how many of these are ok;
+- drift (RPE over 1 s, RMSE) over the undamaged frames, also over the clean run's on the same frames.
+
+Then one row per clip: the share of the pairs of a clean run whose status is not ok.
 
     python benchmarks/faults.py
     python benchmarks/faults.py --method gauss-newton --json faults.json
@@ -40,9 +43,9 @@ from gavo_jax.trajectory import Trajectory, inverse
 
 PLACES = 5
 DROPPED = 3
-"""Frames in a row that go missing."""
+"""Consecutive frames that are dropped."""
 WRONG = (0.05, 3.0)
-"""Metres and degrees: a pair whose motion is further from the truth is wrong."""
+"""Metres and degrees: a pair is wrong if its motion is further from the truth."""
 
 Alter = Callable[[FrameSequence, int, Frame], Frame]
 
@@ -51,15 +54,15 @@ class Damaged:
     """A clip with altered frames, other frames in their place, or altered stamps.
 
     Attributes:
-        sources: Of each frame the clip's frame whose images it has.
-        timestamps: Of each frame, as the odometry is told.
-        moments: When the truth is asked for each frame, seconds.
-        alter: Of some frames what makes the damaged frame; may raise FrameError.
-        damaged: The frames that are not as the clip has them, or that follow others than in the clip.
+        sources: For each frame, the index of the clip's frame whose images it has.
+        timestamps: Timestamp of each frame, as given to the odometry.
+        moments: Time at which the truth of each frame is taken, seconds.
+        alter: For some frames, the function that damages them; may raise FrameError.
+        damaged: Indices of the frames that differ from the clip's, or follow another frame than in the clip.
     """
 
     def __init__(self, clip: FrameSequence, sources: list[int]) -> None:
-        """Take these frames of a clip, with their stamps."""
+        """Take the given frames of a clip, with their timestamps."""
         self.clip, self.camera, self.name, self.ground_truth = clip, clip.camera, clip.name, clip.ground_truth
         self.sources = sources
         self.timestamps = clip.timestamps[sources].copy()
@@ -82,7 +85,7 @@ Fault = Callable[[FrameSequence, list[int]], Damaged]
 
 
 def altered(alter: Alter, count: int = 1) -> Fault:
-    """A number of frames in a row are altered."""
+    """Alter `count` consecutive frames at each place."""
 
     def damage(clip: FrameSequence, places: list[int]) -> Damaged:
         sequence = Damaged(clip, list(range(len(clip))))
@@ -94,7 +97,7 @@ def altered(alter: Alter, count: int = 1) -> Fault:
 
 
 def every_frame(alter: Alter) -> Callable[[FrameSequence], Damaged]:
-    """All frames are altered."""
+    """Alter all frames."""
 
     def change(clip: FrameSequence) -> Damaged:
         sequence = Damaged(clip, list(range(len(clip))))
@@ -105,27 +108,27 @@ def every_frame(alter: Alter) -> Callable[[FrameSequence], Damaged]:
 
 
 def with_grey(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault:
-    """Damage of the grey image."""
+    """Damage the grey image of some frames."""
     return altered(lambda clip, index, frame: replace(frame, grey=make(frame.grey)), count)
 
 
 def of_depth(make: Callable[[np.ndarray], np.ndarray]) -> Alter:
-    """Damage of the depth image."""
+    """Damage the depth image of a frame."""
     return lambda clip, index, frame: replace(frame, depth=make(frame.depth).astype(frame.depth.dtype))
 
 
 def late(frames: int) -> Alter:
-    """Depth of so many frames before, under this one's stamp."""
+    """Replace a frame's depth by that of `frames` frames before, under its own timestamp."""
     return lambda clip, index, frame: replace(frame, depth=clip[max(index - frames, 0)].depth)
 
 
 def with_depth(make: Callable[[np.ndarray], np.ndarray], count: int = 1) -> Fault:
-    """Damage of the depth image of some frames."""
+    """Damage the depth image of some frames."""
     return altered(of_depth(make), count)
 
 
 def dropped(count: int, restamped: bool = False) -> Fault:
-    """Frames in a row go missing; with `restamped` the stamps go on as if they had not."""
+    """Drop consecutive frames; with `restamped` the timestamps continue without a gap."""
 
     def damage(clip: FrameSequence, places: list[int]) -> Damaged:
         missing = {place + i for place in places for i in range(count)}
@@ -139,7 +142,7 @@ def dropped(count: int, restamped: bool = False) -> Fault:
 
 
 def shifted_stamp(seconds: float) -> Fault:
-    """A stamp that comes so many seconds after the last one."""
+    """Set a frame's timestamp to `seconds` after the previous one."""
 
     def damage(clip: FrameSequence, places: list[int]) -> Damaged:
         sequence = Damaged(clip, list(range(len(clip))))
@@ -152,7 +155,7 @@ def shifted_stamp(seconds: float) -> Fault:
 
 
 def stale(age: int) -> Fault:
-    """A frame's images are older ones, so many frames back."""
+    """Replace a frame's images by those of `age` frames before."""
 
     def damage(clip: FrameSequence, places: list[int]) -> Damaged:
         sequence = Damaged(clip, list(range(len(clip))))
@@ -165,7 +168,7 @@ def stale(age: int) -> Fault:
 
 
 def swapped(apart: int) -> Fault:
-    """A frame's images and those of the next one, or of a later one, are exchanged."""
+    """Exchange a frame's images with those of the frame `apart` frames later."""
 
     def damage(clip: FrameSequence, places: list[int]) -> Damaged:
         sequence = Damaged(clip, list(range(len(clip))))
@@ -178,7 +181,7 @@ def swapped(apart: int) -> Fault:
 
 
 def exchanged_stamps(clip: FrameSequence, places: list[int]) -> Damaged:
-    """A frame's stamp and that of the next one are exchanged."""
+    """Exchange the timestamps of a frame and the next one."""
     sequence = Damaged(clip, list(range(len(clip))))
     sequence.damaged = {i + j for i in places for j in (0, 1)}
     for i in places:
@@ -188,7 +191,7 @@ def exchanged_stamps(clip: FrameSequence, places: list[int]) -> Damaged:
 
 
 def duplicated(clip: FrameSequence, places: list[int]) -> Damaged:
-    """Every frame comes twice, the second time half an interval later and a grey level off here and there."""
+    """Repeat every frame half an interval later, with jitter in its grey levels."""
     del places
     sequence = Damaged(clip, [i for i in range(len(clip)) for _ in (0, 1)])
     middle = clip.timestamps[:-1] + np.diff(clip.timestamps) / 2
@@ -200,27 +203,27 @@ def duplicated(clip: FrameSequence, places: list[int]) -> Damaged:
 
 
 def jitter(clip: FrameSequence, index: int, frame: Frame) -> Frame:
-    """A grey level off here and there."""
+    """Change each pixel by at most one grey level, at random."""
     change = np.random.default_rng(index).integers(-1, 2, frame.grey.shape)
     return replace(frame, grey=np.clip(frame.grey + change, 0, 255).astype(frame.grey.dtype))
 
 
 def half_old(clip: FrameSequence, index: int, frame: Frame) -> Frame:
-    """The image's lower half is that of three frames before."""
+    """Replace the lower half of the grey image by that of three frames before."""
     grey = frame.grey.copy()
     grey[len(grey) // 2 :] = clip[max(index - 3, 0)].grey[len(grey) // 2 :]
     return replace(frame, grey=grey)
 
 
 def permuted(depth: np.ndarray) -> np.ndarray:
-    """Depth whose tiles are mixed up."""
+    """Shuffle the tiles of a depth image."""
     tiles = [tile for row in np.split(depth, 8) for tile in np.split(row, 8, axis=1)]
     order = np.random.default_rng(0).permutation(64)
     return np.block([[tiles[order[8 * i + j]] for j in range(8)] for i in range(8)])
 
 
 def frozen_depth(clip: FrameSequence, places: list[int]) -> Damaged:
-    """Depth that stands still for ten frames."""
+    """Freeze the depth image for ten frames."""
     sequence = Damaged(clip, list(range(len(clip))))
     for place in places:
         depth = clip[place - 1].depth
@@ -231,19 +234,19 @@ def frozen_depth(clip: FrameSequence, places: list[int]) -> Damaged:
 
 
 def half_missing(depth: np.ndarray) -> np.ndarray:
-    """Depth without its left half."""
+    """Remove the left half of a depth image."""
     return np.where(np.arange(depth.shape[1]) < depth.shape[1] // 2, 0, depth).astype(depth.dtype)
 
 
 def not_a_number(grey: np.ndarray) -> np.ndarray:
-    """The image as floats, a tenth of its rows not a number."""
+    """The image as floats, with NaN in the first tenth of its rows."""
     values = grey.astype(np.float32)
     values[: len(values) // 10] = np.nan
     return values
 
 
 def torn(clip: FrameSequence, index: int, frame: Frame) -> Frame:
-    """What reading the frame from files gives, of which the colour image ends in the middle."""
+    """Read the frame from files whose colour image is truncated."""
     with tempfile.TemporaryDirectory() as name:
         color, depth = Path(name) / "color.png", Path(name) / "depth.png"
         data = cv2.imencode(".png", frame.grey)[1].tobytes()
@@ -253,14 +256,14 @@ def torn(clip: FrameSequence, index: int, frame: Frame) -> Frame:
 
 
 def zoom(image: np.ndarray) -> np.ndarray:
-    """The middle of an image, a fifth larger, in its place."""
+    """Magnify the middle of an image by a fifth to the full size."""
     height, width = image.shape
     part = image[height // 12 : height - height // 12, width // 12 : width - width // 12]
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
 def noise(grey: np.ndarray) -> np.ndarray:
-    """Independent grey levels, evenly spread."""
+    """Independent, uniformly distributed grey levels."""
     return np.random.default_rng(0).integers(0, 256, grey.shape).astype(grey.dtype)
 
 
@@ -304,37 +307,37 @@ LAWFUL: dict[str, Fault] = {
     "gain x 0.4 for 10": with_grey(lambda grey: (grey * 0.4).astype(grey.dtype), 10),
     "contrast / 12 for 10": with_grey(lambda grey: (100 + grey / 12).astype(grey.dtype), 10),
 }
-"""What a camera may do: none of these frames should be lost."""
+"""Changes that a camera may make: none of these frames should be lost."""
 
 
 class Row(NamedTuple):
-    """What one fault did."""
+    """Result of one fault on one clip."""
 
     clip: str
     fault: str
     crashed: bool
     flagged: float
-    """Share of the damaged pairs."""
+    """Share of the damaged pairs whose status is not ok."""
     false_alarms: float
-    """Share of the other pairs."""
+    """Share of the other pairs whose status is not ok."""
     wrong: int
-    """Pairs whose motion is wrong, wherever they are."""
+    """Pairs whose motion is wrong, damaged or not."""
     silent: int
     """Pairs whose motion is wrong and whose status is `ok`."""
     drift: float
-    """m/s, over the frames left alone; median over the seeds."""
+    """m/s, over the undamaged frames; median over the seeds."""
     clean_drift: float
     statuses: dict[str, int]
-    """Of the damaged pairs."""
+    """Count of each status among the damaged pairs."""
 
     @property
     def ratio(self) -> float:
-        """Drift against the clean run's."""
+        """Drift over the clean run's."""
         return self.drift / self.clean_drift
 
 
 def is_wrong(step: Step, sequence: Damaged, truth: Trajectory) -> bool:
-    """Whether the motion that a step was given lies far from the truth at its stamps."""
+    """Whether a step's motion is wrong; False for a step without a motion or without ground truth."""
     if not np.isfinite(np.asarray(step.alignment.error)):
         return False
     before = int(np.argmin(np.abs(sequence.timestamps - step.reference_timestamp)))
@@ -347,13 +350,13 @@ def is_wrong(step: Step, sequence: Damaged, truth: Trajectory) -> bool:
 
 
 def drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float:
-    """Drift over the poses of some stamps, m/s."""
+    """Drift over the poses at some timestamps, m/s."""
     chosen = np.isin(trajectory.timestamps, stamps)
     return relative_pose_error(trajectory[chosen], truth).translation.rmse
 
 
 def known_drift(trajectory: Trajectory, stamps: np.ndarray, truth: Trajectory) -> float | None:
-    """The same; None where the trajectory is broken into segments of less than a second."""
+    """Drift as by `drift`; None if the trajectory is broken into segments of less than a second."""
     try:
         return drift(trajectory, stamps, truth)
     except GavoError:
@@ -369,7 +372,7 @@ def follow(sequence: Any, contender: common.Contender, seed: int) -> tuple[list[
 def measure(
     name: str, fault: str, clip: FrameSequence, clean: list[Trajectory], contender: common.Contender, truth: Trajectory
 ) -> Row:
-    """One fault, a run a seed."""
+    """Run one fault, once per seed."""
     places = [len(clip) * (i + 1) // (PLACES + 1) for i in range(PLACES)]
     flagged, alarms, drifts, clean_drifts, wrong = [], [], [], [], []
     statuses: Counter[str] = Counter()
@@ -413,9 +416,9 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: the clips to damage, and to count false alarms on, with commas between.
+        clips: comma-separated clips to damage, and to count false alarms on.
         method: METHOD or METHOD:PRESET.
-        faults: names with commas between.
+        faults: comma-separated names.
         seeds: runs of each fault.
         json: file for the figures.
     """

@@ -1,14 +1,14 @@
-"""What a process of `gavo run` takes: seconds to its first pose, and memory of a short and of a long run.
+"""Cost of a `gavo run` process: seconds to its first pose, and memory of a short and of a long run.
 
 The first table has the seconds from the start of a process to the first pair's pose in trajectory.txt, with an empty
-cache of compiled programs and with a filled one. The second has the peak of the resident memory of a process that runs
-each of `--lengths` frames with a filled cache (a compilation takes more memory than a run and would hide the run's),
-and the last over the first. The frames are the clip's, written anew without distortion, and played forth and back.
+and with a filled compilation cache. The second has the peak resident memory of runs over each of `--lengths` frames,
+and the last over the first. Their cache is filled, because a compilation takes more memory than a run. The frames are
+the clip's, rewritten without distortion, and played back and forth.
 
     python benchmarks/footprint.py
     python benchmarks/footprint.py --clip synthetic:40 --methods ga --lengths 100,700 --json footprint.json
 
-Clips and own methods as for the other benchmarks. The defaults take about three minutes on two cores.
+Clips and our own methods are named as in the other benchmarks. The defaults take about three minutes on two cores.
 """
 
 import os
@@ -28,7 +28,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.output.screen import number
 
 RATE = 30.0
-"""Frames a second of what is played."""
+"""Frames per second of the played clip."""
 
 
 def main(
@@ -42,9 +42,9 @@ def main(
 
     Args:
         clip: one clip.
-        methods: METHOD or METHOD:PRESET with commas between.
-        starts: processes that are started with an empty cache, and as many with a filled one; the medians count.
-        lengths: frames of the runs whose memory is measured.
+        methods: comma-separated METHOD or METHOD:PRESET.
+        starts: processes started with an empty cache, and as many with a filled one; medians are printed.
+        lengths: comma-separated frames of the runs whose memory is measured.
         json: file for the figures.
 
     Raises:
@@ -58,7 +58,7 @@ def main(
         for name in common.names(methods):
             common.preset_of(name)
             start = time_starts(scratch, name, starts)
-            # a run of several frames may compile more than one of two does, so the first one is not counted
+            # runs of more than two frames may compile more programs, so the first one does not count
             peaks = [peak_megabytes(scratch, name, count) for count in (counts[0], *counts)]
             figures[name] = {"start": start, "megabytes": dict(zip(counts, peaks[1:], strict=True))}
     rows = [
@@ -89,7 +89,7 @@ def gavo_run(scratch: Path, name: str, frames: int) -> list[str]:
 def time_starts(scratch: Path, name: str, count: int) -> dict[str, list[float]]:
     """Seconds from the start of a process to its first pose, with an `empty` and with a `filled` cache.
 
-    The processes end by themselves, figures drawn, so that whatever a run compiles is in the cache afterwards.
+    Each process runs to its end, figures included, so that the cache then holds all that a run compiles.
     """
     seconds: dict[str, list[float]] = {"empty": [], "filled": []}
     nowhere = subprocess.DEVNULL
@@ -113,11 +113,11 @@ code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subproces
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 sys.exit(code)
 """
-"""A small process starts the one to be weighed, whose peak counts what its parent held when it was started."""
+"""Script that measures a child: its peak includes the parent's memory at its start, so the parent is small."""
 
 
 def peak_megabytes(scratch: Path, name: str, frames: int) -> float:
-    """Largest resident memory, MB, of a process that runs so many frames; its cache is filled."""
+    """Peak resident memory, MB, of a run over `frames` frames with a filled cache."""
     _play(scratch / "clip", frames)
     command = [sys.executable, "-c", WEIGH, *gavo_run(scratch, name, frames)]
     done = subprocess.run(command, env=_environment(scratch), stdout=subprocess.PIPE, check=False)
@@ -126,7 +126,7 @@ def peak_megabytes(scratch: Path, name: str, frames: int) -> float:
 
 
 def _environment(scratch: Path) -> dict[str, str]:
-    """Ours with a cache of its own."""
+    """This process's environment, with a separate cache."""
     ours = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     return ours | {"GAVO_CACHE_DIR": str(scratch / "cache")}
 
@@ -137,7 +137,7 @@ def _check(status: int, name: str) -> None:
 
 
 def _poses(run: Path) -> int:
-    """Rows of the trajectory so far."""
+    """Poses in the trajectory file so far."""
     try:
         lines = (run / "trajectory.txt").read_text().splitlines()
     except FileNotFoundError:
@@ -146,7 +146,7 @@ def _poses(run: Path) -> int:
 
 
 def _play(folder: Path, frames: int) -> None:
-    """Have the lists of a folder name its first images forth and back until there are so many frames."""
+    """Rewrite a folder's lists so that its images play back and forth for `frames` frames."""
     for part in ("rgb", "depth"):
         images = sorted(path.name for path in (folder / part).iterdir())
         there = [*range(len(images)), *range(len(images) - 2, 0, -1)]

@@ -1,17 +1,21 @@
-"""What an accelerator makes of it: pairs per second, latency, share of the memory's speed, agreement with the CPU.
+"""Performance of an accelerator: pairs per second, latency, share of the memory bandwidth, agreement with the CPU.
 
-Prints four tables: `align_batch` by the size of the batch, from arrays on the host to results there; the latency of
-one pair alone, by `align` and by the driver from decoded images; scoring against the limit that memory sets; and how
-far the motions of some pairs lie from those of the same program on the CPU, which a second process computes.
+Prints four tables:
 
-The limit: every candidate reads five float32 numbers of every reference point (x, y, inverse depth, grey, facing) and
-one 32-bit word of the grey and of the depth target: 28 bytes a pixel and candidate, at the speed at which the device
-copies 256 MB (read and written). Caches that serve several candidates from one read can take the share above 1.
+- `align_batch` by batch size, from arrays on the host to results on the host;
+- latency of a single pair, by `align` and by the driver, from decoded images;
+- scoring against the limit set by memory bandwidth;
+- distance of the motions of some pairs from those of the same program on the CPU, in a second process.
+
+The limit assumes that every candidate reads five float32 numbers of every reference point (x, y, inverse depth, grey,
+facing) and one 32-bit word of each of the grey and depth targets. That is 28 bytes per pixel and candidate, at the
+bandwidth of copying 256 MB (read and written). Caches that serve several candidates from one read can raise the share
+above 1.
 
     python benchmarks/gpu.py
     python benchmarks/gpu.py --batches 64,256,1024 --rounds 9 --json gpu.json
 
-It runs on a CPU too, to be tested; the tables are then the CPU's own and the last one compares it with itself.
+It also runs on a CPU, for tests: the tables are then the CPU's, and the last one compares it with itself.
 """
 
 import multiprocessing
@@ -36,10 +40,10 @@ from gavo_jax.output.screen import number
 from gavo_jax.trajectory import inverse
 
 BYTES = 7 * 4
-"""Read a pixel and candidate; see above."""
+"""Bytes read per pixel and candidate; see the module's docstring."""
 KEYS_OF_MEMORY = ("milliseconds", "limit_milliseconds", "share")
 COPIED = 2**26
-"""Floats of the copy that tells the memory's speed: 256 MB."""
+"""Floats copied to measure the memory bandwidth: 256 MB."""
 
 
 def main(
@@ -53,10 +57,10 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clip: where the pairs come from.
-        methods: METHOD or METHOD:PRESET with commas between.
-        batches: pairs aligned in a call; the clip's are repeated.
-        populations: candidates scored in a call.
+        clip: clip that the pairs come from.
+        methods: comma-separated METHOD or METHOD:PRESET.
+        batches: comma-separated numbers of pairs per call; the clip's pairs are repeated.
+        populations: comma-separated numbers of candidates per call.
         rounds: measurements of each.
         json: file for the figures.
 
@@ -110,7 +114,7 @@ def latency(frames: list[Frame], camera: Camera, name: str, rounds: int) -> dict
 
 
 def memory_share(sequence: Sequence, populations: list[int], rounds: int) -> dict[str, Any]:
-    """Time to score at 640x480 and what it would take if the memory's speed alone counted."""
+    """Time to score at 640x480, and its limit by memory bandwidth."""
     bandwidth = copy_bandwidth(rounds)
     rows = time_scoring(sequence, [0], populations, rounds)
     for row in rows:
@@ -120,7 +124,7 @@ def memory_share(sequence: Sequence, populations: list[int], rounds: int) -> dic
 
 
 def copy_bandwidth(rounds: int) -> float:
-    """Bytes a second that the device reads and writes as it copies a large array."""
+    """Bytes per second that the device reads and writes while copying a large array."""
     array = jnp.zeros(COPIED, jnp.float32)
     copy = jax.jit(lambda a: a + 1.0)
     [milliseconds] = time_in_turn([lambda: copy(array).block_until_ready()[0]], rounds)
@@ -128,7 +132,7 @@ def copy_bandwidth(rounds: int) -> float:
 
 
 def agreement(frames: list[Frame], camera: Camera, name: str) -> dict[str, float]:
-    """How far this device's motions lie from those of a process on the CPU: millimetres and degrees."""
+    """Distance of this device's motions from those of a process on the CPU, millimetres and degrees."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, spawn, initializer=_on_cpu) as process:
         theirs = process.submit(motions, frames, camera, name).result()
@@ -143,7 +147,7 @@ def agreement(frames: list[Frame], camera: Camera, name: str) -> dict[str, float
 
 
 def motions(frames: list[Frame], camera: Camera, name: str) -> np.ndarray:
-    """[B, 4, 4] target_T_reference of the pairs of neighbours."""
+    """Motions target_T_reference [B, 4, 4] of consecutive frames."""
     settings = common.preset_of(name)
     return np.stack(
         [align(*pair, camera, settings).target_T_reference for pair in zip(frames[:-1], frames[1:], strict=True)]
