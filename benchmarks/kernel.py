@@ -1,19 +1,22 @@
-"""Cost of scoring a candidate motion, in nanoseconds per pixel and candidate, for several ways of writing it.
+"""Cost of scoring a candidate motion, in nanoseconds per pixel and candidate, for several formulations.
 
-Prints a row a formulation and a column an image size (the five pyramid levels of 640x480): `Objective.score` as the
-solvers call it, its two forms (one candidate after the other in a fused loop; all side by side), the same with the
-default preset's robust loss and depth term; `score` without two things that XLA needs (the barrier behind the look-up,
-without which it may read a word anew for each of its bytes; one array that holds both the costs and the mark of the
-points outside, without which it may pass over the points twice); a plain version with [N, 4] points, `vmap` and
-`map_coordinates`; and the references outside JAX, a hand-written numba loop (`prange`, `fastmath`) and SciPy's
-`map_coordinates`. All but the robust one compute the same errors, which is checked. Below it the ratios of the plain
-version to `score` and of `score` to the numba loop. Medians of runs in turn (A B C A B C ...), so that a slow spell
-meets all.
+Prints one row per formulation and one column per image size (the five pyramid levels of 640x480):
+
+- `Objective.score` as the solvers call it, its two forms (candidates in turn in a fused loop; all side by side), and
+  the same with the default preset's robust loss and depth term;
+- `score` without the barrier behind the look-up (XLA may then read a word again for each of its bytes), and with costs
+  and marks of the points outside in two arrays (XLA may then pass over the points twice);
+- a plain version with [N, 4] points, `vmap` and `map_coordinates`;
+- references outside JAX: a hand-written numba loop (`prange`, `fastmath`) and SciPy's `map_coordinates`.
+
+All but the robust one compute the same errors, which is checked. A second table has the ratios of the plain version to
+`score` and of `score` to the numba loop. Times are medians of runs in turn (A B C A B C ...), so that a slow spell
+affects all.
 
     python benchmarks/kernel.py
     python benchmarks/kernel.py --levels 2,3 --population 16 --rounds 3 --json kernel.json
 
-On 2 cores the defaults take about 2 minutes. SciPy's figure is taken from 4 candidates, one after the other.
+On 2 cores the defaults take about 2 minutes. SciPy is timed on 4 candidates, one after the other.
 """
 
 import importlib.util
@@ -48,21 +51,21 @@ PLAIN, NUMBA, SCIPY = "plain vmap", "numba", "scipy"
 GREY_ONLY = AlignmentOptions(loss=l2, depth=False, brightness=False, robust_scale=False, points=None, min_overlap=0.0)
 SCIPY_CANDIDATES = 4
 GENERATIONS = 10
-"""Populations that one call of ours scores, one after the other: a search is one program, entered once."""
+"""Populations that one timed call of ours scores in turn: a search is one program, entered once."""
 LEAST_SECONDS = 0.2
 """A measurement repeats its call until it takes about this long."""
 
 
 class Scene(NamedTuple):
-    """What the formulations are given: a level of a pair, as plain arrays, and the motions."""
+    """Input of the formulations: a level of a pair, as plain arrays, and the motions."""
 
     camera: Camera
     rays: np.ndarray
     """[3, N] x, y of the ray and inverse depth (0 = no reading) of the reference's points."""
     grey: np.ndarray
-    """[N] of the reference."""
+    """[N] grey levels of the reference."""
     target: np.ndarray
-    """[h, w] grey of the target, whole grey levels."""
+    """[h, w] grey levels of the target, rounded."""
     motions: np.ndarray
     """[P, 4, 4] target_T_reference."""
 
@@ -76,25 +79,25 @@ def score_without_barrier(objective: Objective, motions: jax.Array) -> tuple[jax
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TwoMarks(Objective):
-    """The objective with costs [0] and marks of the points inside [1] in two arrays."""
+    """The objective with costs and marks of the points inside in two arrays."""
 
     @classmethod
     def of(cls, objective: Objective) -> "TwoMarks":
-        """The same objective."""
+        """Make it from the usual objective."""
         return cls(**{field.name: getattr(objective, field.name) for field in fields(objective)})
 
     def cost(self, r: Residuals) -> jax.Array:
-        """[2, N]: 0 outside, and 1 inside."""
+        """Costs [0], 0 outside, and marks [1], 1 inside: [2, N]."""
         return jnp.stack([jnp.where(r.inside > 0, super().cost(r), 0.0), r.inside])
 
     def sums(self, cost: jax.Array) -> jax.Array:
-        """Sum either array."""
+        """Sum each array."""
         return jnp.stack([lane_sum(cost[0]), lane_sum(cost[1])])
 
 
 @jax.jit
 def plain_score(points: jax.Array, grey: jax.Array, target: jax.Array, camera: Camera, motions: jax.Array) -> jax.Array:
-    """E of every motion, written as the equations read: homogeneous points [N, 4], NaN without a reading."""
+    """E of every motion, written like the equations, with homogeneous points [N, 4]; NaN without a reading."""
 
     def error(target_T_reference: jax.Array) -> jax.Array:
         moved = (points @ target_T_reference.T)[:, :3]
@@ -110,7 +113,7 @@ def plain_score(points: jax.Array, grey: jax.Array, target: jax.Array, camera: C
 
 @cache
 def make_numba_score() -> Callable[..., np.ndarray]:
-    """The hand-written loop: candidates in parallel, pixels one by one, nothing in memory between."""
+    """Make the hand-written loop: candidates in parallel, pixels one by one, no intermediate arrays."""
     import numba
 
     @numba.njit(parallel=True, fastmath=True)
@@ -162,12 +165,12 @@ def scipy_score(scene: Scene, motions: np.ndarray) -> np.ndarray:
 def make_objective(
     pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, options: AlignmentOptions
 ) -> Objective:
-    """E of a level of a pair, every pixel a point."""
+    """The objective of one level of a pair, with every pixel a point."""
     return jax.jit(lambda a, b: objectives_of(a, b, camera, (level,), options, jnp.eye(4))[0])(*pyramids)
 
 
 def make_scene(pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, motions: np.ndarray) -> Scene:
-    """A level as plain arrays; the target is rounded, as `pack_grey` does, so that all see the same image."""
+    """One level as plain arrays; the target is rounded as by `pack_grey`, so that all see the same image."""
     reference, target = (jax.device_get(pyramid[level]) for pyramid in pyramids)
     camera = camera.level(level)
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
@@ -177,7 +180,7 @@ def make_scene(pyramids: tuple[Pyramid, Pyramid], camera: Camera, level: int, mo
 
 
 class Formulation(NamedTuple):
-    """A way to score."""
+    """One implementation of scoring."""
 
     run: Callable[[], np.ndarray]
     """Score all candidates and wait; returns the errors."""
@@ -187,7 +190,7 @@ class Formulation(NamedTuple):
 
 
 def formulations(scene: Scene, objective: Objective, full: Objective) -> dict[str, Formulation]:
-    """What can be run here, by name; numba and SciPy where they are installed."""
+    """The formulations by name; numba and SciPy only where installed."""
     count = len(scene.motions)
     motions = jnp.asarray(scene.motions)
 
@@ -239,7 +242,7 @@ def measure(candidates: dict[str, Formulation], pixels: int, rounds: int) -> dic
         repeats[name] = max(1, round(LEAST_SECONDS / (time.perf_counter() - start)))
     for _ in range(rounds):
         for name, formulation in candidates.items():
-            formulation.run()  # memory and threads are then its own, not the last one's
+            formulation.run()  # warm-up: memory and threads are then its own
             start = time.perf_counter()
             for _ in range(repeats[name]):
                 formulation.run()
@@ -249,7 +252,7 @@ def measure(candidates: dict[str, Formulation], pixels: int, rounds: int) -> dic
 
 
 def random_motions(count: int) -> np.ndarray:
-    """[P, 4, 4] motions about the identity: 1 cm and 0.6 degrees in each direction, standard deviation."""
+    """Random motions [P, 4, 4] about the identity; standard deviation 1 cm and 0.6 degrees per axis."""
     return np.asarray(exp(0.01 * jax.random.normal(jax.random.key(0), (count, 6))))
 
 
@@ -262,8 +265,8 @@ def main(levels: str = "0,1,2,3,4", population: int = 64, rounds: int = 7, json:
     """Measure, print and return the figures.
 
     Args:
-        levels: pyramid levels of 640x480, with commas between.
-        population: candidates scored in a call.
+        levels: comma-separated pyramid levels of 640x480.
+        population: number of candidates.
         rounds: measurements of each formulation.
         json: file for the figures.
     """

@@ -1,14 +1,17 @@
-"""What a map of keyframes is worth: the error with and without loops, false loops, and the way back after a loss.
+"""Gain from a map of keyframes: error with and without loop closures, false loops, and relocalisation after a loss.
 
-Prints up to four tables. `clips`: absolute error and drift of each clip before and after loops. `false`: the absolute
-error with false loops planted in the first clip's graph. `synthetic`: the error at the end of a rendered walk that
-returns to where it began, with exact truth. `covered`: a lens that is covered for ten frames and then shows another
-part of the mapped scene, or a scene that is not in the map; a place is right within 5 cm and 3 degrees.
+Prints up to four tables:
 
-A fifth one, `long`, is printed only where it is asked for: 2,000 frames of rounds through a rendered room, 320 x 240,
-whose lens is covered for a second in each round. Processor time of tracking and of the map per uncovered frame, the
-longest time that the map took for one frame, resident memory, and keyframes, for every 250 frames. The map works
-after each frame here, not beside the tracking, so that the two can be told apart.
+- `clips`: absolute error and drift of each clip before and after loop closure;
+- `false`: absolute error with false loops planted in the first clip's pose graph;
+- `synthetic`: error at the end of a rendered walk that returns to its start, with exact ground truth;
+- `covered`: relocalisation after ten frames with a covered lens, in another part of the mapped scene (right within 5 cm
+  and 3 degrees), or in a scene that is not in the map.
+
+A fifth one, `long`, is printed only on request: 2,000 frames of rounds through a rendered room, 320 x 240, with the
+lens covered for a second in each round. For every 250 frames it has the processor time of tracking and of the map per
+uncovered frame, the map's longest time for one frame, resident memory, and keyframes. Here the map works after each
+frame, not in parallel with tracking, so that the two can be timed separately.
 
     python benchmarks/loops.py
     python benchmarks/loops.py --clips fr1_desk_loop --parts clips,false
@@ -47,7 +50,7 @@ from gavo_jax.trajectory import Trajectory, inverse
 
 PARTS = "clips,false,synthetic,covered"
 COVERED, SOUGHT = 10, 5
-"""Frames that the lens is covered, and within which a frame has to be found after that."""
+"""Frames for which the lens is covered, and within which it must then be relocalised."""
 NEAR = (0.05, np.radians(3.0))
 """Metres and radians within which a place is right."""
 FALSE_SHARES = (0.1, 0.3, 0.5)
@@ -57,7 +60,7 @@ WALK = 300
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 """The camera of the rendered rooms."""
 ROUND, UNSEEN, BLOCK = 125, 30, 250
-"""Frames of one round of the long walk, of these those with a covered lens, and those of a row of its table."""
+"""Frames of one round of the long walk, those of them with a covered lens, and frames per row of its table."""
 
 
 def with_loops(name: str) -> Settings:
@@ -67,7 +70,7 @@ def with_loops(name: str) -> Settings:
 
 
 def compare_clips(clips: list[str], settings: Settings) -> list[dict[str, Any]]:
-    """Errors before and after loops of each clip."""
+    """Errors of each clip before and after loop closure."""
     rows = []
     for clip in clips:
         metrics: dict[str, Any] = dict(run_odometry(common.open_clip(clip), settings).metrics)
@@ -78,7 +81,7 @@ def compare_clips(clips: list[str], settings: Settings) -> list[dict[str, Any]]:
 
 
 def mapped(sequence: Sequence, settings: Settings) -> tuple[Odometry, Mapper, list[Step]]:
-    """A sequence tracked with a map; the map is not finished."""
+    """Track a sequence with a map, without finishing the map."""
     mapper = Mapper(sequence.camera)
     odometry = Odometry(sequence.camera, settings, relocaliser=mapper)
     steps = list(track(sequence, odometry=odometry, watch=mapper.watch))
@@ -86,7 +89,7 @@ def mapped(sequence: Sequence, settings: Settings) -> tuple[Odometry, Mapper, li
 
 
 def plant_false_loops(clip: str, settings: Settings) -> list[dict[str, Any]]:
-    """The absolute error with false loops in the graph, the worst of several tries."""
+    """Absolute error with false loops in the pose graph, the worst of several tries."""
     sequence = common.open_clip(clip)
     _, mapper, steps = mapped(sequence, settings)
     truth, causal = sequence.ground_truth, trajectory_of(float(sequence.timestamps[0]), steps)
@@ -122,19 +125,19 @@ def _false_loop(rng: np.random.Generator, keyframes: int) -> Edge:
 
 
 def walk(seed: int) -> Trajectory:
-    """Once round the middle of a room, looking outwards, and back to where it began."""
+    """One round about the middle of a room, looking outwards, back to its start."""
     turn = np.linspace(0.0, 2.0 * np.pi, WALK - 30)
     return around(np.concatenate([turn, np.full(30, turn[-1])]) + 0.4 * seed)
 
 
 def rounds(frames: int) -> Trajectory:
-    """Round after round, each a little nearer to the walls or further from them."""
+    """Many rounds about the middle of a room, at slowly varying distance from the walls."""
     turn = 2.0 * np.pi * np.arange(frames) / ROUND
     return around(turn, 0.6 + 0.15 * np.sin(0.37 * turn))
 
 
 def around(turn: np.ndarray, radius: np.ndarray | float = 0.6) -> Trajectory:
-    """Poses at angles round the middle of a room, looking outwards, at a distance from it in metres."""
+    """Poses at angles `turn` about the middle of a room, at `radius` metres from it, looking outwards."""
     forward = np.stack([np.cos(turn), np.sin(turn), np.full(len(turn), -0.15)], axis=1)
     place = np.stack([np.cos(turn), np.sin(turn), 0.1 * np.sin(3 * turn)], axis=1)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -161,13 +164,13 @@ def measure_walks(settings: Settings, seeds: int) -> list[dict[str, Any]]:
 
 
 def dark(frame: Frame, timestamp: float) -> Frame:
-    """What a covered lens shows."""
+    """A frame as a covered lens shows it."""
     grey = np.full_like(frame.grey, 3)
     return replace(frame, grey=grey, depth=np.zeros_like(frame.depth), timestamp=timestamp, depth_timestamp=timestamp)
 
 
 def measure_long(settings: Settings, frames: int) -> list[dict[str, Any]]:
-    """What a long walk costs, and what is held, block by block."""
+    """Time and memory of a long walk, block by block."""
     sequence = SyntheticSequence(trajectory=rounds(frames), camera=SMALL)
     mapper = Mapper(sequence.camera)
     odometry = Odometry(sequence.camera, settings, relocaliser=mapper)
@@ -199,13 +202,13 @@ def measure_long(settings: Settings, frames: int) -> list[dict[str, Any]]:
 
 
 def resident() -> float:
-    """Memory of this process, MiB."""
+    """Resident memory of this process, MiB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def after_cover(frames: list[Frame], now: float, between: float) -> Iterator[Frame]:
-    """Covered frames, then others, with stamps that go on."""
+    """Yield covered frames, then the given ones, with timestamps that continue from `now`."""
     for i in range(COVERED + len(frames)):
         now += between
         if i < COVERED:
@@ -218,7 +221,7 @@ def after_cover(frames: list[Frame], now: float, between: float) -> Iterator[Fra
 def try_covered(
     map_of: str, tried: str, foreign: list[Sequence], settings: Settings, tries: int, foreign_tries: int
 ) -> dict[str, Any]:
-    """How often a frame is found again after a covered lens, and how often one is found that is not in the map."""
+    """Relocalise after a covered lens, in the mapped scene and (which is false) in foreign ones."""
     sequence, other = common.open_clip(map_of), common.open_clip(tried)
     odometry, mapper, _ = mapped(sequence, settings)
     progress, between = odometry.progress, float(np.median(np.diff(sequence.timestamps)))
@@ -261,7 +264,11 @@ def try_covered(
 
 
 def fitted(frame: Frame, camera: Camera) -> Frame:
-    """A frame of another camera with depth in this one's units; of the same size."""
+    """Return the frame of another camera as it is, if it has the map's image size.
+
+    Raises:
+        GavoError: it has another size.
+    """
     if frame.grey.shape != (camera.height, camera.width):
         raise GavoError(f"a frame of {frame.grey.shape} is not of the map's size")
     return frame
@@ -283,16 +290,16 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        parts: tables, with commas between.
-        clips: as for drift.py.
+        parts: comma-separated tables.
+        clips: comma-separated, as for drift.py.
         method: METHOD or METHOD:PRESET.
-        map_of: clip whose map the covered camera has.
-        tried: clip of the same scene, whose other frames it sees then.
-        foreign: folders of other scenes beside the clips, with commas between; rendered rooms join them.
-        tries: frames of `tried`.
-        foreign_tries: frames of other scenes.
+        map_of: clip that the map of `covered` is built from.
+        tried: clip of the same scene, whose other frames are seen after the cover.
+        foreign: comma-separated folders of other scenes in GAVO_DATA; rendered rooms are added.
+        tries: tries with frames of `tried`.
+        foreign_tries: tries with frames of other scenes.
         seeds: synthetic walks.
-        long: frames of the long one.
+        long: frames of the long walk.
         json: file for the figures.
     """
     settings, results, wanted = with_loops(method), {}, common.names(parts)

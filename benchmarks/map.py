@@ -1,7 +1,7 @@
-"""How near a run's map lies to what a frame saw that is no part of it, and a picture of the map.
+"""Distance of a run's map from the depth of a frame left out of it, and a picture of the map.
 
-Tracks a clip, fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.scene_map`), and prints how
-far the left-out frame's depth, put where the run says that it was taken, lies from it. Needs the extra `[map]`.
+Tracks a clip and fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.scene_map`). Prints how
+far the left-out frame's depth, placed at its tracked pose, lies from the mesh. Needs the extra `[map]`.
 
     python benchmarks/map.py
     python benchmarks/map.py --record benchmarks/records/map.toml --picture-file docs/map.png
@@ -25,18 +25,18 @@ from gavo_jax.scene_map import VOXEL, SceneMap, build_map
 from gavo_jax.trajectory import inverse
 
 FARTHEST = 4.0
-"""Metres: depth beyond is not in the map."""
+"""Metres: depth beyond this is not in the map."""
 
 SIZE, ABOVE, BEHIND, VIEW = (1000, 750), -0.25, -0.75, 55.0
-"""Of the picture: pixels, metres above and behind the first camera, degrees from side to side."""
+"""Picture: size in pixels, y and z of its camera in the first one's frame (m), horizontal field of view (deg)."""
 
 
 BACKGROUND = 45
-"""Grey level where nothing is."""
+"""Grey level where there is no surface."""
 
 
 def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Metres from points to the mesh."""
+    """Distances of points from the mesh, metres."""
     open3d = import_open3d("map")
     tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
     rays = open3d.t.geometry.RaycastingScene()
@@ -45,7 +45,7 @@ def distances(scene: SceneMap, points: Float[np.ndarray, "n 3"]) -> Float[np.nda
 
 
 def points_of(frame: Frame, camera: Camera, world_T_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
-    """Return where a frame's depth lies in the world, metres."""
+    """Return the points of a frame's depth in the world frame, metres."""
     depth = frame.depth / camera.depth_scale
     v, u = np.nonzero((depth > 0) & (depth < FARTHEST))
     points = np.asarray(camera.back_project(np.stack([u, v], axis=-1).astype(float), depth[v, u]))
@@ -53,7 +53,7 @@ def points_of(frame: Frame, camera: Camera, world_T_camera: Float[np.ndarray, "4
 
 
 def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB of the mesh as a camera sees it, by casting a ray through each pixel; dark where there is nothing."""
+    """Render the mesh in RGB by casting a ray through each pixel; dark where there is no surface."""
     open3d = import_open3d("map")
     tensor, faces = open3d.core.Tensor, np.asarray(scene.triangles, np.uint32)
     rays = open3d.t.geometry.RaycastingScene()
@@ -72,7 +72,7 @@ def picture(scene: SceneMap, world_T_camera: Float[np.ndarray, "4 4"]) -> UInt8[
 
 
 def looking_on() -> Float[np.ndarray, "4 4"]:
-    """Return a pose behind and above the first camera, along its view."""
+    """Return a pose behind and above the first camera, looking at a point 1.5 m in front of it."""
     tilt = np.arctan2(-ABOVE, 1.5 - BEHIND)
     pose = np.eye(4)
     pose[1:3, 1:3] = [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]
@@ -91,11 +91,11 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clip: see `common.open_clip`.
+        clip: one clip; see `common.open_clip`.
         method: METHOD or METHOD:PRESET.
-        voxels: sides, metres, with commas between.
-        left_out: number of the frame that is no part of the map; the middle one by default.
-        picture_file: where a picture of the map of all frames is written, of the last voxels.
+        voxels: comma-separated sides of a voxel, metres.
+        left_out: number of the frame left out of the map; the middle one by default.
+        picture_file: file for a picture of the map of all frames, with the last voxel size.
         json: file for the figures.
     """
     plain = common.open_clip(clip)

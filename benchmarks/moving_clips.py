@@ -1,7 +1,7 @@
-"""Put a rigid body that moves on its own into any clip with a truth: a textured card with colour and depth.
+"""Insert an independently moving rigid body into any clip with ground truth: a textured card with grey and depth.
 
-It swings sideways and to and fro before the first camera, and turns; it hides what lies behind it and is hidden by what
-lies before it. A clip with a card tells the same of it as `SyntheticSequence` of its bodies.
+It swings sideways and back and forth in front of the first camera, and turns. Occlusion is rendered both ways. A clip
+with a card has the same ground truth for it as `SyntheticSequence` for its bodies.
 """
 
 from collections.abc import Iterator
@@ -23,9 +23,9 @@ MARGIN = 0.03
 """Seconds of truth that a frame needs on either side: its depth may be exposed before or after its colour."""
 ASPECT = 0.75
 NEAREST = 0.2
-"""Metres from the camera at which the card still is in the picture."""
+"""Least distance from the camera at which the card is rendered, metres."""
 DEPTH_NOISE = 0.0012
-"""Deviation of its depth, metres at one metre; it grows with the square."""
+"""Standard deviation of the card's depth at one metre, metres; it grows with the square of the depth."""
 GREY_NOISE = 1.3
 SIZING_FRAMES, SIZING_ROUNDS = 12, 3
 
@@ -39,7 +39,7 @@ class Look(NamedTuple):
     turn: float
     """Amplitude, degrees."""
     near: float
-    """Its distance from the first camera over the near depth of the first frame (the 20th percentile)."""
+    """Distance from the first camera over the 20th percentile of the first frame's depth."""
 
 
 LOOKS = (
@@ -48,11 +48,11 @@ LOOKS = (
     Look("plain", 0.7, 30.0, 0.75),
     Look("stripes", 0.4, 20.0, 0.9),
 )
-"""One after the other, by the seed."""
+"""Looks that the seeds take in turn."""
 
 
 def texture(kind: str, rng: np.random.Generator) -> np.ndarray:
-    """A card's picture, float grey [480, 640].
+    """Texture of a card, float grey [480, 640].
 
     Raises:
         GavoError: no such kind.
@@ -78,9 +78,9 @@ class CardClip:
     """A clip with a card in it.
 
     Attributes:
-        clip: frames with a truth.
-        share: of the image that the card covers, median over the frames.
-        seed: of its texture and of the phases of its path.
+        clip: frames with ground truth.
+        share: share of the image that the card covers, median over the frames.
+        seed: seed of its texture and of the phases of its path.
         look: how it looks and moves.
     """
 
@@ -93,7 +93,7 @@ class CardClip:
         """Find the frames that the truth covers, and the size at which the card covers the share.
 
         Raises:
-            GavoError: there is no truth of the clip.
+            GavoError: the clip has no ground truth.
         """
         clip, truth = self.clip, self.clip.ground_truth
         if truth is None:
@@ -119,7 +119,7 @@ class CardClip:
             self._width *= np.sqrt(self.share / max(median, 0.1 * self.share))
 
     def camera_at(self, timestamps: np.ndarray) -> np.ndarray:
-        """`world_T_camera` at some stamps, [n, 4, 4]."""
+        """`world_T_camera` at some timestamps, [n, 4, 4]."""
         return self.ground_truth.interpolate(timestamps, max_gap=np.inf)[0]
 
     @cached_property
@@ -127,7 +127,7 @@ class CardClip:
         return self.camera_at(self.timestamps[:1])[0]
 
     def card_at(self, timestamps: np.ndarray) -> np.ndarray:
-        """`world_T_card` at some stamps, [n, 4, 4]: its middle; x and y span it."""
+        """`world_T_card` at some timestamps, [n, 4, 4]; its origin is the card's middle, x and y span the card."""
         reach, phases = 0.35 * self._distance, self._phases
         angle = self.look.speed / reach * np.pi / 2 * (timestamps - self.timestamps[0])
         poses = np.tile(np.eye(4), (len(timestamps), 1, 1))
@@ -148,7 +148,7 @@ class CardClip:
         return np.asarray(self.camera.back_project(np.stack([columns, rows], axis=-1), np.ones_like(rows)))
 
     def _render(self, timestamp: float) -> tuple[np.ndarray, np.ndarray]:
-        """Depth of the card along each ray, 0 beside it, and where on it the ray ends (-1/2 to 1/2 twice)."""
+        """Depth of the card along each ray, 0 off the card, and where it meets the card's plane (card: ±1/2)."""
         stamp = np.array([timestamp])
         camera_T_card = inverse(self.camera_at(stamp)[0]) @ self.card_at(stamp)[0]
         normal, middle = camera_T_card[:3, 2], camera_T_card[:3, 3]
@@ -159,7 +159,7 @@ class CardClip:
         return np.where(inside, z, 0.0), on
 
     def _seen(self, frame: Frame, timestamp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the card is before everything else at a moment, its depth and the places on it."""
+        """Return the mask of the card's visible part at a moment, its depth, and the coordinates on it."""
         z, on = self._render(timestamp)
         scene = frame.depth / float(self.camera.depth_scale)
         return (z > 0) & ((scene == 0) | (z < scene)), z, on
@@ -192,7 +192,7 @@ class CardClip:
 
     @property
     def bodies_truth(self) -> tuple[BodyTruth, ...]:
-        """The card's poses at the colour stamps."""
+        """The card's poses at the colour timestamps."""
         return (BodyTruth("card", 1, (1,), self.timestamps, self.card_at(self.timestamps)[None]),)
 
     def part_labels(self, index: int) -> np.ndarray:
