@@ -1,22 +1,21 @@
-"""The camera's motion among bodies that move, and theirs: clips with a card put in, and the rendered room with bodies.
+"""Motion of the camera among moving bodies, and theirs: clips with an inserted card, and the rendered room with bodies.
 
-The card (`moving_clips.py`) covers 0.1, 0.25 and 0.4 of the image of each clip; with every seed another texture, speed
-and distance. The room has a box, then a box and a walking figure. Prints one row per clip, body and method, over the
-seeds:
+The card (`moving_clips.py`) covers 0.1, 0.25 and 0.4 of the image of each clip; each seed has another texture, speed
+and distance. The room has a box, or a box and a walking figure. Prints one row per clip, body and method, over the seeds:
 
 - drift (RPE over 1 s, RMSE) over that of the clean clip, median and worst. It is taken within segments; `breaks` counts
-  the places where trajectories break, and `across` is the median with the guessed ways across these counted in;
-- IoU of a body's mask with the true one, in the median frame; of several bodies, each frame counts once for each;
+  the breaks of the trajectories, and `across` is the median with the guessed motion across them included;
+- IoU of a body's mask with the true one, median over frames and bodies;
 - error of a body's motion between two frames, medians: displacement of its centroid in mm, rotation in degrees;
-- wrong pairs (camera motion off by more than 2 cm or 1.5 degrees) whose status is not ok; the share of the other pairs
-  whose status is not ok, and of the exact ones among them (off by less than 8 mm and 0.6 degrees): between these lie
-  pairs that followed a slow body.
+- wrong pairs (camera motion off by more than 2 cm or 1.5 degrees), pairs whose status is not ok, and precision and
+  recall of that; its share among the other pairs, and among the exact ones (off by less than 8 mm and 0.6 degrees).
+  Pairs between the two limits followed a slow body.
 
-Then one row per method over all clips and over all rooms, whose clean drift is near nothing: their ratios are large.
-Dashes stand where a method knows no bodies.
+Then one row per method over all clips and over all rooms. The rooms' ratios are large, as their clean drift is near
+zero. A dash stands where a method does not track bodies.
 
-With `--bodies told` methods are told where the bodies are: depth is taken away there, a few pixels about them included,
-and nothing else is looked for. That is what finding them perfectly would give, from the frames before and after alone.
+With `--bodies told` methods get the true masks: depth is removed there and in a margin of a few pixels, and no other
+bodies are sought. That is what perfect detection would give.
 
     python benchmarks/moving.py
     python benchmarks/moving.py --methods ga:fast,gauss-newton --bodies track --seeds 1 --json moving.json
@@ -54,14 +53,14 @@ from gavo_jax.settings import Settings
 from gavo_jax.trajectory import Trajectory, inverse
 
 WRONG = (0.02, 1.5)
-"""Metres and degrees: a pair whose motion is further from the truth is wrong."""
+"""Metres and degrees: a pair is wrong if its motion is further from the truth."""
 EXACT = (0.008, 0.6)
-"""Metres and degrees: a pair whose motion is nearer is exact. A body at 30 cm/s takes the camera along by
-10 mm a frame."""
+"""Metres and degrees: a pair is exact if its motion is nearer to the truth. Following a body at 30 cm/s costs 10 mm a
+frame."""
 LEAST_SHARE = 0.01
-"""Of the image: less of a body than this need not be found."""
+"""Share of the image: a body that covers less need not be found."""
 TOLD, ABOUT = "told", 4
-"""Mode in which bodies are taken out of the depth images, and pixels about them that are as well."""
+"""Mode that removes the true bodies from the depth images, and the margin about them in pixels."""
 ROOM = "room"
 """Name of the rendered sequences; each seed has its own."""
 PEER_NAMES = ("opencv-rgbd", "opencv-depth", "open3d-color", "open3d-hybrid")
@@ -80,7 +79,7 @@ class Case(NamedTuple):
 
 @dataclass
 class Score:
-    """What came of one method on one case."""
+    """Result of one method on one case."""
 
     clip: str
     body: str
@@ -89,14 +88,14 @@ class Score:
     drift: float
     clean_drift: float
     drift_across: float = np.nan
-    """As if the trajectory had not been broken."""
+    """Drift as if the trajectory had no breaks."""
     breaks: int = 0
     wrong: int = 0
     wrong_flagged: int = 0
     right: int = 0
     right_flagged: int = 0
     exact: int = 0
-    """Of the right ones."""
+    """Right pairs that are exact."""
     exact_flagged: int = 0
     overlaps: list[float] = field(default_factory=list)
     displacements_mm: list[float] = field(default_factory=list)
@@ -109,7 +108,7 @@ class Score:
 
 
 def with_bodies(settings: Settings, mode: str | None) -> Settings:
-    """Settings that treat bodies by a mode, those that are told by none; None leaves them as they are.
+    """Settings with a mode for bodies; `TOLD` switches them off, None changes nothing.
 
     Raises:
         GavoError: no such mode.
@@ -124,7 +123,7 @@ class Told:
     """A sequence without depth where its bodies are.
 
     Attributes:
-        whole: the sequence with them.
+        whole: the sequence with all its depth.
     """
 
     whole: Any
@@ -143,7 +142,7 @@ class Told:
 
 
 def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]:
-    """The true masks of the bodies of which a frame shows enough, by label; from the labels of its parts."""
+    """True masks by label, from a frame's part labels, of the bodies that cover enough of it."""
     bodies = body_of_part(sequence.bodies_truth)[labels]
     return {
         truth.label: bodies == truth.label
@@ -153,7 +152,7 @@ def bodies_in(sequence: WithBodies, labels: np.ndarray) -> dict[int, np.ndarray]
 
 
 def best_match(true: np.ndarray, masks: dict[int, np.ndarray]) -> tuple[int | None, float]:
-    """The found mask of largest intersection over union with a true one, and that."""
+    """Number of the found mask with the largest IoU with a true one, and that IoU."""
     best: tuple[int | None, float] = (None, 0.0)
     for name, mask in masks.items():
         overlap = float((mask & true).sum() / (mask | true).sum())
@@ -165,12 +164,12 @@ def best_match(true: np.ndarray, masks: dict[int, np.ndarray]) -> tuple[int | No
 def motion_errors(
     sequence: WithBodies, index: int, label: int, labels: np.ndarray, found: Body, world_T_first: np.ndarray
 ) -> tuple[float, float | None]:
-    """How far the motion of a body between frames index - 1 and index is from the truth.
+    """Error of a body's motion between frames index - 1 and index.
 
-    Of a body of several parts the truth is the mean motion of what is seen of it, and no rotation.
+    For a body of several parts the truth is the mean motion of its visible parts, without a rotation.
 
     Returns:
-        Millimetres of its centroid; degrees.
+        Error of the centroid's displacement in millimetres, of the rotation in degrees; None for a non-rigid body.
     """
     truth = next(truth for truth in sequence.bodies_truth if truth.label == label)
     weights = np.array([np.sum(labels == part) for part in truth.part_labels], float)
@@ -188,9 +187,7 @@ def motion_errors(
 
 
 def pair_error(step: Step, poses: dict[float, np.ndarray], truth: Trajectory) -> tuple[float, float]:
-    """How far the recorded motion since a step's reference is from the true one, metres and degrees; nothing where the
-    truth does not tell.
-    """
+    """Error of the recorded motion since a step's reference, metres and degrees; zero where the truth is unknown."""
     stamps = np.array([step.reference_timestamp, step.timestamp])
     true, valid = truth.interpolate(stamps)
     if not valid.all() or step.reference_timestamp not in poses:
@@ -206,7 +203,7 @@ def exceeds(error: tuple[float, float], limits: tuple[float, float]) -> bool:
 
 
 def run(label: str, sequence: Any, contender: common.Contender, seed: int, score: Score | None = None) -> Trajectory:
-    """Track a sequence; a score, if given, takes in its statuses, masks and bodies' motions."""
+    """Track a sequence, and add its statuses, masks and bodies' motions to a score if given."""
     truth, odometry = sequence.ground_truth, contender.make(sequence.camera, seed)
     first = float(sequence.timestamps[0])
     world_T_first = truth.interpolate(sequence.timestamps[:1], max_gap=np.inf)[0][0]
@@ -237,7 +234,7 @@ def run(label: str, sequence: Any, contender: common.Contender, seed: int, score
 
 
 def count(score: Score, error: tuple[float, float], flagged: bool) -> None:
-    """Take one pair in."""
+    """Add one pair to a score."""
     wrong, exact = exceeds(error, WRONG), not exceeds(error, EXACT)
     score.wrong += wrong
     score.wrong_flagged += wrong and flagged
@@ -248,10 +245,10 @@ def count(score: Score, error: tuple[float, float], flagged: bool) -> None:
 
 
 def cases(clips: str, shares: str, rooms: str, seeds: int, frames: int) -> Iterator[Case]:
-    """All sequences with bodies, those of one clip in a row.
+    """All sequences with bodies, grouped by clip.
 
     Raises:
-        GavoError: a clip cannot be read or has no truth; a share or a number of bodies that cannot be.
+        GavoError: a clip cannot be read or has no truth; invalid share or number of bodies.
     """
     for name in common.names(clips):
         whole = common.open_clip(f"{name}:{frames}")
@@ -266,10 +263,10 @@ def cases(clips: str, shares: str, rooms: str, seeds: int, frames: int) -> Itera
 
 
 def share_of(text: str) -> float:
-    """The share that a text says.
+    """Parse a share of the image.
 
     Raises:
-        GavoError: it says none.
+        GavoError: not a number between 0 and 1.
     """
     try:
         share = float(text)
@@ -281,7 +278,7 @@ def share_of(text: str) -> float:
 
 
 def drift(trajectory: Trajectory, truth: Trajectory) -> float:
-    """RPE over 1 s, RMSE of its translation, m/s; infinite where no stretch of known motion is as long as that.
+    """RPE over 1 s, RMSE of its translation, m/s; infinite if no segment is that long.
 
     Raises:
         GavoError: the truth covers too little.
@@ -295,12 +292,12 @@ def drift(trajectory: Trajectory, truth: Trajectory) -> float:
 
 
 def measure(chosen: Iterator[Case], contenders: list[common.Contender], told: bool = False) -> list[Score]:
-    """Run every method on every case, and on its clean clip: once a seed, a peer once where that is the same clip.
+    """Run every method on every case, and once per seed on its clean clip; a peer runs once on each clean clip.
 
     Args:
         chosen: The cases.
         contenders: The methods.
-        told: Whether these are told where the bodies are.
+        told: Whether the methods get the true masks.
     """
     clean: dict[tuple[str, str, int], float] = {}
     scores = []
@@ -324,7 +321,7 @@ def measure(chosen: Iterator[Case], contenders: list[common.Contender], told: bo
 
 
 class Summary(NamedTuple):
-    """One method over some cases; None where there is nothing to say."""
+    """One method over some cases; None where undefined."""
 
     clip: str
     body: str
@@ -334,7 +331,7 @@ class Summary(NamedTuple):
     ratio_median: float
     ratio_worst: float
     ratio_across: float
-    """Median, breaks counted in."""
+    """Median, with the motion across breaks included."""
     breaks: int
     overlap: float | None
     """Median over frames and bodies."""
@@ -386,7 +383,7 @@ def summarise(clip: str, body: str, scores: list[Score]) -> Summary:
 
 
 def groups(scores: list[Score], *names: str) -> list[list[Score]]:
-    """Scores that agree in some fields, in the order in which they first come."""
+    """Group scores by some fields, in order of first appearance."""
     found: dict[tuple[Any, ...], list[Score]] = {}
     for score in scores:
         found.setdefault(tuple(getattr(score, name) for name in names), []).append(score)
@@ -400,7 +397,7 @@ COLUMNS = (
 
 
 def row(summary: Summary) -> list[str]:
-    """The cells of `COLUMNS`."""
+    """Format a summary as cells of `COLUMNS`."""
 
     def percent(share: float | None) -> str:
         return "–" if share is None else f"{share:.1%}"
@@ -428,7 +425,7 @@ def row(summary: Summary) -> list[str]:
 
 
 def below_peers(scores: list[Score], method: str) -> tuple[int, int]:
-    """Count on how many cases a method's drift is below every peer's, and on how many there are peers."""
+    """Count the cases where a method's drift is below every peer's, and the cases that have peers."""
     below = total = 0
     for case in groups(scores, "clip", "body", "seed"):
         peers = [score.drift for score in case if score.method in PEERS]
@@ -452,14 +449,14 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: clips to put a card into, with commas between; none where empty.
-        shares: of the image that the card covers, median over the frames.
-        rooms: numbers of bodies in the rendered room; none where empty.
-        methods: METHOD, METHOD:PRESET or names of peers, with commas between.
-        bodies: how our own methods treat bodies: off, mask or track; their settings' own choice if left out. With told
-            all methods are told where they are.
-        seeds: runs of each, each with a card, or a room, of its own.
-        frames: of each clip, the first ones.
+        clips: comma-separated clips to put a card into; none if empty.
+        shares: comma-separated shares of the image that the card covers, median over the frames.
+        rooms: comma-separated numbers of bodies in the rendered room; none if empty.
+        methods: comma-separated METHOD, METHOD:PRESET or names of peers.
+        bodies: how our own methods treat bodies: off, mask or track; as in their settings if left out. With told
+            all methods get the true masks.
+        seeds: runs of each, each with its own card or room.
+        frames: first frames to take of each clip.
         json: file for the figures.
     """
     contenders = [

@@ -1,11 +1,10 @@
 """How close the GA's result is to the minimum of E, over all consecutive pairs of the clips.
 
 For each pair the GA and Gauss-Newton are run coarse to fine from the identity. Then one objective is made for the
-finest level, its brightness model and scales estimated at the GA's result, and everything is judged by that E: the two
-motions as they were found, and the minima that Gauss-Newton, run to convergence on this very E, reaches from either.
-The lower of the two minima is the reference. Prints one row per clip: the excess of the GA's E over it (median, 90th
-and 95th percentile, largest, per cent), the share of pairs within 0.5 %, and the same share for Gauss-Newton's own
-result.
+finest level, with brightness model and scales estimated at the GA's result. Its E judges the two motions found, and the
+minima that Gauss-Newton, run to convergence on it, reaches from either. The lower minimum is the reference. Prints one
+row per clip: the excess of the GA's E over the reference in per cent (median, 90th and 95th percentile, largest), the
+share of pairs within 0.5 %, and the same share for Gauss-Newton's own result.
 
     python benchmarks/optimality.py
     python benchmarks/optimality.py --clips fr1_desk:31 --preset fast --json optimality.json
@@ -54,7 +53,7 @@ class FinalErrors(NamedTuple):
 
 
 def converged_error(objective: Objective, start: Float[Array, "4 4"]) -> Float[Array, ""]:
-    """E where Gauss-Newton ends that starts at a motion; never above E there."""
+    """E to which Gauss-Newton converges from a start motion; never above E at the start."""
     problem = Problem(objective, start, preconditioner(reference_curvature(objective)))
     solver = GaussNewton(iterations=(POLISH,), patience=POLISH).at_level(0)
     unbounded = Bounds(jnp.full(6, -jnp.inf), jnp.full(6, jnp.inf))
@@ -71,7 +70,7 @@ def final_errors(
     options: AlignmentOptions,
     key: PRNGKeyArray,
 ) -> FinalErrors:
-    """E of one pair, everything by the same objective (see the module)."""
+    """E of one pair, all by the same objective (see the module's docstring)."""
     before, after = (build_pyramid(frame.grey, frame.depth, camera.depth_scale) for frame in (reference, target))
     levels = levels_of(camera, genetic, options)
     view, packed, exchanged = prepare_pair(before, after, camera, levels, options)
@@ -101,12 +100,12 @@ def pair_errors(sequence: Sequence, preset_name: str, seed: int) -> list[FinalEr
 
 
 def stack(errors: list[FinalErrors]) -> FinalErrors:
-    """Arrays over the pairs."""
+    """Stack the errors into arrays over the pairs."""
     return jax.tree.map(lambda *values: np.stack(values), *errors)
 
 
 def excess(error: np.ndarray, errors: FinalErrors) -> np.ndarray:
-    """Excess over the lower minimum, per cent; infinite where the error is."""
+    """Excess over the lower minimum, per cent; infinite where the error is not finite."""
     minimum = np.minimum(errors.minimum_from_genetic, errors.minimum_from_gauss_newton)
     return np.where(np.isfinite(error), 100.0 * (error / minimum - 1.0), np.inf)
 
@@ -130,9 +129,9 @@ def main(clips: str = common.CLIPS, preset: str = "default", seed: int = 0, json
     """Measure, print and return the figures.
 
     Args:
-        clips: as for drift.py, with commas between.
-        preset: settings of both methods; the GA's objective is the one that counts.
-        seed: of the GA.
+        clips: comma-separated, as for drift.py.
+        preset: preset of both methods; the objective is the GA's.
+        seed: seed of the GA.
         json: file for the figures and every pair's errors.
     """
     rows, pairs, everything = [], {}, []

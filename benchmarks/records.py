@@ -1,13 +1,13 @@
 """Results of the benchmarks as records, and pages that quote them.
 
 A record is a file of `benchmarks/records`: the tables that a benchmark printed, and with them its command, date,
-machine and versions. `python benchmarks/NAME.py --record benchmarks/records/NAME.toml` writes one. Pages hold places
+machine and versions. `python benchmarks/NAME.py --record benchmarks/records/NAME.toml` writes one. Pages have places
 for tables, between `<!-- records NAME -->` or `<!-- summary -->` and `<!-- end -->`; this command fills them:
 
     python benchmarks/records.py
     python benchmarks/records.py --check
 
-With `--check` nothing is written, and the exit status is 1 where a page says something else than the records.
+With `--check` nothing is written, and the exit status is 1 if a page differs from the records.
 """
 
 import argparse
@@ -54,15 +54,15 @@ class Record(NamedTuple):
     told: tuple[str, ...] = ()
     """Sentences that the benchmark printed beside its tables."""
     notes: tuple[str, ...] = ()
-    """What a reader has to know beside these, written by hand."""
+    """Remarks for the reader, written by hand."""
 
 
 STRING = r"\"(?:[^\"\\\n]|\\.)*\""
-"""Of TOML, on one line."""
+"""Pattern of a TOML string on one line."""
 
 
 def write_record(path: Path, record: Record) -> None:
-    """Write a record; notes that an earlier one at that place held stay."""
+    """Write a record; if it has no notes, it keeps those of the record that it replaces."""
     notes = record.notes or (read_record(path).notes if path.is_file() else ())
     entries = {**record._asdict(), "notes": notes}
     del entries["tables"]
@@ -75,7 +75,7 @@ def write_record(path: Path, record: Record) -> None:
 
 
 def _rows_on_a_line(text: str) -> str:
-    """Have TOML's innermost lists stand on a line each: a row of a table is a line of the file."""
+    """Put each innermost list of a TOML text on one line, so that a table's row is a line of the file."""
     return re.sub(rf"\[\s*((?:{STRING},\s*)+)\]", lambda found: f"[{', '.join(re.findall(STRING, found[1]))}]", text)
 
 
@@ -97,7 +97,7 @@ class Records:
         self.by_name = {path.stem: read_record(path) for path in sorted(folder.glob("*.toml"))}
 
     def of(self, benchmark: str) -> list[Record]:
-        """The records of a benchmark; the one that bears its name comes first."""
+        """The records of a benchmark; the one of the same name comes first."""
         names = sorted(
             (name != benchmark, name) for name, record in self.by_name.items() if record.benchmark == benchmark
         )
@@ -107,15 +107,15 @@ class Records:
         """A figure of the first record that has it, or a dash.
 
         Args:
-            benchmark: Its name.
-            table: What the table's title holds.
+            benchmark: Name of the benchmark.
+            table: Text that the table's title contains.
             row: First cell of the row.
-            column: What the column's heading begins with.
+            column: Beginning of the column's heading.
         """
         return next((cell for _, cell in self.cells(benchmark, table, row, column)), UNKNOWN)
 
     def cells(self, benchmark: str, table: str, row: str, column: str) -> Iterator[tuple[Record, str]]:
-        """Every such figure with the record that has it."""
+        """Every figure that matches the arguments of `cell`, with its record."""
         for record in self.of(benchmark):
             for found in record.tables:
                 headings = [i for i, heading in enumerate(found.columns) if i and heading.startswith(column)]
@@ -141,14 +141,14 @@ SUMMARY = (
     ("Open3D tensor, hybrid", "open3d-tensor-hybrid"),
     ("Open3D tensor, point to plane", "open3d-tensor-point-to-plane"),
 )
-"""Rows of README's table: what they are called, and the method's name in the records."""
+"""Rows of README's table: the label, and the method's name in the records."""
 OF_TABLE_1 = {"ga, paper": ("ga, paper", "m/s"), "printed": ("ga", "printed")}
-"""Rows whose drift is of the paper's first experiment alone: the row and the column of Table 1."""
+"""Rows whose drift is from the paper's first experiment only: the row and the column of Table 1."""
 CLIPS = ("fr1_xyz", "fr1_desk", "fr1_rpy")
 
 
 def share_found(record: Record, share: str) -> str:
-    """The share of motions found, with a word where it is of all pairs: `benchmarks/basin.py` takes every fourth."""
+    """The share of motions found, marked if it is of all pairs; `benchmarks/basin.py` takes every fourth by default."""
     return f"{share} (all)" if "--step 1 " in record.command else share
 
 
@@ -174,13 +174,13 @@ def markdown(table: Table) -> str:
 
 
 def jax_of(record: Record) -> str | None:
-    """The JAX that a record was measured with; None where it says none."""
+    """Version of JAX that a record was measured with; None if it names none."""
     found = re.search(r"\bJAX ([\w.]+)", record.versions)
     return found[1].rstrip(".") if found else None
 
 
 def ruled_out(record: Record) -> str | None:
-    """A sentence where a record comes from a JAX that the package does not allow."""
+    """A remark if a record comes from a version of JAX that the package does not allow, else None."""
     version = jax_of(record)
     if version is None or ALLOWED.contains(version, prereleases=True):
         return None
@@ -188,7 +188,7 @@ def ruled_out(record: Record) -> str | None:
 
 
 def sources_of_summary(records: Records) -> str:
-    """Which JAX the columns of README's table are of."""
+    """A sentence that names the version of JAX of each column of README's table."""
     columns = {"Drift": "drift", "*found*": "basin", "*time*": "throughput"}
     by_version: dict[str, list[str]] = {}
     for column, benchmark in columns.items():
@@ -205,7 +205,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def section(records: Sequence[Record]) -> str:
-    """The tables of a benchmark's records, each with where it comes from."""
+    """The tables of a benchmark's records, with the source of each record."""
     parts = []
     for record in records:
         parts += [
@@ -248,14 +248,14 @@ def pages(root: Path = ROOT) -> Iterator[Path]:
 
 
 def stale_pages(root: Path = ROOT) -> dict[Path, str]:
-    """The pages that say something else than the records, with what they should say."""
+    """The pages that differ from the records, with the text that they should have."""
     records = Records(root / "benchmarks" / "records")
     filled = {path: fill(path.read_text(encoding="utf-8"), records) for path in pages(root)}
     return {path: text for path, text in filled.items() if text != path.read_text(encoding="utf-8")}
 
 
 def main() -> int:
-    """Fill the pages, or say which are out of date."""
+    """Fill the pages, or print which are out of date."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; status 1 where a page is out of date")
     check = parser.parse_args().check

@@ -1,14 +1,14 @@
-"""How cost grows: time to score a population against pixels and candidates, and time of a batch against its pairs.
+"""How cost scales: time to score a population over pixels and candidates, and time of a batch over its pairs.
 
 The first table has the milliseconds of one call of `Objective.score` (robust grey and depth error, every pixel a
-point), a row an image size, a column a population, and below it the exponent of (pixels x candidates) fitted to all
-calls of more than a million of them: 1 is linear. The second has the milliseconds of `align_batch`, from arrays on the
-host to the results there, and the pairs per second. Each figure is the median of calls in turn.
+point), one row per image size and one column per population. Below it is the exponent of (pixels x candidates) fitted
+to all calls with more than a million of them: 1 is linear. The second has the milliseconds of `align_batch`, from
+arrays on the host to results on the host, and the pairs per second. Each figure is the median of calls in turn.
 
     python benchmarks/scaling.py
     python benchmarks/scaling.py --populations 64,256,1024,4096 --batches 16,64,256,1024 --json scaling.json
 
-On 2 cores the defaults take about four minutes, compilation included: each size of batch is a program.
+On 2 cores the defaults take about four minutes, compilation included: each batch size is a program of its own.
 """
 
 import time
@@ -32,7 +32,7 @@ from gavo_jax.output.screen import number
 from gavo_jax.settings import AlignmentOptions
 
 LARGE = 1e6
-"""Pixels x candidates from which on a call's fixed cost is small."""
+"""Pixels x candidates above which a call's fixed cost is small."""
 
 
 def main(
@@ -46,15 +46,15 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        levels: pyramid levels of 640x480, with commas between.
-        populations: candidates scored in a call.
-        batches: pairs aligned in a call; empty leaves them out.
-        methods: METHOD or METHOD:PRESET with commas between, of the batches.
+        levels: comma-separated pyramid levels of 640x480.
+        populations: comma-separated numbers of candidates per call.
+        batches: comma-separated numbers of pairs per call; no batches if empty.
+        methods: comma-separated METHOD or METHOD:PRESET of the batches.
         rounds: measurements of each.
         json: file for the figures.
 
     Raises:
-        GavoError: unknown method, or something else than numbers.
+        GavoError: unknown method, or something that is not a number.
     """
     sequence = common.open_clip("synthetic:9")
     scoring = time_scoring(sequence, common.counts(levels), common.counts(populations), rounds)
@@ -80,7 +80,7 @@ def main(
 def time_scoring(
     sequence: FrameSequence, levels: Sequence[int], populations: Sequence[int], rounds: int
 ) -> list[dict[str, Any]]:
-    """A row an image size and population: `size`, `pixels`, `candidates`, `milliseconds`."""
+    """One row per image size and population: `size`, `pixels`, `candidates`, `milliseconds`."""
     camera = sequence.camera
     pyramids = (pyramid_of(sequence[0], camera), pyramid_of(sequence[1], camera))
     score, rows, calls = jax.jit(Objective.score), [], []
@@ -98,7 +98,7 @@ def time_scoring(
 def time_batches(
     align: Callable[..., Alignment], sequence: FrameSequence, batches: Sequence[int], rounds: int
 ) -> list[dict[str, Any]]:
-    """A row a size: `pairs`, `milliseconds`, `per_second`; the batch repeats the sequence's pairs."""
+    """One row per batch size: `pairs`, `milliseconds`, `per_second`; batches repeat the sequence's pairs."""
     frames = [sequence[i] for i in range(len(sequence))]
     calls = [partial(align, *_pairs(frames, count)) for count in batches]
     return [
@@ -115,7 +115,7 @@ def _pairs(frames: Sequence[Frame], count: int) -> list[tuple[np.ndarray, np.nda
 
 
 def time_in_turn(calls: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
-    """Median milliseconds of each call, results on the host; before it each is called once to compile it."""
+    """Median milliseconds of each call, transfer to the host included; a first call, which compiles, is not timed."""
     times = []
     for call in calls:
         jax.device_get(call())

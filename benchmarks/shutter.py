@@ -1,10 +1,10 @@
-"""What the photometric error says of a camera's rolling shutter: E over the time from the first row to the last.
+"""Readout time of a camera's rolling shutter, from the first row to the last, by the photometric error E.
 
-Runs Gauss-Newton frame to frame with each readout time, at the mean velocity since the last frame: a frame's own
-would make up for a wrong readout. Prints, for each clip, a row a readout: E relative to that of a shutter that
-exposes all rows at once (geometric mean over the pairs; below 1, the images agree better) and, where the clip has
-ground truth, the drift. E needs no ground truth: the readout where it is least is the camera's, as far as the clip
-can tell. A camera that moves slowly, or a series of blurred images, tells little.
+Runs Gauss-Newton frame to frame with each readout time. It uses the mean velocity since the last frame, because one
+estimated for each frame would compensate for a wrong readout. Prints, for each clip, one row per readout: E relative to
+the first readout's, by default a global shutter (geometric mean over the pairs; below 1 the images agree better). Where
+the clip has ground truth, it also prints the drift. The readout with the least E is the camera's, as far as the clip
+can tell; slow motion and blurred images tell little.
 
     python benchmarks/shutter.py
     python benchmarks/shutter.py --clips FOLDER --readouts 0,10,20,30 --json shutter.json
@@ -55,8 +55,8 @@ def main(clips: str = common.CLIPS, readouts: str = "0,12,16,20,24,28,32", json:
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between; see `common.open_clip`.
-        readouts: milliseconds, with commas between; the first is what the others are compared with.
+        clips: comma-separated names; see `common.open_clip`.
+        readouts: comma-separated milliseconds; the others are compared with the first.
         json: file for the figures.
     """
     found = {clip: measure(clip, common.counts(readouts)) for clip in common.names(clips)}

@@ -1,7 +1,7 @@
-"""What it is worth to know the camera's velocity at each frame's own moment, under a rolling shutter.
+"""Gain from estimating the camera's velocity at each frame, under a rolling shutter.
 
-Runs a method with the mean velocity since the last frame, and with each frame's own. Prints, for each clip, a row for
-either: the error of a pair (RMSE and the largest) in mm and degrees, and the drift over a second.
+Runs a method with the mean velocity since the last frame, and with one estimated at each frame. Prints, for each clip,
+one row for each of the two: the error of a pair (RMSE in mm and degrees, largest in mm), and the drift over a second.
 
     python benchmarks/sway.py
     python benchmarks/sway.py --clips FOLDER --method gauss-newton --json sway.json
@@ -27,7 +27,7 @@ VELOCITIES = {"the mean since the last frame": False, "each frame's own": True}
 
 
 def pair_errors(found: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Metres and radians that the motion between two frames is off by, one by one."""
+    """Error of the motion between each two consecutive frames, metres and radians."""
     true, known = truth.interpolate(found.timestamps)
     pairs = np.flatnonzero(known[1:] & known[:-1])
     between, true_between = (inverse(path[pairs]) @ path[pairs + 1] for path in (found.world_T_camera, true))
@@ -36,7 +36,7 @@ def pair_errors(found: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.nd
 
 
 def measure(clip: str, method: str) -> list[dict[str, Any]]:
-    """The errors of a clip with either velocity.
+    """Errors on a clip with either velocity.
 
     Raises:
         GavoError: a clip without ground truth.
@@ -63,7 +63,7 @@ def main(clips: str = common.CLIPS, method: str = "ga:fast", json: Path | None =
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between, of clips with ground truth; see `common.open_clip`.
+        clips: comma-separated names of clips with ground truth; see `common.open_clip`.
         method: METHOD or METHOD:PRESET.
         json: file for the figures.
     """

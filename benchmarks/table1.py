@@ -1,8 +1,8 @@
 """The paper's Table 1 from the runs of `gavo experiment examples/table1.toml`: each method's drift, and paired tests.
 
-Prints, for each sequence, one row per method: its runs, the drift's median and quartiles in m/s, what the paper prints,
-and the rotation's median in deg/s; then the methods against `ga`, paired by seed, with p of a Wilcoxon signed-rank
-test.
+Prints, for each sequence, one row per method: its runs, the drift's median and quartiles in m/s, the paper's figure,
+and the rotation's median in deg/s. A second table compares `ga` with the other methods, paired by seed, with p of a
+Wilcoxon signed-rank test.
 
     gavo experiment examples/table1.toml
     python benchmarks/table1.py
@@ -34,7 +34,7 @@ def main(results: Path = Path("runs/table1"), json: Path | None = None) -> dict[
         json: file for the figures.
 
     Raises:
-        GavoError: no results there.
+        GavoError: the folder has no results.
     """
     table = Table(results)
     if not table.done():
