@@ -1,7 +1,7 @@
 """Motion of the camera among moving bodies, and theirs: clips with an inserted card, and the rendered room with bodies.
 
 The card (`moving_clips.py`) covers 0.1, 0.25 and 0.4 of the image of each clip; each seed has another texture, speed
-and distance. The room has a box, or a box and a walking figure. Prints one row per clip, body and method, over the seeds:
+and distance. The room has a box, or a box and a walking figure. Prints one row per clip, body and method:
 
 - drift (RPE over 1 s, RMSE) over that of the clean clip, median and worst. It is taken within segments; `breaks` counts
   the breaks of the trajectories, and `across` is the median with the guessed motion across them included;

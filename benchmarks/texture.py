@@ -1,10 +1,10 @@
-"""What is said of surfaces that tell little: stripes, edges, plain and periodic walls, corridors, cylinders.
+"""Results on poorly constrained scenes: stripes, edges, plain and periodic walls, corridors, cylinders.
 
 Each scene is rendered twice, a centimetre and a fraction of a degree apart, with grey noise (standard deviation in grey
-levels) and with or without a Kinect's depth noise, and aligned by each method. A result is fine if it is right (within
-5 mm and 0.3 degrees), if it is as likely by its covariance as three deviations are, or if that holds of what is left of
-its error besides the axes that it names as undetermined. Prints one row per method and scene: pairs that are fine, the
-largest error of a pair that is `ok`, and the statuses; then every pair that is not fine.
+levels) and with or without a Kinect's depth noise, and aligned by each method. A result is fine if its error is small
+(within 5 mm and 0.3 degrees) or within three deviations by its covariance. Axes that it reports as undetermined may be
+left out of the error. It is also fine if its status is high error, ambiguous or no depth. Prints one row per method and
+scene: pairs that are fine, the largest error of an `ok` pair, and the statuses; then every pair that is not fine.
 
     python benchmarks/texture.py
     python benchmarks/texture.py --methods gauss-newton --noise 0,1 --json texture.json
@@ -36,19 +36,19 @@ MOTION = (0.01, 0.003, 0.004, 0.004, -0.003, 0.002)
 RIGHT = (0.005, np.radians(0.3))
 """Metres and radians within which a motion is right."""
 DEVIATIONS = (3.0, 3.44, 3.76, 4.03, 4.27, 4.48)
-"""Largest distance, in deviations, of one to six unknowns: 99.73 % of normal errors lie within."""
+"""Largest Mahalanobis distance for one to six unknowns: 99.73 % of normal errors lie within."""
 SUPERSAMPLING = 3
-"""Rays a pixel along either side."""
+"""Rays per pixel along each side."""
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Grey from two coordinates on a surface, metres."""
+"""Maps two coordinates on a surface, metres, to its grey level."""
 Points = Float[np.ndarray, "n 3"]
 Scene = Callable[[Points, Points], tuple[np.ndarray, np.ndarray]]
-"""Distance along rays (from origins, in units of their directions), and the grey that they meet."""
+"""Maps rays (origins, directions) to the distance to the surface, in units of the directions, and its grey level."""
 
 
 def _bumps(seed: int, size: float) -> Texture:
-    """A texture without a period, smooth at a given size."""
+    """An aperiodic texture with smooth features of a given size, metres."""
     generator = np.random.default_rng(seed)
     waves = generator.normal(size=(24, 2)) / size
     phases = generator.uniform(0, 2 * np.pi, 24)
@@ -68,12 +68,12 @@ def bands(degrees: float) -> Texture:
 
 
 def edge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """One step, a millimetre wide."""
+    """A single step edge, a millimetre wide."""
     return 128 + 50 * np.tanh((x - 0.1) / 0.001)
 
 
 def plain(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Nothing at all."""
+    """A uniform grey."""
     return np.full_like(x, 128.0)
 
 
@@ -83,7 +83,7 @@ def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def tiles(period: float) -> Texture:
-    """The same tile every so many metres."""
+    """A tile that repeats every `period` metres."""
 
     def grey(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         a, b = 2 * np.pi * x / period, 2 * np.pi * y / period
@@ -98,7 +98,7 @@ def checks(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def wall(texture: Texture, distance: float = 1.5, slope: float = 0.0) -> Scene:
-    """A plane before the camera, turned by its slope along x."""
+    """A plane in front of the camera, tilted by a slope along x."""
 
     def meet(origins: Points, rays: Points) -> tuple[np.ndarray, np.ndarray]:
         along = (distance + slope * origins[:, 0] - origins[:, 2]) / (rays[:, 2] - slope * rays[:, 0])
@@ -118,7 +118,7 @@ def corridor(origins: Points, rays: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cylinder(origins: Points, rays: Points) -> tuple[np.ndarray, np.ndarray]:
-    """A tube along x, seen from within, that carries stripes along its axis."""
+    """A tube along x, seen from inside, with stripes along its axis."""
     oy, oz, dy, dz = origins[:, 1], origins[:, 2], rays[:, 1], rays[:, 2]
     a, b, c = dy**2 + dz**2, oy * dy + oz * dz, oy**2 + oz**2 - 1.5**2
     along = (-b + np.sqrt(b**2 - a * c)) / a
@@ -144,7 +144,7 @@ SCENES: dict[str, Scene] = {
 
 
 def render(scene: Scene, world_T_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Grey (floating point) and depth in metres."""
+    """Render grey (floating point) and depth in metres."""
     n = SUPERSAMPLING
     offsets = (np.arange(n) + 0.5) / n - 0.5
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
@@ -160,9 +160,9 @@ def render(scene: Scene, world_T_camera: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def photograph(grey: np.ndarray, depth: np.ndarray, noise: float, kinect: bool, seed: int) -> tuple[Any, Any]:
-    """The images of a sensor: 8-bit grey with noise, and depth in units of the camera's.
+    """Images of a sensor: 8-bit grey with noise, and depth in the camera's units.
 
-    A Kinect's disparity has a noise of half a step, and steps of an eighth of a pixel (0.00287 1/m).
+    A Kinect's disparity has steps of an eighth of a pixel (0.00287 1/m), and noise of half a step.
     """
     generator = np.random.default_rng(seed)
     image = np.clip(np.round(grey + noise * generator.normal(size=grey.shape)), 0, 255).astype(np.uint8)
@@ -174,7 +174,7 @@ def photograph(grey: np.ndarray, depth: np.ndarray, noise: float, kinect: bool, 
 
 
 class Case(NamedTuple):
-    """A pair and what became of it."""
+    """A pair and its result."""
 
     method: str
     scene: str
@@ -202,7 +202,7 @@ def judge(result: Alignment, truth: np.ndarray) -> tuple[bool, np.ndarray]:
 
 
 def is_likely(error: np.ndarray, covariance: np.ndarray) -> bool:
-    """Whether an error is no further off than three deviations of one unknown are."""
+    """Whether an error is within `DEVIATIONS` by its covariance; an empty one is."""
     if not error.size or not np.isfinite(covariance).all():
         return not error.size
     return bool(error @ np.linalg.solve(covariance, error) < DEVIATIONS[error.size - 1] ** 2)
@@ -220,9 +220,9 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        methods: METHOD or METHOD:PRESET, with commas between.
-        scenes: names with semicolons between, or all.
-        noise: standard deviations of the grey noise, with commas between.
+        methods: comma-separated METHOD or METHOD:PRESET.
+        scenes: semicolon-separated names, or all.
+        noise: comma-separated standard deviations of the grey noise.
         json: file for the figures.
     """
     truth = np.asarray(se3.exp(jnp.array(MOTION)), np.float64)

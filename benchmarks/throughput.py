@@ -1,18 +1,21 @@
 """Frames per second from PNG files on disk to poses, of every method and preset and of other libraries.
 
-Prints a row a contender. End to end: read, decoded and undistorted in a thread ahead as `gavo run` does it, aligned,
-the pose on the host; by the clock and on the processor (all cores' time added up, which a busy machine changes
-little). Beside it the median time of a pair whose frames are decoded already, the time that compilation took before
-(or loading from the cache), and the end-to-end time over that of each of `--over`. Contenders take turns (A B C A B C
-...), so that a slow spell meets all; figures are medians over the rounds, ratios medians of each round's ratio; a
-first round does not count. Below it what decoding costs; with `--together N` also a pair of N runs on one decoded
-stream, and what a row of an experiment's table takes: the figures that docs/scaling.md reckons with.
+Prints one row per contender. End-to-end time covers reading, decoding and undistortion in a thread ahead, as in
+`gavo run`, alignment, and the pose's transfer to the host. It is given as wall time and as processor time (summed over
+the cores, which a busy machine changes little). Beside it are the median time of a pair of decoded frames, the time of
+compilation (or loading from the cache), and the end-to-end time over that of each of `--over`.
+
+Contenders take turns (A B C A B C ...), so that a slow spell affects all. Figures are medians over the rounds, ratios
+medians of each round's ratio; a first round does not count. A second table has the cost of decoding. With
+`--together N` there are also the time per pair of N runs on one decoded stream, and the cost of a row of an
+experiment's table; docs/scaling.md is based on these.
 
     python benchmarks/throughput.py
     python benchmarks/throughput.py --methods ga:fast,opencv-rgb --frames 90 --rounds 7 --json throughput.json
     python benchmarks/throughput.py --methods ga,ga:fast,gauss-newton --together 4
 
-Clips and methods as for the other benchmarks. The defaults take about three minutes on two cores, with Open3D five.
+Clips and methods are named as in the other benchmarks. The defaults take about three minutes on two cores,
+five with Open3D.
 """
 
 import tempfile
@@ -49,11 +52,11 @@ def main(
 
     Args:
         clip: one clip.
-        methods: METHOD, METHOD:PRESET or peers with commas between.
-        frames: how many of the clip's.
+        methods: comma-separated METHOD, METHOD:PRESET or names of peers.
+        frames: first frames of the clip to use.
         rounds: measurements of each contender.
-        over: contenders whose time the others' is divided by; those that do not take part are left out.
-        together: runs on one decoded stream; 0 leaves them out, and the table's row.
+        over: comma-separated contenders whose time divides the others'; absent ones are ignored.
+        together: runs on one decoded stream; 0 leaves out these and the table's row.
         json: file for the figures.
 
     Raises:
@@ -99,7 +102,7 @@ COLUMNS_OF_TIME = {
 
 
 def measure(sequence: Sequence, contenders: list[common.Contender], rounds: int) -> dict[str, dict[str, Any]]:
-    """Time each contender over the sequence; the first time does not count.
+    """Time each contender over the sequence; the first round does not count.
 
     Returns:
         For each contender `seconds` of every round, and the medians.
@@ -134,7 +137,7 @@ def _ratio(figures: dict[str, Any], others: dict[str, Any]) -> float:
 
 
 def _from_files(sequence: Sequence, odometry: Odometry) -> np.ndarray:
-    """Seconds of a run, by the clock and on the processor."""
+    """Wall and processor seconds of a run."""
     start = _now()
     for _ in track(sequence, odometry=odometry):
         pass
@@ -148,12 +151,12 @@ def _from_frames(frames: list[Frame], odometry: Odometry) -> float:
 
 
 def _now() -> np.ndarray:
-    """Seconds by the clock and of the processor, all cores added up."""
+    """Wall and processor seconds, the latter summed over the cores."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def _together(sequence: Sequence, name: str, count: int) -> dict[str, float]:
-    """Milliseconds a pair of that many runs on one decoded stream, by the clock and on the processor."""
+    """Wall and processor milliseconds per pair of `count` runs on one decoded stream."""
     drivers = [Odometry(sequence.camera, common.preset_of(name), seed=seed) for seed in range(count)]
     start = _now()
     track_together(sequence, drivers)
@@ -162,7 +165,7 @@ def _together(sequence: Sequence, name: str, count: int) -> dict[str, float]:
 
 
 def _reading(sequence: Sequence) -> dict[str, float]:
-    """Size of a frame's two files where there are files, and a core's time to make a `Frame` of them."""
+    """Size of a frame's two files, if there are files, and the processor time to make a `Frame` of them."""
     start = time.process_time()
     for i in range(len(sequence)):
         sequence[i]

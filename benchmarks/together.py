@@ -1,16 +1,19 @@
-"""What 64 runs of one program cost when they go through a sequence together, against 64 single runs.
+"""Cost of 64 runs of one program that go through a sequence together, against 64 single runs.
 
 The runs differ in their seeds and in a rate of the solver (`ga`: mutation_decay, `pso`: constriction, `gauss-newton`:
-damping, `adam`: decay). For each method: programs compiled for one run and then for all the others, seconds of the 64
-runs as 64 calls of `run_odometry`, as bare loops over the frames (without its warm-up and figures), and together; the
-ratios of these times; milliseconds per pair on the processor (all cores' time added up) bare and together; and how many
-of the trajectories are the same bit for bit.
+damping, `adam`: decay). Prints for each method:
+
+- programs compiled for one run, and then for all the others;
+- seconds of the 64 runs as 64 calls of `run_odometry`, as bare loops over the frames (without its warm-up and figures),
+  and together; and the ratios of these times;
+- processor milliseconds per pair (summed over the cores), bare and together;
+- how many of the trajectories are the same bit for bit.
 
     python benchmarks/together.py
     python benchmarks/together.py --clip fr1_xyz:10 --methods ga --runs 8
 
-Frames are small by default: a rendered room of 160 x 120 pixels, written as PNG and read by every run that is
-alone, once for the runs together. All ways run in turn `--repeats` times, and the median counts. The defaults take
+Frames are small by default: a rendered room of 160 x 120 pixels, written as PNG. Every single run reads them; the runs
+together read them once. All variants run in turn `--repeats` times, and medians are printed. The defaults take
 about two minutes on two cores.
 """
 
@@ -57,10 +60,10 @@ def main(
 
     Args:
         clip: one clip, or the word small.
-        methods: METHOD or METHOD:PRESET with commas between.
-        runs: how many runs.
-        frames: how many of the small clip's.
-        repeats: measurements of every way, in turn.
+        methods: comma-separated METHOD or METHOD:PRESET.
+        runs: number of runs.
+        frames: number of frames of the small clip.
+        repeats: measurements of each variant, in turn.
         json: file for the figures.
     """
     results: dict[str, Any] = {"clip": clip, "runs": runs}
@@ -123,7 +126,7 @@ def _measure(sequence: Sequence, settings: list[Settings], repeats: int) -> dict
 
 
 def _timed(run: Callable[[], list[list[Step]]]) -> tuple[tuple[float, float], list[list[Step]]]:
-    """Seconds by the clock and of the processor, and what came of it."""
+    """Wall and processor seconds of a call, and its result."""
     start = time.perf_counter(), time.process_time()
     steps = run()
     return (time.perf_counter() - start[0], time.process_time() - start[1]), steps
@@ -135,7 +138,7 @@ def _same(first: list[Step], second: list[Step]) -> bool:
 
 @contextmanager
 def _compilations() -> Iterator[list[str]]:
-    """Programs that XLA compiles (or loads from the cache) meanwhile."""
+    """Collect the programs that XLA compiles (or loads from the cache) meanwhile."""
     events: list[str] = []
     counting = True
 

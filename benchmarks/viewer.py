@@ -1,12 +1,12 @@
-"""What it costs to watch: a run with the viewer that saves to a file against one without, in turn.
+"""Cost of the viewer: runs with the viewer that saves to a file against runs without, in turn.
 
-Prints, for each method, the median time of a run without and with `--viewer save`, their ratio, the processor's
-milliseconds per frame that the viewer adds (all cores' time added up) and the recording's size a frame.
+Prints, for each method, the median time per frame without and with `--viewer save`, their ratio, the processor time
+per frame that the viewer adds (summed over the cores), and the recording's size per frame.
 
     python benchmarks/viewer.py
     python benchmarks/viewer.py --clip synthetic:20 --methods gauss-newton --rounds 2 --json viewer.json
 
-Clips and methods as for the other benchmarks. The defaults take about two minutes on two cores.
+Clips and methods are named as in the other benchmarks. The defaults take about two minutes on two cores.
 """
 
 import tempfile
@@ -29,18 +29,18 @@ MODES: tuple[ViewerMode, ...] = ("none", "save")
 
 
 class Cost(NamedTuple):
-    """Of one run, a frame."""
+    """Cost of one run, per frame."""
 
     milliseconds: float
-    """By the clock, from the first frame to the viewer's last."""
+    """Wall time, from the first frame until the viewer has finished."""
     processor_milliseconds: float
-    """Of all cores."""
+    """Processor time, summed over the cores."""
     megabytes: float
-    """Of the recording."""
+    """Size of the recording."""
 
 
 def watch(sequence: Sequence, name: str, mode: ViewerMode, folder: Path) -> Cost:
-    """Track a sequence before a viewer."""
+    """Track a sequence with a viewer."""
     recording = folder / RECORDING
     viewer = make_viewer(mode, recording)
     odometry = Odometry(sequence.camera, common.preset_of(name), record=viewer.wants_populations)
@@ -61,7 +61,7 @@ def main(
 
     Args:
         clip: one clip.
-        methods: METHOD or METHOD:PRESET with commas between.
+        methods: comma-separated METHOD or METHOD:PRESET.
         rounds: runs without and with the viewer, in turn.
         json: file for the cost of every run.
     """

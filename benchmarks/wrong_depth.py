@@ -1,11 +1,14 @@
-"""What depth that is wrong in every frame does to a run, and whether that is told.
+"""Effect of depth that is wrong in every frame, and whether the run reports it.
 
-Of frames that were never right no history tells; how depth changes does (`odometry/depth_change.py`), and where it
-lies (`depth_edges.py`). Prints, for each clip and fault, the share of the pairs that are not ok once the run
-has ended, how many pairs are off by more than 5 cm or 3 degrees and how many of these are ok, the drift (RPE over 1 s,
-RMSE; a dash where no segment is that long), also over the clean run's, and of the change of depth the part that the
-motions leave: median over the run, and the most.
-Beyond `MOST_LEFT` depth is told to be wrong, so the clean clips' most says how far from a false alarm they are.
+If no frame was ever right, history cannot reveal it, but the change of depth (`odometry/depth_change.py`) and its edges
+(`depth_edges.py`) can. Prints for each clip and fault:
+
+- the share of the pairs that are not ok at the end of the run;
+- how many pairs are off by more than 5 cm or 3 degrees, and how many of these are ok;
+- drift (RPE over 1 s, RMSE; a dash where no segment is that long), also over the clean run's;
+- the part of the change of depth that the motions do not explain: median and maximum over the run.
+
+Above `MOST_LEFT` depth is reported as wrong, so the maximum on clean clips shows how far from a false alarm they are.
 
     python benchmarks/wrong_depth.py
     python benchmarks/wrong_depth.py --clips FOLDER --method gauss-newton --json wrong_depth.json
@@ -55,7 +58,7 @@ FAULTS: dict[str, Alter] = {
 
 
 def measure(clip: FrameSequence, truth: Trajectory, alter: Alter, contender: common.Contender) -> dict[str, Any]:
-    """One run of which every frame is altered."""
+    """Figures of one run with every frame altered."""
     sequence: Any = every_frame(alter)(clip)
     odometry, steps, left = contender.make(sequence.camera, 0), [], []
     for step in track(sequence, odometry=odometry):
@@ -82,9 +85,9 @@ def main(
     """Measure, print and return the figures.
 
     Args:
-        clips: names with commas between, of clips with ground truth; see `common.open_clip`.
+        clips: comma-separated names of clips with ground truth; see `common.open_clip`.
         method: METHOD or METHOD:PRESET.
-        faults: names with commas between; the clean clip comes first in any case.
+        faults: comma-separated names; the clean clip always comes first.
         json: file for the figures.
     """
     contender, rows, cells = common.parse_methods(method)[0], [], []
@@ -108,7 +111,7 @@ def main(
 
 
 FIGURES = {"drift": 4, "ratio": 2, "left": 2, "most_left": 2}
-"""Of a row, those that are printed as numbers, with their digits."""
+"""Figures of a row that are printed as numbers, with their digits."""
 
 
 if __name__ == "__main__":

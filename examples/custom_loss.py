@@ -14,15 +14,15 @@ SOLVER = gavo.GeneticAlgorithm(population=(0, 0, 24, 32, 64), iterations=(0, 0, 
 
 
 def counted(s: jax.Array) -> jax.Array:
-    """Cost of a squared residual in units of the noise: by eighths up to 3 σ, and no more for what is further off.
+    """Cost of a squared residual in units of the noise: rises in steps of 1/8 up to 3 σ, constant beyond.
 
-    A staircase: flat nearly everywhere, so its derivative tells nothing.
+    It is flat nearly everywhere, so its derivative is useless.
     """
     return jnp.minimum(jnp.ceil(8.0 * s) / 8.0, 9.0)
 
 
 def main() -> gavo.Alignment:
-    """Align two frames by the genetic algorithm under a loss of our own."""
+    """Align two frames by the genetic algorithm with a custom loss."""
     sequence = gavo.SyntheticSequence(frames=2)
     settings = gavo.Settings(SOLVER, gavo.AlignmentOptions(loss=counted))
     pair = gavo.align(sequence[0], sequence[1], sequence.camera, settings)

@@ -1,7 +1,7 @@
 """A film of the search: the particles close in on the motion of each frame while the trajectory grows.
 
 Run it as `python examples/film.py [FILE]`, by default into film.webp; a name that ends in .gif makes a GIF. It needs
-the extra `[plot]`. A population is there to be looked at where `Odometry` is told to record it.
+the extra `[plot]`. `Odometry` keeps the populations only if told to record them.
 """
 
 import io
@@ -20,7 +20,7 @@ from gavo_jax.viewer.search_space import Level, level_of
 
 DARK, PALE, GREEN, BLUE = "#181a20", "#d0d4dc", "#2fcf9a", "#56b4e9"
 SECONDS = 0.09
-"""Of a picture."""
+"""Seconds per picture."""
 
 
 class Moment(NamedTuple):
@@ -30,16 +30,16 @@ class Moment(NamedTuple):
     path: np.ndarray
     """Positions of the camera so far, [n, 3], metres."""
     truth: np.ndarray
-    """The true ones, as many."""
+    """True positions, [n, 3], metres."""
     level: Level
     generation: int
     title: str
     true_step: np.ndarray
-    """Where the camera truly goes next, seen from the last one, millimetres."""
+    """True position of the camera in its previous frame, millimetres."""
 
 
 def moments(frames: int, stride: int) -> Iterator[Moment]:
-    """Track the synthetic room; of the first searches every other generation is shown, of later ones one a level."""
+    """Track the synthetic room; yield every other generation of the first two searches, one per level of later ones."""
     sequence = gavo.SyntheticSequence(frames=frames * stride, color=True)[::stride]
     odometry = gavo.Odometry(sequence.camera, gavo.preset("ga"), record=True)
     world_T_camera, _ = sequence.ground_truth.interpolate(sequence.timestamps)
@@ -104,7 +104,7 @@ def draw(moment: Moment, room: np.ndarray) -> Image.Image:
 
 
 def main(file: str = "film.webp", frames: int = 26, stride: int = 4) -> list[Image.Image]:
-    """Write the film of so many frames of the synthetic room, every stride-th of its path."""
+    """Write a film of `frames` frames of the synthetic room, every `stride`-th of its path."""
     gavo.enable_compilation_cache()
     matplotlib.rcParams["font.family"] = "DejaVu Sans"
     shown = list(moments(frames, stride))

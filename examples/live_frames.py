@@ -1,8 +1,8 @@
 """Frames as they come from a camera: `Odometry.register`, one call a frame.
 
-Run it as `python examples/live_frames.py`. The synthetic room stands for the camera; with a device of your own, yield
-its images and stamps from `camera_images` instead, and give `Odometry` its `gavo.Camera`. Images of a lens with
-distortion go through `camera.undistort` first.
+Run it as `python examples/live_frames.py`. The synthetic room stands in for the camera; for a real device, yield its
+images and timestamps from `camera_images` instead, and give `Odometry` its `gavo.Camera`. If the lens has
+distortion, undistort the images with `camera.undistort` first.
 """
 
 from collections.abc import Iterator
@@ -13,13 +13,13 @@ import gavo_jax as gavo
 
 
 def camera_images(frames: int) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """Grey [H, W] of uint8, depth [H, W] of uint16 registered to it, and the colour image's stamp in seconds."""
+    """Yield grey [H, W] uint8, depth [H, W] uint16 registered to it, and the colour image's timestamp in seconds."""
     for frame in gavo.SyntheticSequence(frames=frames):
         yield frame.grey, frame.depth, frame.timestamp
 
 
 def main(frames: int = 10) -> np.ndarray:
-    """Track what the camera sees until it ends or Ctrl-C; returns the last world_T_camera."""
+    """Track the camera until its images end or Ctrl-C is pressed; return the last world_T_camera."""
     gavo.enable_compilation_cache()
     odometry = gavo.Odometry(gavo.SyntheticSequence(frames=2).camera, gavo.preset("ga", "fast"))
     print("compiling ...")

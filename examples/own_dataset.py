@@ -1,4 +1,4 @@
-"""A dataset of one's own: frames that lie as arrays in one .npz file.
+"""A custom dataset: frames stored as arrays in one .npz file.
 
 Run it as `python examples/own_dataset.py [FILE.npz]`; without a file it writes one from the synthetic room first.
 """
@@ -17,7 +17,7 @@ import gavo_jax as gavo
 
 @dataclass(frozen=True)
 class ArraySequence:
-    """Frames of `grey`, `depth` and `timestamps`, equally long; `gavo.Sequence` says what else is asked for."""
+    """Frames from `grey`, `depth` and `timestamps` of equal length; see `gavo.Sequence` for the required interface."""
 
     name: str
     camera: gavo.Camera
@@ -41,11 +41,11 @@ class ArraySequence:
         return gavo.Frame(self.grey[index], self.depth[index], float(self.timestamps[index]))
 
     def __iter__(self) -> Iterator[gavo.Frame]:
-        """Give frame after frame."""
+        """Iterate over the frames."""
         return (self[i] for i in range(len(self)))
 
     def check(self) -> None:
-        """Refuse what is wrong with the whole, before a run."""
+        """Check the whole sequence before a run."""
         if not len(self.grey) == len(self.depth) == len(self.timestamps):
             raise gavo.GavoError(f"{self.name}: grey, depth and timestamps differ in length")
 

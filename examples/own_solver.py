@@ -1,4 +1,4 @@
-"""A solver of one's own: differential evolution (Storn and Price 1997), DE/best/1, beside the genetic algorithm.
+"""A custom solver: differential evolution (Storn and Price 1997), DE/best/1, beside the genetic algorithm.
 
 Run it as `python examples/own_solver.py`.
 """
@@ -16,7 +16,7 @@ from gavo_jax.solvers import Best, Bounds, Candidates, PerLevel, Problem, Schedu
 
 
 class State(NamedTuple):
-    """Candidates with their errors, those that are tried next, and the box."""
+    """Candidates with their errors, the next trials, and the bounds."""
 
     x: Float[Array, "p 6"]
     error: Float[Array, " p"]
@@ -27,7 +27,7 @@ class State(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class DifferentialEvolution(PerLevel):
-    """Each candidate is tried against the best one plus a scaled difference of two others."""
+    """Mixes each candidate with a mutant: the best one plus a scaled difference of two others."""
 
     iterations: Schedule = static((0, 15, 15, 20, 30))
     patience: int = static(1000)
@@ -36,7 +36,7 @@ class DifferentialEvolution(PerLevel):
     crossover: float = 0.9
 
     def init(self, key: PRNGKeyArray, problem: Problem, guess: Float[Array, "g 6"], bounds: Bounds) -> State:
-        """A cloud about the guesses, in units of `Problem`: a step of 1 changes the image by a grey level."""
+        """A cloud around the guesses, in units of `Problem`: a step of 1 changes the image by a grey level."""
         x = initial_population(key, self.population, 3.0, guess, bounds)
         return State(x, jnp.full(self.population, jnp.inf), x, bounds)
 
@@ -56,12 +56,12 @@ class DifferentialEvolution(PerLevel):
         return Best(state.x[jnp.argmin(state.error)], jnp.min(state.error))
 
     def candidates(self, state: State) -> Candidates:
-        """All of them."""
+        """All candidates with their errors."""
         return Candidates(state.x, state.error)
 
 
 def main() -> gavo.Alignment:
-    """Align two frames by it; then it has a name, too."""
+    """Align two frames with it, then register it under a name."""
     sequence = gavo.SyntheticSequence(frames=2)
     pair = gavo.align(sequence[0], sequence[1], sequence.camera, DifferentialEvolution())
     first, second = sequence.ground_truth.world_T_camera
