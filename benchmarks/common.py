@@ -97,7 +97,7 @@ def take_record(arguments: Sequence[str]) -> tuple[list[str], Path | None]:
 
 
 def printed_record(benchmark: str, arguments: Sequence[str]) -> records.Record:
-    """What this process printed, as a record."""
+    """Make a record of what this process printed."""
     here = machine()
     versions = here["versions"]
     named = {"JAX": "jax", "NumPy": "numpy", "OpenCV": "opencv"}
@@ -223,7 +223,7 @@ def parse_methods(text: str) -> list[Contender]:
 
 
 def installed_peers() -> str:
-    """Names of the peers whose libraries are installed, with commas between."""
+    """Comma-separated names of the peers whose libraries are installed."""
     return ",".join(name for name, info in PEERS.items() if info.installed)
 
 

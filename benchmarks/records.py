@@ -35,7 +35,7 @@ ALLOWED = next(
 
 
 class Table(NamedTuple):
-    """What a benchmark printed: the first column is text, the others are numbers as they were printed."""
+    """A printed table: the first column is text, the others are numbers as they were printed."""
 
     title: str
     columns: tuple[str, ...]

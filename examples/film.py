@@ -24,7 +24,7 @@ SECONDS = 0.09
 
 
 class Moment(NamedTuple):
-    """What one picture of the film shows."""
+    """Content of one picture of the film."""
 
     frame: gavo.Frame
     path: np.ndarray
