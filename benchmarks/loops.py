@@ -258,20 +258,21 @@ def try_covered(
     for i in range(foreign_tries):
         scene = foreign[i % len(foreign)]
         first = int(rng.integers(0, len(scene) - SOUGHT))
-        frames = [fitted(scene[first + k], sequence.camera) for k in range(SOUGHT)]
+        frames = [seen_by(sequence.camera, scene[first + k], scene.camera) for k in range(SOUGHT)]
         false += attempt(frames, "relocalised") is not None
     return {"tries": rows, "foreign": foreign_tries, "false": false}
 
 
-def fitted(frame: Frame, camera: Camera) -> Frame:
-    """Return the frame of another camera as it is, if it has the map's image size.
+def seen_by(camera: Camera, frame: Frame, own: Camera) -> Frame:
+    """Return a frame of its own camera with its depth in the units of the map's camera.
 
     Raises:
-        GavoError: it has another size.
+        GavoError: it has another size than the map's images.
     """
     if frame.grey.shape != (camera.height, camera.width):
         raise GavoError(f"a frame of {frame.grey.shape} is not of the map's size")
-    return frame
+    depth = np.asarray(frame.depth) * (camera.depth_scale / own.depth_scale)
+    return replace(frame, depth=np.where(depth < 65535, depth, 0).round().astype(np.uint16))
 
 
 def main(

@@ -9,7 +9,7 @@ import gavo_jax as gavo
 
 
 def main(folder: str | None = None, frames: int = 30) -> gavo.OdometryRun:
-    """Track the first frames of a sequence, saying each pair's status on the way."""
+    """Track the first frames of a sequence, printing each pair's status on the way."""
     gavo.enable_compilation_cache()  # keep compiled programs for later runs
     sequence = gavo.TumSequence(folder)[:frames] if folder else gavo.SyntheticSequence(frames=frames)
 

@@ -15,6 +15,7 @@ import pytest
 from small import ALONE, CAMERA, GENETIC, NEWTON, Rendered
 
 from gavo_jax import presets
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
@@ -209,6 +210,19 @@ def test_depth_that_is_always_wrong_is_measured(load, quick, tmp_path: Path) -> 
     assert damaged["flagged"] > 0.5 and damaged["silent"] <= damaged["wrong"]
     with pytest.raises(GavoError, match="nonsense"):
         wrong_depth.main(clips=CLIP, faults="nonsense")
+
+
+def test_a_foreign_frame_has_depth_in_the_units_of_the_map(load) -> None:
+    """Depth in millimetres was handed to a map in fifths of them: the foreign scene was five times too near."""
+    loops: ModuleType = load("loops")
+    own = replace(CAMERA, depth_scale=1000.0)
+    depth = np.full((CAMERA.height, CAMERA.width), 1500, np.uint16)
+    depth[0, :3] = 0, 65535, 20000
+    frame = Frame(np.zeros(depth.shape, np.uint8), depth, 0.0)
+    seen = loops.seen_by(replace(CAMERA, depth_scale=5000.0), frame, own)
+    assert seen.depth.dtype == np.uint16 and seen.depth[1, 0] == 7500 and not seen.depth[0, :3].any()
+    with pytest.raises(GavoError, match="not of the map's size"):
+        loops.seen_by(CAMERA.binned(2), frame, own)
 
 
 def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
