@@ -1,1 +1,1 @@
-"""Many runs: what is planned, who runs it, where the results go, what they say."""
+"""Experiments of many runs: plans, executors, results tables and summaries."""

@@ -1,6 +1,7 @@
-"""Rows of one name whose configurations differ, told apart by their names.
+"""Distinct names for table rows that share a name but differ in configuration.
 
-A table keeps what an experiment once was: after a change of its file, frames and settings of the same name are others.
+A table keeps the rows of earlier versions of an experiment's file, where the same name may stand for other frames or
+settings.
 """
 
 import itertools
@@ -13,20 +14,20 @@ from gavo_jax.output.files import differences
 Row = Mapping[str, Any]
 
 FRAMES, SETTINGS = ("sequence",), ("method", "preset", "settings")
-"""Parts of a row's configuration: which frames it is of, and what is done with them by any seed."""
+"""Keys of a row's configuration that identify its frames, and its settings regardless of the seed."""
 DIGESTS = {"timestamps_sha256": "stamps", "images_sha256": "images", "truth_sha256": "truth"}
 TOLD_BY_OTHERS = ("first_timestamp", "last_timestamp", *DIGESTS)
-"""Differ where the frames do, and say little."""
+"""Keys that differ whenever the frames do, but tell a reader little."""
 MOST_SHOWN = 3
 
 
 def tell_apart(rows: Sequence[Row], planned: Collection[str] = ()) -> list[dict[str, Any]]:
-    """Return the rows with names of sequences and labels that stand for one configuration each.
+    """Return the rows with sequence names and labels that each stand for a single configuration.
 
     Args:
-        rows: Of a table.
-        planned: Hashes of the runs that the experiment has now: these keep their plain names. Else, or where there are
-            none of a name, the newest one does; to the others what differs is added.
+        rows: Rows of a results table.
+        planned: Hashes of the experiment's current runs, which keep their plain names. If no row of a name is among
+            them, the newest keeps it. The other rows' names are extended by what differs.
     """
     order = sorted(rows, key=lambda row: row["finished"] or "", reverse=True)
     order.sort(key=lambda row: row["run"] not in planned)
@@ -43,7 +44,7 @@ def _part(configuration: Any, keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _names(entries: Sequence[tuple[str, str, dict[str, Any]]]) -> dict[str, str]:
-    """Name each run of (run, name, configuration): equal names only where configurations are equal."""
+    """Map each run of (run, name, configuration) to a name that only runs of equal configuration share."""
     plain: dict[str, dict[str, Any]] = {}
     given: dict[tuple[str, str], str] = {}
     found = {}

@@ -1,4 +1,4 @@
-"""Who runs the runs: this process on its own device, or a Ray cluster."""
+"""Executors of batches: this process on its own device, or a Ray cluster."""
 
 import importlib
 import platform
@@ -34,7 +34,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a batch: its rows, or the one line that says why there are none."""
+    """The outcome of a batch: its rows, or a one-line reason why there are none."""
 
     batch: Batch
     rows: tuple[Row, ...]
@@ -45,32 +45,32 @@ class Executor(Protocol):
     """Runs batches, in any order."""
 
     def slots(self) -> int:
-        """How many batches it can run at the same time."""
+        """Return the number of batches that can run at the same time."""
         ...
 
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
-        """Yield each batch's outcome as soon as it is known; `on_pairs` hears of pairs that are done."""
+        """Yield each batch's outcome as soon as it is known, and call `on_pairs` with the number of pairs just done."""
         ...
 
 
 class LocalExecutor:
-    """One batch after the other in this process; the device works on the runs of a batch together."""
+    """Runs one batch after another in this process; the runs of a batch share the device."""
 
     def slots(self) -> int:
-        """One."""
+        """Return one."""
         return 1
 
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
-        """Run them in their order."""
+        """Run the batches in the given order."""
         for batch in batches:
             yield interruptible(partial(run_batch, experiment, batch, on_pairs))
 
 
 class RayExecutor:
-    """Batches as tasks of a Ray cluster: the one that RAY_ADDRESS names, else one that is started here.
+    """Runs batches as tasks on a Ray cluster: the one RAY_ADDRESS names, or else one started here.
 
-    Ray retries a task whose process or node dies. Rows travel back to the driver, which alone writes the table; only
-    the frames have to be readable on every node, under the same paths.
+    Ray retries a task whose process or node dies. Rows are sent back to the driver, which alone writes the table. The
+    nodes only need to read the frames, under the same paths.
     """
 
     RETRIES = 5
@@ -79,7 +79,7 @@ class RayExecutor:
         """Join the cluster.
 
         Raises:
-            GavoError: Ray is missing, no cluster answers, or none of its nodes has what a batch takes.
+            GavoError: Ray is missing, no cluster answers, or it has too few processors or GPUs for a batch.
         """
         try:
             ray = importlib.import_module("ray")
@@ -100,14 +100,14 @@ class RayExecutor:
                 raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
 
     def slots(self) -> int:
-        """Count how many runs the cluster's processors and GPUs allow now."""
+        """Return how many batches the cluster's processors and GPUs can run at the same time."""
         resources = self._ray.cluster_resources()
         return max(1, int(min((resources.get(name, 0.0) // n for name, n in self._wanted.items() if n), default=1)))
 
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
-        """Hand all of them to the cluster and yield them in the order in which they come back."""
+        """Submit all batches to the cluster and yield their outcomes in order of completion."""
         ray = self._ray
-        folder = cache_folder()  # each node keeps its own kind of processor's programs in it
+        folder = cache_folder()  # on each node, it holds the programs compiled for that kind of processor
         variables = {} if folder is None else {"GAVO_CACHE_DIR": str(folder)}
         task = ray.remote(_run_cached).options(
             num_cpus=self._wanted["CPU"],
@@ -132,13 +132,13 @@ class RayExecutor:
                 ray.cancel(reference, force=True)
 
     def close(self) -> None:
-        """Leave the cluster; one that was started here ends."""
+        """Shut the cluster down if it was started here."""
         if self._started:
             self._ray.shutdown()
 
 
 def _run_cached(experiment: str, batch: Batch) -> Outcome:
-    """`run_batch` in a process of its own, with what others compiled for its kind of processor."""
+    """Call `run_batch` in a worker process, with the compilation cache for its kind of processor."""
     enable_compilation_cache()
     return run_batch(experiment, batch)
 
@@ -147,12 +147,12 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
     """Run a batch on this process's device.
 
     Args:
-        experiment: Name that the rows carry.
+        experiment: Name of the experiment, written to the rows.
         batch: Runs of one program over the same frames.
-        on_pairs: Hears of pairs that are done.
+        on_pairs: Called with the number of pairs just done.
 
     Returns:
-        A row of the results table a run; bad input is an outcome, too.
+        One row of the results table per run, or the fault if the input is bad.
     """
     try:
         sequence = batch.part.open()
@@ -178,7 +178,7 @@ def run_batch(experiment: str, batch: Batch, on_pairs: Callable[[int], None] | N
 def _mapped(
     experiment: str, batch: Batch, sequence: FrameSequence, settings: Settings, on_pairs: Callable[[int], None] | None
 ) -> Row:
-    """The row of a run that keeps a map, alone in its batch: its figures are those of the corrected trajectory."""
+    """The row of a run with a map, the only one in its batch: its metrics are those of the corrected trajectory."""
     (run,) = batch.runs
 
     def on_step(_: Step) -> None:
@@ -191,14 +191,14 @@ def _mapped(
 
 
 class _Tracker:
-    """All runs of a batch over its frames: stacked into one call a frame where the device gains by it."""
+    """Tracks a batch's frames by all its runs: on an accelerator, stacked into one call per frame."""
 
     def __init__(self, batch: Batch, sequence: FrameSequence) -> None:
         self._sequence, self._runs = sequence, batch.runs
         self._stacked = jax.default_backend() != "cpu" and batch.runs[0].settings is not None
 
     def warm_up(self) -> float:
-        """Compile; returns the seconds this took."""
+        """Compile the program and return the seconds this took."""
         if not self._stacked:
             return _odometry(self._runs[0], self._sequence).warm_up()
         start = time.perf_counter()
@@ -206,7 +206,7 @@ class _Tracker:
         return time.perf_counter() - start
 
     def track(self, on_pairs: Callable[[int], None] | None) -> list[list[Step]]:
-        """The steps of each run."""
+        """Track all frames and return the steps of each run."""
         frames = iter(range(len(self._sequence)))
 
         def on_frame() -> None:
@@ -257,7 +257,7 @@ def _peer_versions(run: Run, camera: Camera) -> dict[str, str]:
 
 @cache
 def git_state() -> tuple[str | None, bool | None]:
-    """Commit of the checkout that this package is imported from, and whether it has changes; None where it is none."""
+    """Commit of the checkout this package is imported from, and whether it has changes; None outside a checkout."""
     folder = Path(__file__).parent
 
     def git(*arguments: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Runs that are to be made: of which frames, with what, and which of them together."""
+"""The runs of an experiment: their frames and settings, and the batches they form."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -21,16 +21,16 @@ class Part:
     """Frames of one sequence."""
 
     name: str
-    """As tables call it."""
+    """Name in tables."""
     path: str
-    """A folder, or the word synthetic."""
+    """A folder, or `synthetic`."""
     camera: str = "auto"
     start: int = 0
     frames: int | None = None
     stride: int = 1
 
     def open(self) -> FrameSequence:
-        """Return the frames, checked.
+        """Open the frames and check them.
 
         Raises:
             GavoError: as `open_part`.
@@ -43,14 +43,14 @@ class Run:
     """One run, ready to go.
 
     Attributes:
-        id: Hash of everything below and of the frames' stamps and camera: equal runs have equal ones everywhere.
-        part: Which frames.
-        pairs: How many pairs these make.
-        pixels: Of one image.
+        id: Hash of the run's `configuration`: equal runs have equal hashes on every machine.
+        part: Frames to track.
+        pairs: Number of pairs of successive frames.
+        pixels: Number of pixels of an image.
         method: One of `presets.methods()`, or a peer.
         preset: Name of the preset; empty for a peer.
-        variant: The settings that differ from the preset's, in words; mostly empty.
-        seed: None for a peer, which has none.
+        variant: Settings that differ from the preset's, as text; usually empty.
+        seed: Random seed; None for a peer.
         settings: Effective settings; None for a peer.
     """
 
@@ -81,7 +81,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class RayOptions:
-    """What one batch takes of a Ray cluster: processors, and GPUs (None: one where the cluster has any)."""
+    """Processors and GPUs that a batch takes on a Ray cluster (`gpus` None: one GPU if the cluster has any)."""
 
     cpus: float = 2.0
     gpus: float | None = None
@@ -89,16 +89,16 @@ class RayOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """What an experiment's file asks for.
+    """The contents of an experiment's file, checked and laid out as runs.
 
     Attributes:
-        name: Of the experiment.
-        folder: Where the results go.
+        name: Name of the experiment.
+        folder: Folder for the results.
         runs: All runs, sequence by sequence.
-        skipped: A line for each optional sequence that is not here.
-        printed: Drift that a publication gives, by (sequence, method's label), m/s.
-        batch: Most runs that are tracked together.
-        ray: What a batch takes of a Ray cluster.
+        skipped: One line for each missing optional sequence or peer.
+        printed: Published drift by (sequence, label), m/s.
+        batch: Largest number of runs that are tracked together.
+        ray: Resources that a batch takes on a Ray cluster.
     """
 
     name: str
@@ -111,8 +111,9 @@ class Plan:
 
 
 def batches(runs: Iterable[Run], size: int) -> list[Batch]:
-    """Put runs of one part and one program together, at most `size` of them; peers go one by one, and so do runs with a
-    map.
+    """Group runs of the same frames and program into batches of at most `size`.
+
+    A peer or a run with a map is a batch of its own.
     """
     groups: dict[Any, list[Run]] = {}
     for run in runs:
@@ -126,13 +127,16 @@ def batches(runs: Iterable[Run], size: int) -> list[Batch]:
 
 
 def programs(runs: Iterable[Run]) -> int:
-    """Number of distinct compiled programs that the runs take."""
+    """Number of distinct compiled programs that the runs need."""
     return len({(run.pixels, program_of(run.settings)) for run in runs if run.settings is not None})
 
 
 def configuration(run: Run, frames: Mapping[str, Any]) -> dict[str, Any]:
-    """The full configuration of a run on frames as `frames_of` tells them, without what belongs to a machine: equal
-    ones are one run.
+    """The full configuration of a run, without anything specific to a machine: equal configurations are one run.
+
+    Args:
+        run: The run; its id is not used.
+        frames: Its frames, as described by `frames_of`.
     """
     return describe(
         {
@@ -147,9 +151,9 @@ def configuration(run: Run, frames: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
-    """Which frames a sequence has, by which camera, and what is true of them, without where they lie.
+    """Describe a sequence's frames, camera and ground truth by value, without file paths.
 
-    Of the images the first, the middle and the last tell: two recordings may have the same name, stamps and camera.
+    Hashes of the first, middle and last image tell apart recordings of the same name, timestamps and camera.
     """
     stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
     images, truth = hashlib.sha256(), sequence.ground_truth

@@ -1,4 +1,4 @@
-"""From a TOML file to a plan: sequences × methods × presets × settings × seeds, checked before anything runs."""
+"""Reads a plan from a TOML file: sequences × methods × presets × settings × seeds, checked before anything runs."""
 
 import glob
 import hashlib
@@ -38,18 +38,18 @@ METHOD_KEYS = ("name", "presets", "seeds", "solver", "alignment", "odometry", "s
 RAY_KEYS = ("cpus", "gpus")
 DATA = "GAVO_DATA"
 BATCH = 32
-"""Runs that are tracked together unless the file says otherwise."""
+"""Default number of runs that are tracked together."""
 
 
 def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
-    """Read an experiment's file, check all of it, and lay out its runs.
+    """Read an experiment's file, check it completely, and lay out its runs.
 
     Args:
         path: The TOML file.
-        output: Folder for the results; the file's own `output`, else runs/NAME.
+        output: Folder for the results; by default the file's own `output`, or else runs/NAME.
 
     Raises:
-        GavoError: names the file, the key and the fault; an unknown key comes with the nearest known one.
+        GavoError: The message names the file, the key and the fault, and suggests the nearest key for an unknown one.
     """
     path = Path(path)
     table = read_toml(path)
@@ -91,10 +91,10 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
 
 
 def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str, str]]:
-    """The parts of all [[sequences]] of a file, and by name a line for each optional one that is not here.
+    """Return the parts of a file's [[sequences]], and by name a line for each optional one that is missing.
 
     Raises:
-        GavoError: a wrong key or value, a sequence that is nowhere, two of one name, none at all.
+        GavoError: A key or value is wrong, a sequence is not found, two share a name, or there is none.
     """
     entries = tables_of(f"{path}: sequences", table.get("sequences", []))
     parts: list[Part] = []
@@ -121,7 +121,7 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
 
 
 def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
-    """Folders that the first pattern with any match stands for: from here, beside the file, in GAVO_DATA."""
+    """Folders of the first pattern that matches any: in the working directory, beside the file, or in GAVO_DATA."""
     roots = ["", str(beside), *([os.environ[DATA]] if os.environ.get(DATA) else [])]
     for pattern in patterns:
         if pattern == SYNTHETIC:
@@ -153,7 +153,7 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
 
 @dataclass(frozen=True)
 class _Variant:
-    """One method with one choice of settings, and the seeds it is run with."""
+    """A method with one choice of settings, and the seeds it runs with."""
 
     method: str
     preset: str
@@ -168,10 +168,10 @@ class _Variant:
 
 
 def _lacking(place: str, entry: Mapping[str, Any]) -> str | None:
-    """A line for an optional peer that is not installed; None for what can be run.
+    """Return a line for an optional peer that is not installed; None for a method that can run.
 
     Raises:
-        GavoError: a peer that is not installed and not optional.
+        GavoError: A peer that is not optional is not installed.
     """
     info = PEERS.get(str(entry.get("name")))
     if info is None or info.installed:
@@ -216,7 +216,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
 
 
 def require_what_loops_need(place: str, settings: Settings) -> None:
-    """Raise GavoError for settings with loops where GTSAM is not installed, before anything runs."""
+    """Raise GavoError if the settings close loops but GTSAM is not installed."""
     try:
         if settings.odometry.loops:
             require_gtsam()

@@ -1,4 +1,4 @@
-"""What is kept beside a table of runs: which runs are the experiment's, in which order, and what publications give."""
+"""The record beside a results table: the experiment's runs, their order in tables, and published figures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,19 +12,19 @@ FILE = "experiment.json"
 
 
 class Record(NamedTuple):
-    """What a report needs of an experiment beside the table."""
+    """What a report needs to know of an experiment in addition to its table."""
 
     name: str
     printed: Mapping[tuple[str, str], float]
-    """Drift that a publication gives, by sequence and label, m/s."""
+    """Published drift by sequence and label, m/s."""
     order: Mapping[tuple[str, str], int]
-    """Of sequence and label."""
+    """Rank in tables, by sequence and label."""
     runs: frozenset[str]
-    """Hashes of the experiment's runs as its file was last."""
+    """Hashes of the runs that the experiment's file last asked for."""
 
 
 def write_record(plan: Plan) -> None:
-    """Write the record of a plan into its folder."""
+    """Write a plan's record to its folder."""
     order = list(dict.fromkeys((run.part.name, run.label) for run in plan.runs))
     printed = [{"sequence": name, "label": label, "drift": value} for (name, label), value in plan.printed.items()]
     runs = [run.id for run in plan.runs]
@@ -32,10 +32,10 @@ def write_record(plan: Plan) -> None:
 
 
 def read_record(folder: Path) -> Record:
-    """Read the record in a folder; an empty one where none was written.
+    """Read the record in a folder; an empty one if none was written.
 
     Raises:
-        GavoError: It cannot be read.
+        GavoError: The record cannot be read.
     """
     path = folder / FILE
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""An experiment from its plan to its table: what is missing is run, each row is kept as soon as it is there."""
+"""Runs an experiment: whatever its table lacks, saving each row as soon as it is known."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from gavo_jax.experiments.table import Table
 from gavo_jax.odometry.metrics import FRAMES_PER_SECOND
 
 MILLISECONDS = {"ga": 40.0, "pso": 60.0, "gauss-newton": 40.0, "adam": 60.0}
-"""A frame of 640 x 480 by the default preset on two cores, for a plan's estimate before anything was measured."""
+"""Typical time per 640 x 480 frame by method (default preset, two cores), for estimates before any measurement."""
 PRESET_FACTOR = {"default": 1.0, "fast": 0.8, "paper": 12.0, "wide": 6.0}
 PEER_MILLISECONDS = 120.0
 COMPILE_SECONDS = 20.0
@@ -19,27 +19,27 @@ PIXELS = 640 * 480
 
 
 class Finished(NamedTuple):
-    """What an experiment came to."""
+    """The outcome of an experiment."""
 
     rows: int
-    """New rows in the table."""
+    """Number of new rows in the table."""
     faults: list[str]
-    """A line for each batch that could not be run."""
+    """One line for each batch that could not be run."""
 
 
 def missing(plan: Plan, table: Table) -> list[Run]:
-    """The runs that the table does not have yet."""
+    """Return the runs that the table does not have yet."""
     done = table.done()
     return [run for run in plan.runs if run.id not in done]
 
 
 def fitted_batches(runs: Sequence[Run], largest: int, slots: int) -> list[Batch]:
-    """Batches as large as leaves none of the executor's slots without one."""
+    """Group runs into the largest batches, up to `largest` runs each, that still give every slot one."""
     return batches(runs, max(1, min(largest, -(-len(runs) // slots))))
 
 
 def estimate_seconds(runs: Sequence[Run], rows: Iterable[Mapping[str, Any]], slots: int) -> float:
-    """How long the runs will take, roughly: by the table's own times of the same label, else by `MILLISECONDS`."""
+    """Roughly estimate the runs' duration from the table's times of the same label, or else from `MILLISECONDS`."""
     measured: dict[str, list[float]] = {}
     for row in rows:
         if row[FRAMES_PER_SECOND]:
@@ -59,17 +59,17 @@ def run_experiment(
     on_pairs: Callable[[int], None] = lambda _: None,
     on_outcome: Callable[[Outcome], None] = lambda _: None,
 ) -> Finished:
-    """Run what the table does not have yet and append each row as soon as it is known.
+    """Run what the table does not have yet, and append each row as soon as it is known.
 
     Args:
-        plan: What is to be there in the end.
-        table: Where it goes; other processes may append to it meanwhile.
-        executor: Who runs it.
-        on_pairs: Hears of pairs that are done.
-        on_outcome: Hears of each batch when its rows are in the table.
+        plan: All runs that the table should have in the end.
+        table: Table to append to; other processes may append to it meanwhile.
+        executor: Runs the batches.
+        on_pairs: Called with the number of pairs just done.
+        on_outcome: Called with each batch's outcome once its rows are in the table.
 
     Raises:
-        GavoError: the table cannot be written.
+        GavoError: The table cannot be written.
     """
     todo = fitted_batches(missing(plan, table), plan.batch, executor.slots())
     rows, faults = 0, []

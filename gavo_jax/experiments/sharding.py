@@ -1,4 +1,4 @@
-"""The batch axis of one program over many devices: this machine's, or all that `jax.distributed` joins."""
+"""Alignment of a batch sharded over many devices: this machine's, or all that `jax.distributed` joins."""
 
 from typing import Any
 
@@ -30,11 +30,11 @@ def align_batch_sharded(
     keys: PRNGKeyArray | None = None,
     guesses: Float[Any, "b 4 4"] | None = None,
 ) -> Alignment:
-    """`align_batch` with its B pairs laid out over all devices, one program for all (`shard_map`).
+    """Align a batch as `align_batch` does, with its B pairs sharded over all devices in one program (`shard_map`).
 
-    Under `jax.distributed` every process calls it with the same arguments and gets the whole result. The pairs' results
-    agree with those of `align_batch` to rounding, since XLA orders the sums of another number of pairs otherwise; a
-    random search enlarges that, within what another seed would change.
+    Under `jax.distributed`, every process calls it with the same arguments and gets the whole result. Results agree
+    with `align_batch` up to rounding, since XLA's order of summation depends on the number of pairs. A random search
+    amplifies these differences, by no more than a change of seed would.
 
     Args:
         references: As in `align_batch`.
@@ -45,10 +45,10 @@ def align_batch_sharded(
         guesses: As in `align_batch`.
 
     Returns:
-        As `align_batch`, in NumPy arrays.
+        As in `align_batch`, in NumPy arrays.
 
     Raises:
-        GavoError: as `align_batch`.
+        GavoError: As in `align_batch`.
     """
     require_untraced(references, targets, camera, settings, keys, guesses)
     settings = as_settings(settings)
@@ -68,7 +68,7 @@ def align_batch_sharded(
 
 
 def _laid_out(rows: Any, mesh: Mesh) -> jax.Array:
-    """Rows over the devices; the last one is repeated until they divide evenly."""
+    """Shard rows over the devices, repeating the last row until they divide evenly."""
     rows = np.asarray(rows)
     missing = -len(rows) % mesh.size
     padded = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])

@@ -1,4 +1,4 @@
-"""What a results table says: median and spread of each method, and whether two of them differ."""
+"""Summary of a results table: median and spread of each method, and tests of whether two methods differ."""
 
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ Row = Mapping[str, Any]
 
 
 class Summary(NamedTuple):
-    """One method on one sequence, over its seeds."""
+    """Figures of one method on one sequence, over its seeds."""
 
     sequence: str
     label: str
@@ -22,19 +22,19 @@ class Summary(NamedTuple):
     drift: tuple[float, float, float] | None
     """Lower quartile, median and upper quartile of the drift, m/s; None where there is no ground truth."""
     rotation: float | None
-    """Median, deg/s."""
+    """Median of the rotational drift, deg/s; None where there is no ground truth."""
     per_frame: float | None
-    """Median of the error from frame to frame, m; None where there is no ground truth."""
+    """Median of the translational error per frame, m; None where there is no ground truth."""
     lost: int
-    """Lost pairs of the worst run."""
+    """Largest number of lost pairs in a run."""
     milliseconds: float
-    """Median over the runs of the machine's time per frame, decoding included."""
+    """Median over the runs of the wall time per frame, decoding included."""
     together: int
-    """Most runs that shared the machine, and its time."""
+    """Largest number of runs that shared the machine while they were timed."""
 
 
 class Comparison(NamedTuple):
-    """Two methods, paired by sequence and seed."""
+    """Comparison of two methods, paired by sequence and seed."""
 
     sequence: str
     first: str
@@ -43,11 +43,11 @@ class Comparison(NamedTuple):
     ratio: float
     """Median of first / second drift over the pairs."""
     p: float | None
-    """Two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero."""
+    """p-value of the two-sided Wilcoxon signed-rank test of the drifts' differences; None where all are zero."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Summary]:
-    """A summary of each sequence and label, in the order in which they come."""
+    """Summarise each sequence and label, in order of first appearance."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["sequence"], row["label"]), []).append(row)
@@ -73,13 +73,13 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
 
 
 def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparison]:
-    """Each two labels on each sequence, and over all where there are several; a single pair is no comparison.
+    """Compare every two labels on each sequence, and over all sequences if there are several.
 
-    A method that ran once on a sequence (it has no randomness) stands against every seed of the other.
+    A method that ran only once on a sequence is compared with every seed of the other. A single pair is not compared.
 
     Args:
-        rows: Of which a sequence's name stands for the same frames everywhere, and a label for the same settings.
-        earlier: Sequences that do not count among all: other frames of those that do.
+        rows: Rows in which a sequence's name always stands for the same frames, and a label for the same settings.
+        earlier: Sequences to leave out of the comparison over all, as earlier selections of frames.
     """
     drifts: dict[str, dict[str, dict[Any, float]]] = {}
     for row in rows:
