@@ -28,9 +28,9 @@ class Summary(NamedTuple):
     lost: int
     """Largest number of lost pairs in a run."""
     milliseconds: float
-    """Median over the runs of the wall time per frame, decoding included."""
+    """Median over the runs of the wall time per frame, decoding included; runs tracked together share it equally."""
     together: int
-    """Largest number of runs that shared the machine while they were timed."""
+    """Largest number of runs that were tracked together."""
 
 
 class Comparison(NamedTuple):
@@ -79,7 +79,7 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
 
     Args:
         rows: Rows in which a sequence's name always stands for the same frames, and a label for the same settings.
-        earlier: Sequences to leave out of the comparison over all, as earlier selections of frames.
+        earlier: Sequences of earlier versions of the experiment's file, left out of the comparison over all.
     """
     drifts: dict[str, dict[str, dict[Any, float]]] = {}
     for row in rows:

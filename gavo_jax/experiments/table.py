@@ -1,7 +1,7 @@
 """The results table: a folder of Parquet files, one row per run.
 
-A run's file is named by the run's hash, is written beside its place and renamed into it. So a row is there whole or not
-at all, writers at the same time need no lock, and a run that is done twice, by whomever, is in the table once.
+A run's file is named after the run's hash, written under a temporary name and then renamed. So a row is never partly
+written, concurrent writers need no lock, and a run that is done twice is in the table once.
 """
 
 import json
@@ -17,11 +17,11 @@ from gavo_jax.output.files import prepare_folder
 
 SUFFIX = ".parquet"
 ROWS = "runs"
-"""Folder of the table within an experiment's folder."""
+"""Name of the table's folder within an experiment's folder."""
 
 TEXT, WHOLE, REAL, FLAG = "string", "int64", "float64", "bool"
 COLUMN_OF = {str: TEXT, int: WHOLE, float: REAL, float | None: REAL}
-"""By the type of a figure."""
+"""Column type by the Python type of a figure."""
 COLUMNS = {
     "run": TEXT,
     "experiment": TEXT,
@@ -41,34 +41,35 @@ COLUMNS = {
     "host": TEXT,
     "finished": TEXT,
 }
-"""Columns and their types: the keys of metrics.json; `runs_together`, the runs that shared the machine while the times
-were taken; `configuration` and `versions` as JSON; the commit of the package's own checkout, where it is one; UTC."""
+"""Columns and their types. The metrics are those of metrics.json; `runs_together` is the number of runs that shared the
+machine while it was timed. `configuration` and `versions` are JSON; `git_commit` is that of the package's own checkout,
+if it is in one; `finished` is in UTC."""
 
 
 MAPPINGS = ("configuration", "versions")
 NEEDED = ("sequence", "method", "label", "lost_pairs", FRAMES_PER_SECOND, "runs_together", "pixels", *MAPPINGS)
-"""What no row is without."""
+"""Columns that have a value in every row."""
 
 
 class Table:
-    """The table in an experiment's folder."""
+    """The results table in an experiment's folder."""
 
     def __init__(self, folder: str | Path) -> None:
-        """Name the folder; nothing is made yet."""
+        """Set the experiment's folder, without creating anything."""
         self.folder = Path(folder) / ROWS
 
     def done(self) -> set[str]:
-        """Hashes of the runs that are in the table."""
+        """Return the hashes of the runs in the table."""
         return {path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")}
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Add a row, atomically; one of the same run is replaced.
+        """Add a row atomically, replacing any row of the same run.
 
         Args:
             row: A value or None for each of `COLUMNS`; mappings become JSON.
 
         Raises:
-            GavoError: the disk is full, or the like; pyarrow is missing.
+            GavoError: The table cannot be written, or pyarrow is missing.
         """
         parquet, schema = _parquet(), _schema()
         prepare_folder(self.folder)
@@ -84,10 +85,10 @@ class Table:
             raise GavoError(f"{self.folder}: cannot be written to: {error.strerror or error}") from None
 
     def read(self) -> list[dict[str, Any]]:
-        """Return all rows, in the order of their hashes.
+        """Return all rows, ordered by hash.
 
         Raises:
-            GavoError: there is no table, a file of it is damaged, pyarrow is missing.
+            GavoError: There is no table, one of its files is damaged, or pyarrow is missing.
         """
         parquet = _parquet()
         if not self.done():
@@ -106,7 +107,7 @@ class Table:
 
 
 def _fault(rows: list[dict[str, Any]], run: str) -> str:
-    """What is wrong with the rows of a run's file; empty where nothing is."""
+    """Describe what is wrong with the rows of a run's file; empty if nothing is."""
     if len(rows) != 1:
         return f"{len(rows)} rows"
     (row,) = rows

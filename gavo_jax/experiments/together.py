@@ -1,8 +1,8 @@
-"""Many runs over one sequence together: each frame is decoded once, for all of them.
+"""Tracks one sequence by many runs together, decoding each frame once for all of them.
 
-On a CPU, which one run's program already fills, the runs of a frame are calls of that one program: their numbers are
-those of `track`, bit for bit. An accelerator gets all runs of a frame as one call, `vmap` over their states, keys,
-solvers and options, the runs laid out over all local devices; a rate that differs from run to run compiles nothing.
+On a CPU, which a single run's program already keeps busy, each run calls that program: results equal those of `track`
+bit for bit. On accelerators, all runs of a frame are one call, a `vmap` over their states, keys, solvers and options,
+sharded over the local devices. Rates that differ between runs don't trigger another compilation.
 """
 
 import math
@@ -46,12 +46,12 @@ def track_together(
     """Track one sequence by several drivers, frame by frame.
 
     Args:
-        sequence: Its frames are decoded once, in a thread, while the one before is aligned.
-        odometries: The drivers, fresh ones, of the sequence's camera.
-        on_frame: Called after each frame with all runs done.
+        sequence: Sequence to track; each frame is decoded once, in a thread, while the previous one is aligned.
+        odometries: Fresh drivers for the sequence's camera.
+        on_frame: Called once all runs are done with a frame.
 
     Returns:
-        The steps of each driver; those of a driver whose policy is to stop end with its first lost frame.
+        The steps of each driver; if its policy is to stop when lost, they end with its first lost frame.
 
     Raises:
         FrameError: the first frame cannot be read.
@@ -72,13 +72,13 @@ def track_stacked(
     seeds: Sequence[int],
     on_frame: Callable[[], None] | None = None,
 ) -> list[list[Step]]:
-    """Track one sequence by R runs of one program, all runs of a frame in one call on the device.
+    """Track one sequence by R runs of one program, with one call on the device per frame.
 
-    Results agree with `track` to rounding, which a random search may enlarge.
+    Results agree with `track` up to rounding, which a random search may amplify.
 
     Args:
         sequence: As in `track_together`.
-        settings: Of each run, of one structure: what differs are rates (see `program_of`).
+        settings: Settings of each run; they may differ only in what doesn't change the program (see `program_of`).
         seeds: Seed of each run.
         on_frame: As in `track_together`.
 
@@ -93,7 +93,7 @@ def track_stacked(
 
 
 def program_of(settings: Settings) -> Any:
-    """What decides, beside the camera, the compiled program of a run: runs of equal (hashable) answers share one."""
+    """A hashable key of a run's compiled program: runs with equal keys and cameras share one."""
     return jax.tree.structure(_of_program(settings))
 
 
@@ -118,7 +118,7 @@ def _drive(
 
 
 def _of_program(settings: Settings) -> Settings:
-    """What the program for a frame takes of a run's settings."""
+    """The settings of a run that its compiled program depends on or takes as inputs."""
     return replace(settings, odometry=traced_part(settings.odometry))
 
 
@@ -132,7 +132,7 @@ def _track_stack(
     camera: Camera,
     settings: Settings,
 ) -> tuple[TrackerState, Alignment]:
-    """One frame of R runs: everything but the images and the camera has a leading axis R."""
+    """Track one frame by R runs: all arguments except the images and the camera have a leading axis R."""
 
     def one(state: TrackerState, clock: Clock, key: Any, settings: Settings) -> Any:
         parts = (settings.solver, settings.alignment, settings.odometry)
@@ -142,21 +142,22 @@ def _track_stack(
 
 
 class _Made(NamedTuple):
-    """One run's attempt at a frame, made with the others'."""
+    """One run's attempt at a frame, from the call for all runs."""
 
     state: TrackerState
     """The run's state before the frame."""
     frame: Frame
-    """The new frame."""
+    """The frame that was aligned."""
     clock: Clock
-    """When the new frame was taken."""
+    """Timing of the frame."""
     result: Alignment
     after: Callable[[], TrackerState]
-    """Gives the state after it: a row of the new stack."""
+    """Returns the run's state after the frame, a row of the new stack."""
 
     def answers(self, state: TrackerState, frame: Frame, clock: Clock) -> bool:
-        """Whether it is what a search would find; since it was made, depth may have been left out, or the motion be
-        thought to have taken another time.
+        """Whether the attempt was made from exactly these inputs.
+
+        The driver may have changed them since, by removing depth or correcting the elapsed time.
         """
         is_same_frame = frame.grey is self.frame.grey and frame.depth is self.frame.depth
         return state is self.state and is_same_frame and clock == self.clock
@@ -164,23 +165,23 @@ class _Made(NamedTuple):
 
 @dataclass
 class _Stacked:
-    """The search of one run of a stack: its first attempt at a frame was made with the others'."""
+    """The search of one run of a stack: the first attempt at each frame comes from the call for all runs."""
 
     search: Search
     made: _Made | None = None
-    """That attempt; None where there is none, and the run is on its own."""
+    """The attempt from that call; None if there is none, so that the run searches by itself."""
 
     def warm_up(self) -> float:
-        """The stack's program compiles with its first frame."""
+        """Return 0: the stack's program is compiled at its first aligned frame."""
         return 0.0
 
     def start(self, frame: Frame) -> TrackerState:
-        """Start as a single run does, whose program the stack has no other use for."""
+        """Start without the program of a single run, which the stack doesn't otherwise need."""
         settings = self.search.settings
         return first_state(frame.grey, frame.depth, self.search.camera, settings.solver, settings.alignment)
 
     def align(self, state: TrackerState, frame: Frame, clock: Clock) -> Attempt:
-        """The attempt that was made, if it is the one that is asked for."""
+        """Return the stack's attempt if it was made from the same inputs; otherwise search."""
         if self.made is None or not self.made.answers(state, frame, clock):
             return self.search.align(state, frame, clock)
         return self.search.judged(state, self.made.after(), self.made.result, frame, clock)
@@ -191,7 +192,7 @@ class _Stacked:
 
 
 class _Stack:
-    """R lanes whose states are rows of one stack on the device."""
+    """R runs, or lanes, whose states are rows of one stack on the device."""
 
     def __init__(self, camera: Camera, settings: Sequence[Settings], seeds: Sequence[int]) -> None:
         self._recorded, self._camera = camera, camera.rectified()
@@ -206,7 +207,7 @@ class _Stack:
         self._settings = self._rows([_of_program(own) for own in settings])
 
     def register(self, frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
-        """Track one more frame by all lanes; each decides by itself what becomes of it."""
+        """Track the next frame by all lanes; each decides for itself whether to accept the result."""
         milliseconds = 0.0
         if isinstance(frame, Frame):
             frame = rectified(frame, self._recorded)
@@ -218,11 +219,11 @@ class _Stack:
         steps = [lane.register(frame, timestamp) for lane in self.lanes]
         for stacked in self._searches:
             stacked.made = None
-        # every lane has waited for the whole stack
+        # Every lane waited for the whole stack.
         return [step and replace(step, milliseconds=step.milliseconds + milliseconds) for step in steps]
 
     def _attempt(self, frame: Frame, before: Sequence[Progress]) -> None:
-        """Align a frame by all lanes in one call; each lane keeps its own result and a way to its state."""
+        """Align a frame by all lanes in one call; each lane keeps its result and a function that returns its state."""
         numbered = [progress._replace(last_index=progress.last_index + 1) for progress in before]
         clocks = [progress.clock(frame) for progress in numbered]
         keys = jnp.stack([stacked.search.key for stacked in self._searches])
@@ -235,13 +236,13 @@ class _Stack:
             stacked.made = _Made(states[i], frame, clocks[i], result, partial(_row, after, i))
 
     def _rows(self, values: Sequence[Any]) -> Any:
-        """Stack R pytrees of numbers, laid out over the devices."""
+        """Stack R pytrees of numbers and shard them over the devices."""
         stacked = jax.tree.map(lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *values)
         return jax.device_put(stacked, self._sharding)
 
 
 def _tracker_of(state: Any) -> TrackerState:
-    """The tracker's part of a lane's state, which may know of bodies too."""
+    """The tracker's part of a lane's state, which may also hold bodies."""
     return state if isinstance(state, TrackerState) else state.tracker
 
 
@@ -255,7 +256,7 @@ def _row(stack: Any, i: int) -> TrackerState:
 
 
 def _over_devices(rows: int) -> NamedSharding:
-    """The leading axis laid out over as many of the local devices as divide it."""
+    """Sharding of a leading axis over the greatest number of local devices that divides both."""
     devices = jax.local_devices()
     count = math.gcd(rows, len(devices))
     return NamedSharding(Mesh(np.array(devices[:count]), ("runs",)), PartitionSpec("runs"))
