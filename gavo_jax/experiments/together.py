@@ -256,7 +256,7 @@ def _row(stack: Any, i: int) -> TrackerState:
 
 
 def _over_devices(rows: int) -> NamedSharding:
-    """Sharding of a leading axis over the greatest number of local devices that divides both."""
+    """Sharding of a leading axis over gcd(rows, number of devices) of the local devices."""
     devices = jax.local_devices()
     count = math.gcd(rows, len(devices))
     return NamedSharding(Mesh(np.array(devices[:count]), ("runs",)), PartitionSpec("runs"))

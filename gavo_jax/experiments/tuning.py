@@ -1,4 +1,4 @@
-"""Settings searched by Optuna for small drift and little time at once."""
+"""Search of settings with Optuna, minimising drift and time together."""
 
 import json
 import math
@@ -30,21 +30,21 @@ KEYS = ("name", "output", "seeds", "sequences", "method", "preset", "trials", "s
 RANGE_KEYS = ("low", "high", "step", "log")
 TRIALS = 50
 CONFIGURATION = "configuration"
-"""Attribute of a study: what it is of, as JSON."""
+"""Attribute of a study that holds its configuration as JSON."""
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What a tuning file asks for.
+    """The contents of a tuning file.
 
     Attributes:
-        name: Of the study.
-        folder: Where the default storage and the front go.
-        parts: Frames that are tracked by every trial.
-        seeds: Each trial tracks them once a seed.
+        name: Name of the study.
+        folder: Folder for the default storage and the Pareto front.
+        parts: Frames that every trial tracks.
+        seeds: Seeds; each trial tracks all frames once per seed.
         method: One of `presets.methods()`.
-        preset: What all other settings are taken from.
-        trials: Trials that the study is to hold.
+        preset: Preset that supplies all settings outside `space`.
+        trials: Number of finished trials to reach.
         space: By dotted name of a hyperparameter, a list of choices or a table of `low`, `high`, `step`, `log`.
     """
 
@@ -59,7 +59,7 @@ class Tuning:
 
 
 class Choice(NamedTuple):
-    """A trial that no other one beats in both drift and time."""
+    """A trial on the Pareto front: no other one is better in drift or time without being worse in the other."""
 
     trial: int
     drift: float
@@ -70,10 +70,10 @@ class Choice(NamedTuple):
 
 
 def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
-    """Read a tuning file and check all of it.
+    """Read a tuning file and check it completely.
 
     Raises:
-        GavoError: names the file, the key and the fault.
+        GavoError: The message names the file, the key and the fault.
     """
     path = Path(path)
     table = read_toml(path)
@@ -111,14 +111,14 @@ def tune(
     """Bring a study up to a number of finished trials and return its Pareto front, fastest first.
 
     Args:
-        tuning: What is tuned.
-        storage: Any of Optuna's storages; a study of the same name in it is gone on with, by many machines at once.
-        trials: Finished trials that the study is to hold.
-        on_trial: Hears of each finished trial: number, drift, milliseconds.
+        tuning: Contents of the tuning file.
+        storage: Any Optuna storage. A study of the same name in it is continued; several machines may share it.
+        trials: Number of finished trials to reach.
+        on_trial: Called after each finished trial with its number, drift and milliseconds.
 
     Raises:
-        GavoError: no ground truth over a second of a sequence, the storage cannot be used, or its study of that name is
-            of other frames or settings; Optuna is missing.
+        GavoError: A sequence has no ground truth over a second, every trial lost the camera, Optuna is missing, the
+            storage cannot be used, or its study of that name has other frames or settings.
     """
     try:
         import optuna
@@ -149,7 +149,7 @@ def tune(
             settings = override(start, values, f"trial {trial.number}")
             drift, milliseconds = interruptible(partial(measure, sequences, settings, tuning.seeds))
         except BaseException:
-            with suppress(Exception):  # a storage that fails has been told of, or will be
+            with suppress(Exception):  # a failing storage is reported elsewhere
                 study.tell(trial, state=optuna.trial.TrialState.FAIL)
             raise
         with _storage_faults(told):
@@ -158,13 +158,13 @@ def tune(
 
 
 def without_password(storage: str) -> str:
-    """A storage's address as it may be shown."""
+    """Return a storage's address with the password masked, for display."""
     return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:…@", storage)
 
 
 @contextmanager
 def _storage_faults(storage: str) -> Iterator[None]:
-    """Refuse a storage that cannot be used: what a damaged or altered one makes Optuna raise has no end."""
+    """Turn any exception of Optuna into a GavoError: a damaged storage can raise almost anything."""
     try:
         yield
     except GavoError:
@@ -174,7 +174,7 @@ def _storage_faults(storage: str) -> Iterator[None]:
 
 
 def _configuration(tuning: Tuning, sequences: Sequence[FrameSequence], start: Settings) -> dict[str, Any]:
-    """All that decides what a trial of a study is: which settings are tried, from where, on which frames."""
+    """Everything that defines a study: its search space, the settings it starts from, its seeds and its frames."""
     parts = [frames_of(part.name, sequence) for part, sequence in zip(tuning.parts, sequences, strict=True)]
     return describe(
         {
@@ -189,7 +189,7 @@ def _configuration(tuning: Tuning, sequences: Sequence[FrameSequence], start: Se
 
 
 def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> None:
-    """Write down what a new study is of; of another one, raise GavoError that names the first difference."""
+    """Record the configuration of a new study; raise GavoError if an existing one has a different configuration."""
     kept = study.user_attrs.get(CONFIGURATION)
     if kept is None and not study.get_trials(deepcopy=False):
         study.set_user_attr(CONFIGURATION, json.dumps(configuration))
@@ -208,7 +208,7 @@ def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> 
 
 
 def _refuse_without_drift(name: str, sequence: FrameSequence) -> None:
-    """Refuse a sequence that no drift can be told of, before a trial is made of it."""
+    """Raise GavoError if no drift can be computed on a sequence, before any trial."""
     lasts = float(np.ptp(sequence.timestamps))
     if sequence.ground_truth is None:
         raise GavoError(f"{name}: no ground truth, and so no drift to tune by")
@@ -217,11 +217,13 @@ def _refuse_without_drift(name: str, sequence: FrameSequence) -> None:
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:
-    """Geometric means of drift (m/s) and of the median time per pair (ms), run by run: nothing shares the machine. The
-    drift is infinite where the camera was lost before a second of any stretch was over.
+    """Return the geometric means of drift (m/s) and of the median time per pair (ms).
+
+    Runs are made one at a time, so that none shares the machine. The drift is infinite if the camera is lost before any
+    stretch lasts a second.
 
     Raises:
-        GavoError: no ground truth over a second of a sequence.
+        GavoError: A sequence has no ground truth over a second.
     """
     figures = []
     for sequence in sequences:
@@ -236,7 +238,7 @@ def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int
 
 
 def _tracked(tuning: Tuning, front: list[Choice]) -> list[Choice]:
-    """The choices of a front that do not lose the camera; one that does may be the fastest of all."""
+    """Return the choices with a finite drift; raise GavoError if every trial lost the camera."""
     kept = [choice for choice in front if np.isfinite(choice.drift)]
     if not kept:
         raise GavoError(f"{tuning.name}: every trial lost the camera within a second: no drift to choose by")
@@ -248,7 +250,7 @@ def _finished(optuna: Any, study: Any) -> list[Any]:
 
 
 def _bounds(place: str, spec: Any) -> list[Any]:
-    """The values that have to be possible: all choices, or both ends of a range."""
+    """Check a search space entry and return the values to validate: all choices, or both ends of a range."""
     if isinstance(spec, list) and spec:
         return spec
     if not isinstance(spec, Mapping):
@@ -271,7 +273,7 @@ def _suggest(trial: Any, key: str, spec: Any, whole: bool) -> Any:
     if isinstance(spec, list):
         return trial.suggest_categorical(key, spec)
     low, high, step, log = spec["low"], spec["high"], spec.get("step"), spec.get("log", False)
-    if step is not None:  # the last value that a step leads to
+    if step is not None:  # the last value reached by whole steps
         high = low + step * math.floor((high - low) / step + 1e-9)
     if whole:
         return trial.suggest_int(key, low, high, step=step or 1, log=log)

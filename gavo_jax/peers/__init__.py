@@ -1,1 +1,1 @@
-"""Other libraries' odometries in the same terms, behind the same driver."""
+"""Odometries of other libraries (peers), behind this project's interface and driver."""

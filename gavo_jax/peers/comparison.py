@@ -1,4 +1,4 @@
-"""Odometries of other libraries behind this project's driver, so that all are timed, chained and judged alike."""
+"""Runs peers by this project's driver, so that all methods are timed, chained and evaluated alike."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,24 +19,24 @@ from gavo_jax.status import AlignmentStatus
 
 @dataclass(frozen=True)
 class PeerAligner:
-    """A peer as an aligner: frame to frame, from a zero guess, no second try.
+    """Adapts a peer to an aligner: from frame to frame, without a prior or a second attempt.
 
-    A pair that the peer calls failed is unusable, as one is whose status is not `OK`. Of its alignments only
-    `target_T_reference` and `status` mean something.
+    A pair on which the peer fails is unusable, and its status is `NOT_FINITE`. Only `target_T_reference` and `status`
+    of the alignments are meaningful.
     """
 
     peer: Peer
 
     def warm_up(self) -> float:
-        """Nothing is compiled."""
+        """Return 0: nothing is compiled."""
         return 0.0
 
     def start(self, frame: Frame) -> Any:
-        """What the peer makes of a frame before it is aligned."""
+        """Return the first frame, prepared by the peer."""
         return self.peer.prepare(frame)
 
     def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
-        """Align as the peer does it."""
+        """Prepare a frame and align it to the previous one with the peer."""
         del clock
         prepared = self.peer.prepare(frame)
         found = self.peer.align(state, prepared)
@@ -45,16 +45,16 @@ class PeerAligner:
         return Attempt(prepared, result, found.success)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """No motion: a peer keeps none."""
+        """Return the identity: a peer has no motion model."""
         del state, elapsed
         return np.eye(4)
 
 
 def peer_odometry(name: str, camera: Camera) -> Odometry:
-    """The driver with the peer of that name (`peers.registry.PEERS`), for frames of a rectified camera.
+    """Return a driver of the named peer (`peers.registry.PEERS`) for frames of a rectified camera.
 
     Raises:
-        GavoError: no such peer, or its library cannot be imported.
+        GavoError: There is no such peer, or its library cannot be imported.
     """
     settings = Settings(odometry=OdometryOptions(reference="previous", prior=False, recover=False))
     return Odometry(camera, settings, aligner=PeerAligner(make_peer(name, camera)))

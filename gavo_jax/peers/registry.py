@@ -1,9 +1,9 @@
-"""Odometries of other libraries by name, to set beside this one in the same tables.
+"""Odometries of other libraries by name, for comparison with this project's own.
 
-Every peer answers in this project's terms: `target_T_reference`, which maps points of the reference camera into the
-target camera, in metres. Each aligns two single frames from a zero guess, but for kiss-icp, which keeps a map of the
-frames before. Each runs at its library's default settings; where one differs, the docstring of the class names it with
-the reason. A library beside OpenCV is imported only when one of its peers is made.
+Every peer returns `target_T_reference`, which maps points of the reference camera into the target camera, in metres.
+Each aligns two single frames from a zero guess, except kiss-icp, which keeps a map of earlier frames. Each uses its
+library's default settings, apart from those listed in its class's docstring. Libraries other than OpenCV are imported
+only when one of their peers is made.
 """
 
 import importlib.util
@@ -27,9 +27,9 @@ class PeerInfo:
     """A peer that can be asked for by name.
 
     Attributes:
-        name: key in `PEERS`.
-        module: what must be importable.
-        make: builds the peer for a camera.
+        name: Key in `PEERS`.
+        module: Module that must be importable.
+        make: Builds the peer for a camera.
     """
 
     name: str
@@ -38,7 +38,7 @@ class PeerInfo:
 
     @property
     def installed(self) -> bool:
-        """Whether its library is installed."""
+        """Whether the peer's library is installed."""
         return importlib.util.find_spec(self.module) is not None
 
 
@@ -79,14 +79,14 @@ PEERS: dict[str, PeerInfo] = {
         PeerInfo("kiss-icp", "kiss_icp", lambda camera: KissIcpPeer("kiss-icp", camera)),
     )
 }
-"""Every peer by the name that the command line knows."""
+"""All peers by their names on the command line."""
 
 
 def make_peer(name: str, camera: Camera) -> Peer:
-    """Return the peer of that name, ready for rectified frames of that camera: no peer models lens distortion.
+    """Return the named peer, ready for rectified frames of the camera: no peer models lens distortion.
 
     Raises:
-        GavoError: the name is not in `PEERS`, or its library cannot be imported.
+        GavoError: The name is not in `PEERS`, or its library cannot be imported.
     """
     if name not in PEERS:
         raise GavoError(f"unknown method {name!r}: the peers are {', '.join(PEERS)}")
