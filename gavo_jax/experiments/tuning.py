@@ -149,7 +149,7 @@ def tune(
             settings = override(start, values, f"trial {trial.number}")
             drift, milliseconds = interruptible(partial(measure, sequences, settings, tuning.seeds))
         except BaseException:
-            with suppress(Exception):  # a failing storage is reported elsewhere
+            with suppress(Exception):  # a failing storage has been reported, or will be
                 study.tell(trial, state=optuna.trial.TrialState.FAIL)
             raise
         with _storage_faults(told):

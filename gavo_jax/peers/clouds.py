@@ -1,6 +1,6 @@
-"""Odometries of point clouds, which see the depth alone: small_gicp and kiss-icp.
+"""Point-cloud odometries as peers, which use the depth alone: small_gicp and kiss-icp.
 
-Their defaults are those of a laser scanner that sees a hundred metres. Each class names what differs and why.
+Their defaults suit a laser scanner with a range of a hundred metres. Each class lists the settings that differ.
 """
 
 import importlib
@@ -17,15 +17,15 @@ from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 from gavo_jax.trajectory import inverse
 
 NEAREST, FARTHEST = 0.4, 5.0
-"""Metres between which a depth camera of structured light measures well."""
+"""Range in which a structured-light depth camera measures well, metres."""
 Cloud = Float64[np.ndarray, "n 3"]
 
 
 def point_cloud(frame: Frame, camera: Camera) -> Cloud:
-    """The points of a frame's depth readings between `NEAREST` and `FARTHEST`, metres, in its camera.
+    """Back-project a frame's depth readings between `NEAREST` and `FARTHEST` to points in its camera, metres.
 
     Raises:
-        GavoError: the frame is not of the camera's size.
+        GavoError: The frame's size differs from the camera's.
     """
     check_size(frame, camera)
     metres = frame.depth / float(camera.depth_scale)
@@ -36,12 +36,12 @@ def point_cloud(frame: Frame, camera: Camera) -> Cloud:
 class SmallGicpPeer:
     """`small_gicp.align`: generalised ICP of two point clouds.
 
-    Settings that differ from the defaults, which are for a laser scanner's clouds:
-    - downsampling to 2 cm (default 25 cm) and correspondences within 10 cm (default 1 m), as suits a desk;
-    - 20 neighbours for a point's covariance (default 10), as in the library's own examples;
+    Settings that differ from the defaults, which suit a laser scanner:
+    - downsampling to 2 cm (default 25 cm) and correspondences within 10 cm (default 1 m), to suit a desk;
+    - 20 neighbours per point for its covariance (default 10), as in the library's own examples;
     - 50 iterations at most (default 20), two threads (default one).
 
-    `success` is that the iteration converged, which says nothing of where to.
+    `success` means that the iteration converged, possibly to a wrong motion.
     """
 
     RESOLUTION, CORRESPONDENCE, NEIGHBOURS, ITERATIONS, THREADS = 0.02, 0.1, 20, 50, 2
@@ -54,10 +54,10 @@ class SmallGicpPeer:
         self._camera = camera
 
     def prepare(self, frame: Frame) -> Any:
-        """A downsampled cloud with covariances, and its tree.
+        """Return the downsampled cloud with covariances and its k-d tree; None if it has too few points.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         cloud = point_cloud(frame, self._camera)
         if len(cloud) < self.NEIGHBOURS:
@@ -81,17 +81,17 @@ class SmallGicpPeer:
 
 
 class KissIcpPeer:
-    """`kiss_icp.kiss_icp.KissICP`: point-to-point ICP of a cloud with a map of the clouds before.
+    """`kiss_icp.kiss_icp.KissICP`: point-to-point ICP of a cloud against a map of earlier clouds.
 
-    Frames that follow one another are registered in one map, which is what the method is; a pair that does not go on
-    from the last one starts a new map.
+    Successive frames are registered to the same map, as the method intends. A pair whose reference is not the last
+    target starts a new map.
 
-    Settings that differ from the defaults, which are for a laser scanner on a car:
+    Settings that differ from the defaults, which suit a laser scanner on a car:
     - range 0.4 to 5 m (default 0 to 100 m), and voxels of 3 cm (default a hundredth of the range);
-    - thresholds of 0.2 m at first and 0.02 m of least motion (defaults 2 m and 0.1 m), in proportion;
-    - no deskewing: a depth image has no stamp per point.
+    - initial threshold of 0.2 m and minimum motion of 0.02 m (defaults 2 m and 0.1 m), scaled down likewise;
+    - no deskewing: a depth image has no timestamp per point.
 
-    There is no flag: `success` is that both frames have points.
+    kiss-icp returns no flag: `success` means that both frames have points.
     """
 
     VOXEL, THRESHOLD, LEAST_MOTION = 0.03, 0.2, 0.02
@@ -106,15 +106,15 @@ class KissIcpPeer:
         self._last: Cloud | None = None
 
     def prepare(self, frame: Frame) -> Cloud:
-        """The frame's cloud.
+        """Return the frame's point cloud.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         return point_cloud(frame, self._camera)
 
     def align(self, reference: Cloud, target: Cloud) -> PeerResult:
-        """Align a frame with the one before, or two frames from a zero guess."""
+        """Align the target to the map; a reference other than the last target first starts a new map."""
         if not len(reference) or not len(target):
             self._last = None
             return failure()

@@ -45,7 +45,7 @@ class PeerAligner:
         return Attempt(prepared, result, found.success)
 
     def predict(self, state: Any, elapsed: float) -> Float64[np.ndarray, "4 4"]:
-        """Return the identity: a peer has no motion model."""
+        """Return the identity: a peer offers no prediction."""
         del state, elapsed
         return np.eye(4)
 

@@ -1,4 +1,4 @@
-"""Features and a pose from matches as a peer: what one writes with OpenCV where two frames lie far apart."""
+"""Feature matching and PnP as a peer: the usual OpenCV pipeline for frames that are far apart."""
 
 import cv2
 
@@ -11,22 +11,22 @@ from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 class FeaturePeer:
     """Keypoints, ratio test, `cv2.solvePnPRansac` and `cv2.solvePnPRefineLM`, with the settings of `features`.
 
-    `success` is false where fewer than `features.FEWEST` matches agree on a motion. Repeated structure and a handful of
-    chance matches can agree on a wrong one.
+    `success` is false if a motion has fewer than `features.FEWEST` inliers. Repeated structure or a few chance matches
+    can agree on a wrong motion.
     """
 
     def __init__(self, name: str, camera: Camera, kind: FeatureKind) -> None:
-        """Set up; kind is what finds and describes the keypoints."""
+        """Set up the peer; kind selects the keypoint detector and descriptor."""
         self.name = name
         self.versions = {"opencv": cv2.__version__}
         self._camera = camera
         self._kind: FeatureKind = kind
 
     def prepare(self, frame: Frame) -> Features:
-        """Find the keypoints of one frame.
+        """Detect and describe the keypoints of a frame.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         check_size(frame, self._camera)
         return detect(frame.grey, frame.depth, self._camera, self._kind)

@@ -1,4 +1,4 @@
-"""Open3D's RGB-D odometries as peers: its legacy pipeline and the one on tensors."""
+"""Open3D's RGB-D odometries as peers: the legacy and the tensor pipeline."""
 
 from typing import Any
 
@@ -14,24 +14,24 @@ from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 class Open3DLegacyPeer:
     """`open3d.pipelines.odometry.compute_rgbd_odometry`: Gauss-Newton on three levels.
 
-    The colour term is that of Steinbrücker et al. 2011, the hybrid one that of Park et al. 2017.
+    The colour term is from Steinbrücker et al. 2011, the hybrid term from Park et al. 2017.
 
     Settings that differ from the defaults:
     - depth scale: the camera's (default 1000);
-    - the cut-off of the image constructor (default 3 m): the odometry's own default of 4 m for the hybrid term; for
-      the colour term both are open at 10 m, as for OpenCV's photometric kinds.
+    - largest depth: 4 m for the hybrid term and 10 m for the colour term, as for OpenCV's photometric kinds (defaults
+      3 m in the image's constructor, 4 m in the odometry).
 
-    `success` is Open3D's flag, which is true even for frames without any depth.
+    `success` is Open3D's own flag, which is true even for frames without any depth.
     """
 
     def __init__(self, name: str, camera: Camera, term: str, max_depth: float) -> None:
         """Set up the odometry.
 
         Args:
-            name: the peer's name.
-            camera: of the frames, rectified.
-            term: class of `open3d.pipelines.odometry` that gives the Jacobian.
-            max_depth: metres; readings beyond are not used.
+            name: Name of the peer.
+            camera: Rectified camera of the frames.
+            term: Class in `open3d.pipelines.odometry` that computes the Jacobian.
+            max_depth: Largest depth used, metres.
         """
         self.name = name
         self._open3d = import_open3d("peers")
@@ -46,10 +46,10 @@ class Open3DLegacyPeer:
         )
 
     def prepare(self, frame: Frame) -> Any:
-        """Convert one frame to Open3D's float intensity and depth.
+        """Convert a frame to Open3D's float intensity and depth.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         check_size(frame, self._camera)
         image = self._open3d.geometry.Image
@@ -77,7 +77,7 @@ class Open3DTensorPeer:
     - four levels of at most 20 iterations; the default three levels of 10, 5 and 3, coarse to fine, stop well short of
       convergence with the intensity and hybrid methods.
 
-    The library has no flag: `success` is false where it raises its error of a singular system.
+    Open3D returns no flag here: `success` is false if it raises an error for a singular system.
     """
 
     ITERATIONS = (20, 20, 20, 20)  # coarse to fine
@@ -94,10 +94,10 @@ class Open3DTensorPeer:
         self._intrinsics = self._open3d.core.Tensor(camera.matrix)
 
     def prepare(self, frame: Frame) -> Any:
-        """Copy one frame into Open3D's tensors; the grey becomes three equal channels, which Open3D expects.
+        """Copy a frame to Open3D tensors, with the grey image repeated as the three channels that Open3D expects.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         check_size(frame, self._camera)
         image, tensor = self._open3d.t.geometry.Image, self._open3d.core.Tensor

@@ -10,18 +10,18 @@ from gavo_jax.peers.base import PeerResult, check_size, result_of
 
 
 class OpenCVPeer:
-    """`cv2.Odometry`: iteratively reweighted Gauss-Newton on four levels, the library's algorithm `COMMON`.
+    """`cv2.Odometry`: iteratively reweighted Gauss-Newton on four levels, OpenCV's algorithm `COMMON`.
 
     Settings that differ from the defaults:
     - camera matrix: the camera's (default: a generic one for 640×480);
-    - largest translation and rotation of a result: open (defaults 0.15 m and 15 degrees). They only turn a finished
-      result into a failure;
-    - largest depth (default 4 m): open for the two photometric kinds, whose rotation far readings hold best; point to
-      plane alone keeps the default, because the sensor's noise grows with z²;
-    - readings of `DEPTH_LIMIT` and beyond are dropped: OpenCV takes a depth image with any value above 10 for one in
-      1/5000 m and divides all of it, so that one far reading would spoil the frame without a word.
+    - largest translation and rotation: unlimited (defaults 0.15 m and 15 degrees). They only turn a finished result
+      into a failure;
+    - largest depth (default 4 m): `DEPTH_LIMIT` for the two photometric kinds, where far readings constrain rotation
+      best. Point-to-plane keeps the default, because the sensor's noise grows with z²;
+    - readings of `DEPTH_LIMIT` or more are dropped. If any value is above 10, OpenCV assumes units of 1/5000 m and
+      divides the whole image: a single far reading would silently spoil the frame.
 
-    `success` is false only where too few pixels match to solve for a motion at all: a diverged result counts as one.
+    `success` is false only if too few pixels match to solve for a motion: a diverged result counts as a success.
     """
 
     DEPTH_LIMIT = 10.0  # metres
@@ -40,10 +40,10 @@ class OpenCVPeer:
         self._odometry = cv2.Odometry(kind, settings, cv2.ODOMETRY_ALGO_TYPE_COMMON)
 
     def prepare(self, frame: Frame) -> cv2.OdometryFrame:
-        """Build pyramids, gradients and normals of one frame.
+        """Build the pyramids, gradients and normals of a frame.
 
         Raises:
-            GavoError: the frame is not of the camera's size.
+            GavoError: The frame's size differs from the camera's.
         """
         check_size(frame, self._camera)
         metres = frame.depth.astype(np.float32) / np.float32(self._camera.depth_scale)
