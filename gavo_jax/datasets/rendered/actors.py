@@ -1,4 +1,4 @@
-"""Bodies for the rendered room: boxes that sway, and a figure that walks; each looks, moves and starts by its seed."""
+"""Bodies for the rendered room: swaying boxes and a walking figure, with seeded appearance, size and phase."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gavo_jax.errors import GavoError
 
 _STREAM = 3
 BOX_PLACES = ((0.0, 1.0), (0.75, 1.0), (-0.75, 1.0), (0.4, 1.6), (-0.4, 1.6), (1.1, 1.6))
-"""Places of the boxes, to the right of the first view's axis and along it, metres."""
+"""Positions of the boxes: to the right of the first view's optical axis and along it, metres."""
 MOST_BODIES = len(BOX_PLACES) + 1
 _LOOKS = (
     ("picture", (1.2, 0.95, 0.8)),
@@ -46,12 +46,12 @@ def _poses(rotation: Float[np.ndarray, "n 3 3"], place: Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """A path to and fro about a place, turning to and fro: one sinusoid per axis.
+    """A path that oscillates about a pose, in translation and rotation: one sinusoid per axis.
 
     Attributes:
-        middle: `world_T_part` in the middle.
+        middle: `world_T_part` at the centre of the oscillation.
         reach: amplitudes along the middle's axes, metres.
-        speed: mean along the first axis that has a reach, m/s.
+        speed: mean speed along the first axis whose reach is not 0, m/s.
         turn: amplitudes about the middle's axes, degrees.
         phases: of the three axes, radians.
     """
@@ -76,11 +76,11 @@ class Walk:
     """A path around an ellipse on the floor, facing forwards: x ahead, y left, z up.
 
     Attributes:
-        middle: of the ellipse on the floor, metres.
+        middle: centre of the ellipse on the floor, metres.
         along: direction of the longer axis, radians from the world's x to its y.
-        axes: half the ellipse's axes, metres.
+        axes: semi-axes of the ellipse, metres.
         speed: mean, m/s.
-        phase: where it starts, radians.
+        phase: starting point on the ellipse, radians.
     """
 
     middle: tuple[float, float, float]
@@ -103,10 +103,10 @@ class Swing:
     """The path of a limb: it swings about the left-to-right axis (y) of a joint that another path carries.
 
     Attributes:
-        carrier: path of what the limb hangs on.
-        joint: of the limb on it, metres.
+        carrier: path of the part that the limb is attached to.
+        joint: position of the joint in the frame of the carrier, metres.
         degrees: amplitude.
-        rate: swings a second.
+        rate: swings per second.
         phase: radians.
     """
 
@@ -129,20 +129,20 @@ def box(name: str, size: tuple[float, float, float], path: Path, texture: str = 
     Args:
         name: of the body.
         size: edge lengths, metres.
-        path: of its middle.
+        path: of its centre.
         texture: one of `textures.TEXTURES`.
-        look: more of `Box`, as `tint`.
+        look: further fields of `Box`, such as `tint`.
     """
     return MovingBody(name, (MovingPart((Box((0.0, 0.0, -size[2] / 2), size, texture, **look),), path),))
 
 
 def figure(name: str, walk: Walk, tall: float = _GROWN_UP, phase: float = 0.0) -> MovingBody:
-    """A figure of six rigid parts that walks: torso, head, arms and legs that swing.
+    """A walking figure of six rigid parts: torso, head, swinging arms and legs.
 
     Args:
         name: of the body.
         walk: path of the point on the floor below it.
-        tall: metres.
+        tall: height, metres.
         phase: of the swing, radians.
     """
     scale = tall / _GROWN_UP
@@ -179,13 +179,13 @@ def builtin_bodies(
     """Bodies in front of the first view: a box, a walking figure, then more boxes.
 
     Args:
-        count: how many, to `MOST_BODIES`.
-        seed: of their looks, sizes and phases.
-        world_T_first: the first camera.
+        count: how many, at most `MOST_BODIES`.
+        seed: of their appearance, sizes and phases.
+        world_T_first: pose of the first camera.
         half_extent: of the room, metres.
 
     Raises:
-        GavoError: fewer than none, or more than there are places for.
+        GavoError: `count` is negative or above `MOST_BODIES`.
     """
     if not 0 <= count <= MOST_BODIES:
         raise GavoError(f"synthetic: bodies: must be from 0 to {MOST_BODIES}, not {count}")
@@ -194,7 +194,7 @@ def builtin_bodies(
 
 
 def _swaying_box(place: int, seed: int, world_T_first: np.ndarray) -> MovingBody:
-    """The box of a place. Its z axis is up where the first camera is level."""
+    """The box at one of `BOX_PLACES`. Its z axis points up if the first camera is level."""
     rng = np.random.default_rng([seed, _STREAM, place])
     right, ahead = BOX_PLACES[place]
     middle = np.eye(4)

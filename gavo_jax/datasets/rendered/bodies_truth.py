@@ -1,4 +1,4 @@
-"""Files that tell where the bodies of a sequence truly are: `bodies_truth.csv`, and one label image per frame."""
+"""Ground truth files of a sequence's bodies: `bodies_truth.csv`, and one label image per frame."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +16,7 @@ COLUMNS = "timestamp,body,part,tx,ty,tz,qx,qy,qz,qw,share"
 
 
 class WithBodies(Protocol):
-    """What a sequence of frames with known bodies offers besides."""
+    """A sequence of frames that also has ground truth of its bodies."""
 
     @property
     def bodies_truth(self) -> tuple[BodyTruth, ...]:
@@ -29,18 +29,18 @@ class WithBodies(Protocol):
 
 
 def write_mask(sequence: WithBodies, index: int, timestamp: float, stamp: str, folder: Path) -> list[str]:
-    """Write masks/STAMP.png, 8 bit: the body's label at each pixel, 0 beside them; nothing where there are no bodies.
+    """Write masks/STAMP.png, 8 bit: the label of the body at each pixel, 0 where there is none.
 
     Args:
         sequence: the frames.
         index: of the frame.
         timestamp: of the frame, seconds.
-        stamp: the same as files are named.
-        folder: that has the folder of the masks.
+        stamp: the timestamp as written in file names.
+        folder: parent of the existing folder `masks`.
 
     Returns:
-        One row of bodies_truth.csv (`COLUMNS`) per rigid part: labels of its body and of itself, `world_T_part` (m; the
-        quaternion's real part last) and the share of the image that it covers.
+        One row of bodies_truth.csv (`COLUMNS`) per rigid part: the labels of its body and of the part, `world_T_part`
+        (m; the quaternion's real part last) and the share of the image that it covers.
 
     Raises:
         OSError: the file cannot be written.
@@ -58,5 +58,5 @@ def write_mask(sequence: WithBodies, index: int, timestamp: float, stamp: str, f
 
 
 def write_truth(rows: Iterable[str], folder: Path) -> None:
-    """Write bodies_truth.csv from what `write_mask` returned; raises OSError."""
+    """Write the rows returned by `write_mask` to bodies_truth.csv; raises OSError."""
     (folder / TRUTH).write_text("\n".join([COLUMNS, *rows]) + "\n", encoding="utf-8")

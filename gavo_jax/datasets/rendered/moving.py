@@ -1,4 +1,4 @@
-"""Rigid parts that move through the rendered room on given paths, and their exact truth."""
+"""Rigid parts that move through the rendered room on given paths, and their ground truth."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gavo_jax.se3 import is_rigid
 from gavo_jax.trajectory import Trajectory
 
 Path = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]
-"""From seconds since the sequence's first frame to `world_T_part`, metres; z up."""
+"""Maps seconds since the sequence's first frame to `world_T_part`, metres; z up."""
 
 MOST_PARTS = 254
-"""Labels are bytes, and 0 is the room."""
+"""Largest number of rigid parts: labels are bytes, and 0 is the room."""
 LARGEST_EDGE = 10.0
 """Largest edge of a body's box, metres."""
 _TEXTURE_STREAM = 1 << 40
@@ -28,23 +28,23 @@ _TEXTURE_STREAM = 1 << 40
 
 @dataclass(frozen=True)
 class MovingPart:
-    """Boxes that move as one.
+    """Boxes that move together as one rigid body.
 
     Attributes:
-        boxes: in the part's own frame (z up), as furniture stands in the room's.
-        path: where that frame is: a function of the seconds since the sequence's first frame, for whatever moments a
-            rolling shutter needs; or a trajectory over these seconds (`world_T_camera` is `world_T_part`), linear and
-            by slerp between its poses. Before its first pose and after its last one the part stands still.
+        boxes: in the part's own frame, z up.
+        path: pose of that frame over the seconds since the sequence's first frame. Either a function, called at
+            whatever times a rolling shutter needs, or a trajectory whose `world_T_camera` is `world_T_part`.
+            A trajectory is interpolated (linear and slerp); the part stands still before its start and after its end.
     """
 
     boxes: tuple[Box, ...]
     path: Path | Trajectory
 
     def world_T_part(self, seconds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-        """Return the pose of the part, seconds after the sequence's first frame.
+        """Return the poses of the part at times in seconds since the sequence's first frame.
 
         Raises:
-            GavoError: the path gives something else than rigid transforms.
+            GavoError: the path is empty, or does not give rigid transforms.
         """
         seconds = np.asarray(seconds, np.float64)
         if isinstance(self.path, Trajectory):
@@ -63,7 +63,7 @@ class MovingPart:
 
 @dataclass(frozen=True)
 class MovingBody:
-    """What moves as one thing: one rigid part, or several that move on paths of their own, as limbs do."""
+    """A moving body: one rigid part, or several parts that each follow their own path, such as limbs."""
 
     name: str
     parts: tuple[MovingPart, ...]
@@ -71,10 +71,10 @@ class MovingBody:
 
 @dataclass(frozen=True, eq=False)
 class BodyTruth:
-    """Where a body truly is. Part p's frame is the one that its boxes are given in.
+    """Ground truth poses of a body. The frame of a part is the one that its boxes are given in.
 
     Attributes:
-        name: as its `MovingBody` says.
+        name: of its `MovingBody`.
         label: its value in `SyntheticSequence.body_labels`, from 1.
         part_labels: its parts' values in `SyntheticSequence.part_labels`, from 1.
         timestamps: of every frame of the whole sequence, seconds.
@@ -89,7 +89,7 @@ class BodyTruth:
 
     @property
     def rigid(self) -> bool:
-        """Whether all of it moves as one."""
+        """Whether the body is a single rigid part."""
         return len(self.part_labels) == 1
 
 
@@ -98,7 +98,7 @@ class Scene:
     """A room and the parts in it; its faces are the room's, then each part's in the part's own frame.
 
     Attributes:
-        room: faces and textures of all.
+        room: faces and textures of the room and of all parts.
         label: of each face: 0 for the room's, k for those of the k-th part.
         parts: in the order of their labels.
     """
@@ -108,7 +108,7 @@ class Scene:
     parts: tuple[MovingPart, ...] = ()
 
     def at(self, seconds: float) -> Room:
-        """What there is to be seen so many seconds after the first frame: all faces in the world."""
+        """The room with all parts at their poses at a time since the first frame; faces in the world frame."""
         if not self.parts:
             return self.room
         poses = np.concatenate([np.eye(4)[None], *(part.world_T_part(np.array([seconds])) for part in self.parts)])
@@ -124,7 +124,7 @@ class Scene:
 
 
 def build_scene(seed: int, half_extent: tuple[float, float], height: float, bodies: Sequence[MovingBody]) -> Scene:
-    """The room of a seed with bodies; without any it is the very room."""
+    """Build the room of a seed with bodies in it; without bodies, just the room."""
     parts = tuple(part for body in bodies for part in body.parts)
     if not parts:
         room = build_room(seed, half_extent, height)
@@ -137,9 +137,9 @@ def build_scene(seed: int, half_extent: tuple[float, float], height: float, bodi
 def _furnish(
     seed: int, half_extent: tuple[float, float], height: float, boxes: tuple[tuple[Box, ...], ...]
 ) -> tuple[Room, np.ndarray]:
-    """The room with the parts' faces behind its own, each part's in its own frame, and the labels of all faces.
+    """The room's faces followed by the parts' (each in the part's own frame), and the labels of all faces.
 
-    The light falls on a part as it does before it moves: a surface keeps its brightness.
+    Parts are lit in their own frames, so that a surface keeps its brightness as it moves.
     """
     room = build_room(seed, half_extent, height)
     faces = [face for part in boxes for box in part for face in box_faces(box, [box.texture] * 6, inwards=False)]
@@ -157,7 +157,7 @@ def _furnish(
 
 
 def _join(first: Atlas, second: Atlas) -> Atlas:
-    """Two atlases in one image, the second below the first, which stays where it was."""
+    """Join two atlases in one image: the first in place, the second below it."""
     width = max(first.image.shape[1], second.image.shape[1])
     images = [np.pad(atlas.image, ((0, 0), (0, width - atlas.image.shape[1]))) for atlas in (first, second)]
     corner = np.concatenate([first.corner, second.corner + [0, len(first.image)]])
@@ -166,11 +166,11 @@ def _join(first: Atlas, second: Atlas) -> Atlas:
 
 @blamed("synthetic: bodies")
 def truths(bodies: Sequence[MovingBody], timestamps: Float[np.ndarray, " frames"]) -> tuple[BodyTruth, ...]:
-    """The truth of every body at the frames' stamps.
+    """The ground truth of every body at the frames' timestamps.
 
     Raises:
-        GavoError: what is no body, a body without parts, a part without boxes, a box that cannot be, more parts than
-            there are labels, or a path that raises, or gives something else than rigid transforms.
+        GavoError: a value is not a `MovingBody`, a body has no parts, a part no boxes, a box is invalid, there are more
+            than `MOST_PARTS` parts, or a path raises or does not give rigid transforms.
     """
     for body in bodies:
         if not isinstance(body, MovingBody):
@@ -194,6 +194,6 @@ def truths(bodies: Sequence[MovingBody], timestamps: Float[np.ndarray, " frames"
 
 
 def body_of_part(bodies: Sequence[BodyTruth]) -> UInt8[np.ndarray, " labels"]:
-    """The body's label by the part's label; 0 stays 0."""
+    """Lookup table from part label to body label; 0 stays 0."""
     lookup = [0, *(body.label for body in bodies for _ in body.part_labels)]
     return np.array(lookup, np.uint8)

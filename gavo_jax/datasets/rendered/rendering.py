@@ -1,8 +1,8 @@
 """Exact views of a room of rectangles, by ray casting in NumPy.
 
 The inverse depth of a rectangle, and its texture coordinates over depth, are affine in the pixel: no matrix product per
-ray. Textures are filtered to the pixel's footprint (mip levels of Gaussian prefiltered images) and silhouettes by 8
-samples a pixel, so that two frames of one surface agree in intensity to about half a grey level.
+ray. Textures are filtered to the pixel's footprint (mip levels of Gaussian prefiltered images) and silhouettes are
+antialiased with 8 samples per pixel, so that two views of a surface agree to about half a grey level.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Hits:
-    """What each ray meets first: inverse depth (0: nothing), that times s and t (metres along the face), the face."""
+    """The first hit of each ray: inverse depth q (0: no hit), q s and q t (s, t: metres along the face), face index."""
 
     inverse_depth: np.ndarray
     scaled_s: np.ndarray
@@ -51,7 +51,7 @@ class _Hits:
 
 
 def render(room: Room, camera: Camera, world_T_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one view by ray casting; the camera's distortion is left out.
+    """Render one view by ray casting; the camera's distortion is ignored.
 
     Args:
         room: what is seen.
@@ -60,7 +60,7 @@ def render(room: Room, camera: Camera, world_T_camera: np.ndarray) -> tuple[np.n
 
     Returns:
         grey: float32 [H, W], grey levels.
-        depth: float32 [H, W], metres along the optical axis, exact at the pixels' centres; 0 where nothing is met.
+        depth: float32 [H, W], metres along the optical axis, exact at the pixels' centres; 0 where no face is hit.
         face: int32 [H, W], index of the face that each pixel's centre shows.
     """
     view = _look(room.faces, camera, world_T_camera)

@@ -65,8 +65,8 @@ class Room:
 def build_room(seed: int, half_extent: tuple[float, float] = (3.0, 2.5), height: float = 3.0) -> Room:
     """Build the room of a seed.
 
-    The furniture is always the same, each piece at its distance from a wall; the textures are drawn anew. Faces that
-    cannot be seen from `free_space` are left out: cameras belong there.
+    The furniture is always the same, each piece at a fixed distance from a wall; the seed only changes the textures.
+    Faces that cannot be seen from `free_space`, where cameras belong, are left out.
 
     Args:
         seed: of the textures.
@@ -78,12 +78,12 @@ def build_room(seed: int, half_extent: tuple[float, float] = (3.0, 2.5), height:
 
 
 def shine(normal: np.ndarray) -> np.ndarray:
-    """The light that falls on surfaces of some normals [F, 3] (unit, in the world): factors [F] on their albedo."""
+    """Shading factors [F] on the albedo of surfaces with unit normals [F, 3] in the world frame."""
     return 0.82 + 0.18 * (normal @ np.array([-0.45, 0.3, 0.84]))
 
 
 def free_space(half_extent: tuple[float, float], height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner [3] (m) of the box in a room's middle that holds nothing: where cameras may be."""
+    """Lowest and highest corner [3] (m) of the empty box in the middle of a room, where cameras may be."""
     x, y = half_extent[0] - MARGIN_X, half_extent[1] - MARGIN_Y
     return np.array([-x, -y, LOWEST_VIEW]), np.array([x, y, height - HIGHEST_VIEW])
 
@@ -119,7 +119,7 @@ def box_faces(box: Box, textures: list[str], inwards: bool) -> list[tuple]:
 
 
 def _place(parts: list[Box], x: float, y: float, yaw: float, z: float = 0.0) -> list[Box]:
-    """Parts given in a piece's own frame, moved to where the piece stands."""
+    """Transform boxes from the frame of a piece of furniture to its place in the room."""
     cos, sin = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     return [
         replace(
@@ -187,7 +187,7 @@ def _chair() -> list[Box]:
 
 
 def _desktop() -> list[Box]:
-    """What lies on the desk: a screen on its foot, two piles of books, a carton, a cup, a keyboard."""
+    """The things on the desk: a screen on its stand, two piles of books, a carton, a cup, a keyboard."""
     return [
         Box((0.15, 0.0, 0.0), (0.18, 0.24, 0.02), "plain"),
         Box((0.18, 0.0, 0.02), (0.04, 0.06, 0.1), "plain"),

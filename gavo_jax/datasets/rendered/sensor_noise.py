@@ -1,4 +1,4 @@
-"""What a structured-light RGB-D camera adds to exact images and depth."""
+"""Noise model of a structured-light RGB-D camera."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from gavo_jax.errors import GavoError, as_number
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What a structured-light RGB-D camera adds to the exact image and depth. All zeros (the default): nothing.
+    """Noise that a structured-light RGB-D camera adds to exact images and depth; none by default (all zeros).
 
     Depth noise and quantisation live in disparity, hence in inverse depth: both grow with z^2 (Khoshelham & Oude
     Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 2012).
 
     Attributes:
-        depth_sigma: deviation of inverse depth, 1/m: sigma_z = depth_sigma z^2.
+        depth_sigma: standard deviation of inverse depth, 1/m: sigma_z = depth_sigma z^2.
         depth_step: quantisation of inverse depth, 1/m: neighbouring depths differ by depth_step z^2.
         depth_nearest: nearest depth with a reading, metres.
         depth_furthest: furthest depth with a reading, metres; 0 for no limit.
         baseline: from the camera to the pattern's projector along +x, metres. Where an object keeps the projector's
             light from the surface behind, there is no depth: a strip to the left of the object.
         edge_dropout: probability that a pixel beside a jump in depth has no reading.
-        grey_sigma: deviation of grey, grey levels.
+        grey_sigma: standard deviation of grey, grey levels.
         gain_drift: amplitude of the slow change in gain (0.03: three per cent either way).
         bias_drift: amplitude of the slow change in bias, grey levels.
         drift_period: of the change in exposure, seconds.

@@ -40,7 +40,7 @@ BANDS = 60
 """Bands of rows that a rolling shutter exposes one after the other."""
 
 MOST_FRAMES = 1_000_000
-"""Their poses are known from the first on: more would fill the memory."""
+"""Largest number of frames: all poses are computed up front and held in memory."""
 
 LARGEST_EXTENT = 50.0
 """Trajectories that reach further than this (m) along an axis are refused: a room has to hold them."""
@@ -53,17 +53,17 @@ _PATH_STREAM, _EXPOSURE_STREAM, _FRAME_STREAM = range(3)
 class SyntheticSequence:
     """A camera moving through a textured, furnished room; exact poses, depth along z, optional sensor noise.
 
-    Frame i depends on the arguments and i alone: not on the order of access, nor on slicing. Frames are rendered when
-    they are asked for (the last two are kept). World frame: metres, z up, origin on the floor below the room's middle.
+    Frame i depends on the arguments and i alone: not on the order of access, nor on slicing. Frames are rendered on
+    demand (the last two are cached). World frame: metres, z up, origin on the floor below the room's middle.
 
     Args:
         frames: how many; by default 30 on the built-in path, all of a given trajectory (never more than it has).
         seed: of the textures, the noise and the phases of the built-in path; from 0.
         noise: what the sensor adds; `NONE` for exact frames.
         camera: any pinhole camera; frames come undistorted. By default 640 x 480, f = 525, the centre in the middle.
-            With a `readout` its shutter rolls: each frame is seen from where the camera is as its rows are read.
+            With a `readout` it has a rolling shutter: rows are rendered from the pose at which they are read.
         trajectory: what to follow instead of the built-in path: a Trajectory or a TUM file (camera to world, z up). It
-            is shifted into the room's free middle (the room is built larger where it must); scale and rotation stay.
+            is shifted into the room's free middle (the room is enlarged as needed); scale and rotation stay.
         rate: frames per second. By default 30 on the built-in path, and the trajectory's own stamps otherwise.
         speed: the motion is played this many times faster.
         color: also give RGB images; grey is then computed from them as OpenCV does.
@@ -126,11 +126,11 @@ class SyntheticSequence:
         self._expose: Callable[[int], tuple[np.ndarray, ...]] = lru_cache(maxsize=2)(self._expose_frame)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the frames that are kept, which another process renders again."""
+        """The state without cached frames, which are rendered again on demand."""
         return {name: value for name, value in vars(self).items() if name not in ("_render", "_expose")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """What was pickled, or copied, with no frame kept."""
+        """Restore a pickled or copied state with empty frame caches."""
         vars(self).update(state)
         self._keep_last()
 
@@ -169,7 +169,7 @@ class SyntheticSequence:
         return self._scene().label.astype(np.uint8)[face]
 
     def check(self) -> None:
-        """Nothing is wrong with what was not read from files: never raises."""
+        """Do nothing: there are no files to check."""
 
     def __len__(self) -> int:
         return len(self._selection)
@@ -236,17 +236,17 @@ def _to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
 
 
 def _to_raw(depth: np.ndarray, depth_scale: float) -> UInt16[np.ndarray, "height width"]:
-    """Metres to raw units; what 16 bit cannot hold has no reading."""
+    """Convert metres to raw units; depth that does not fit in 16 bits becomes 0 (no reading)."""
     raw = np.rint(depth * np.float32(depth_scale))
     return np.where(raw <= np.iinfo(np.uint16).max, raw, 0).astype(np.uint16)
 
 
 def builtin_path(frames: int, rate: float = DEFAULT_RATE, speed: float = 1.0, seed: int = 0) -> Trajectory:
-    """A handheld-like look around, a sum of sinusoids: 0.25 m/s and 18 deg/s on average at speed 1.
+    """A path like that of a handheld camera, a sum of sinusoids: 0.25 m/s and 18 deg/s on average at speed 1.
 
     Args:
         frames: how many poses.
-        rate: poses a second.
+        rate: poses per second.
         speed: the motion is played this many times faster.
         seed: of the sinusoids' phases.
 
