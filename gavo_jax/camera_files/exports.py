@@ -12,7 +12,7 @@ from gavo_jax.errors import GavoError, shown
 Rays = tuple[np.ndarray, np.ndarray]
 
 Lens = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[Rays, Rays]]
-"""From a grid of points and coefficients: ideal points, and where the lens shows them."""
+"""Maps a grid of points and coefficients to undistorted points and their distorted positions."""
 
 GRID = 25
 """Points along either side of the image to which OpenCV's model is fitted."""
@@ -22,7 +22,7 @@ SDK_MODELS = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta
 
 
 def _brown(x: np.ndarray, y: np.ndarray, k: np.ndarray, scaled: bool = False) -> Rays:
-    """Radial and tangential terms, coefficients k1 k2 p1 p2 k3; `scaled`: the latter of what the radial ones left."""
+    """Radial and tangential terms, coefficients k1 k2 p1 p2 k3; `scaled`: tangential after radial."""
     square = x**2 + y**2
     radial = 1 + k[0] * square + k[1] * square**2 + k[4] * square**3
     u, v = (x * radial, y * radial) if scaled else (x, y)
@@ -37,13 +37,13 @@ LENSES: dict[str, Lens] = {
     "modified_brown_conrady": lambda x, y, k: ((x, y), _brown(x, y, k, scaled=True)),
     "inverse_brown_conrady": lambda x, y, k: (_brown(x, y, k), (x, y)),
 }
-"""The SDK's models by name, as `rsutil.h` has them."""
+"""The SDK's models by name, as in `rsutil.h`."""
 
 
 def sdk_distortion(whose: str, model: Any, coefficients: Any, table: Table) -> list[float]:
-    """OpenCV's k1 k2 p1 p2 k3 that show what a lens model of RealSense's SDK shows; none where there is no distortion.
+    """Convert a lens model of RealSense's SDK to OpenCV's k1 k2 p1 p2 k3; empty without distortion.
 
-    OpenCV's terms are linear in its coefficients, so it is least squares over the image.
+    OpenCV's model is linear in its coefficients: they are fitted over the image by linear least squares.
 
     Args:
         whose: begins the message.
@@ -92,7 +92,7 @@ def read_realsense(path: Path, values: Table) -> Table:
 
 
 LIKE = 0.01
-"""By how much of the focal length the cameras of single frames may differ; a phone's autofocus moves it by less."""
+"""Largest difference between frames' intrinsics, as a share of the focal length; autofocus stays below it."""
 
 FOCUS_KEYS = ("fx", "fl_x", "fy", "fl_y", "cx", "cy")
 """Keys of a camera that its focus changes; a focal length first."""
@@ -159,8 +159,9 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
 
 
 def _nerf_cameras(values: Table) -> list[Table]:
-    """The cameras of frames that say their own; what one does not say of it stands above all frames, as instant-ngp and
-    NeRFCapture have it.
+    """Cameras of the frames; missing keys come from the top level, as in instant-ngp and NeRFCapture.
+
+    Empty if only the top level has a focal length.
     """
     frames = values.get("frames")
     told = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
@@ -174,7 +175,7 @@ OPENLORIS_COLOR = "d400_color_optical_frame"
 """The colour camera among the sensors of OpenLORIS-Scene's robots, to which `aligned_depth` is registered."""
 
 SQUARE = 0.05
-"""By which share the two focal lengths of that camera may differ; of numbers in another order they do by more."""
+"""Largest relative difference of OpenLORIS's fx and fy; more means that the numbers are in another order."""
 
 
 def is_openloris(values: Table) -> bool:
@@ -194,5 +195,5 @@ def read_openloris(path: Path, values: Table) -> Table:
 
 
 def _whole(value: Any) -> Any:
-    """A size that is written as 640.0, as a whole number."""
+    """Convert a size written as 640.0 to an integer."""
     return int(value) if isinstance(value, float) and value.is_integer() else value

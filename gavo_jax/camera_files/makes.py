@@ -25,23 +25,24 @@ from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX,
 from gavo_jax.errors import GavoError, line_of, number, parse_json, parse_toml, shown
 
 PROJECTION = "projection_matrix"
-"""Key of a ROS camera_info: three rows of four, of the images that ROS's image_proc makes without distortion."""
+"""Key of a ROS camera_info: the 3×4 projection matrix of the images rectified by ROS's image_proc."""
 
 NESTED = ("camera", "cam", "camera_params", "cam_params")
 """Tables in which Replica, NICE-SLAM, SplaTAM and others keep a camera."""
 
 SAME_CAMERA = 0.5
-"""Pixels by which colour and depth camera of a scan may differ where depth is registered."""
+"""Largest difference (pixels) between a scan's colour and depth intrinsics if depth is registered."""
 
 WIDEST_HALF, SQUARE = 1.5, (0.67, 1.5)
-"""Of a row of numbers without names: the principal point over the focal length at most, and how far pixels may be from
-square. Else the numbers are in another order."""
+"""Limits for a row of unnamed numbers: principal point over focal length, and the range of fx / fy.
+
+Beyond them the numbers are in another order."""
 
 ALIKE = 0.03
-"""Share of a focal length by which that of rows differs from that of columns, mostly by much less."""
+"""Largest usual difference between fx and fy, as a share of fx."""
 
 MOST_SKEW = 0.5
-"""Pixels: pixels whose rows and columns are so far from square to each other are no camera's of ours."""
+"""Largest skew of a camera matrix, pixels."""
 
 
 def _parse_yaml(path: Path, text: str) -> Table:
@@ -58,9 +59,7 @@ def _parse_yaml(path: Path, text: str) -> Table:
 
 @cache
 def _yaml_loader() -> type[Any]:
-    """A loader that refuses a key that is given twice, of which YAML would keep the last, and takes 1e-3 for a number,
-    which YAML 1.1 takes for text.
-    """
+    """A loader that refuses duplicate keys (YAML keeps the last) and reads 1e-3 as a number (YAML 1.1: text)."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -82,7 +81,7 @@ def _parse_json(path: Path, text: str) -> Table:
 
 
 def _of_known_make(path: Path, values: Any) -> Table:
-    """A table of our keys from that of another make."""
+    """Convert a table of any known make to our keys; others stay as they are."""
     if not isinstance(values, dict) or not values:
         raise GavoError(f"{path}: not a camera file: no `key: value` in it")
     if not all(isinstance(key, str) for key in values):
@@ -227,7 +226,7 @@ MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...
     (is_nerfstudio, read_nerfstudio),
     (_is_flat, _read_flat),
 )
-"""How each make is known, and read."""
+"""Test and reader of each make; the first whose test succeeds is used."""
 
 
 def _parse_storage(path: Path, text: str) -> Table:
@@ -244,7 +243,7 @@ def _storage_table(path: Path, storage: Any) -> Table:
 
 
 def _storage_orb(storage: Any) -> Table | None:
-    """The keys of an ORB-SLAM settings file (`Camera.fx` or `Camera1.fx`); None where it is none."""
+    """The keys of an ORB-SLAM settings file (`Camera.fx` or `Camera1.fx`); None for other files."""
     prefix = next((p for p in ("Camera", "Camera1") if not storage.getNode(f"{p}.fx").empty()), None)
     if prefix is None:
         return None
@@ -266,7 +265,7 @@ def _storage_orb(storage: Any) -> Table | None:
 
 
 def _orb_model(kind: str) -> str:
-    """Our name of ORB-SLAM's camera type; one that is not known stays as it is, and is refused."""
+    """Our name of ORB-SLAM's camera type; an unknown one is returned unchanged and refused later."""
     return {"PinHole": "pinhole", "Rectified": "pinhole", "KannalaBrandt8": "fisheye"}.get(kind, kind)
 
 

@@ -19,7 +19,7 @@ REQUIRED = (*FOCAL, "width", "height")
 CAMERA_KEYS = (*REQUIRED, "distortion", "model", "depth_scale", "readout")
 """Keys of a camera in our own files; `REQUIRED` ones are in every file."""
 DEVICE_KEYS = ("depth_delay",)
-"""Keys of our own files that stand beside the cameras of a device."""
+"""Keys of our own files that belong to a device, not to one of its cameras."""
 
 MATRIX = ("cameramatrix", "k", "m1")
 """Names of a camera matrix: fx, fy, cx and cy."""
@@ -31,9 +31,9 @@ LENS = (
 """Names of a list of distortion coefficients, or of a table of them by name."""
 
 LENS_MODEL = ("distortionmodel", "distortiontype", "modeltype")
-"""Names of a lens model, whatever it is."""
+"""Names of an entry that always holds a lens model."""
 ANY_MODEL = ("model", "cameramodel")
-"""Names of a lens model, or of the device's make."""
+"""Names of an entry that holds a lens model or the make of the device."""
 
 IS_FISHEYE = ("fisheye", "fisheyemodel", "isfisheye")
 """Names of a flag that says whether the lens is a fisheye."""
@@ -45,10 +45,10 @@ WIDTH, HEIGHT, SIZE = ("width", "imagewidth", "w"), ("height", "imageheight", "h
 """Names of the image's width, of its height and of both, pixels."""
 
 KEPT = ("readout", "depth_delay")
-"""Keys that are taken as in our own files."""
+"""Keys that are read unchanged, as in our own files."""
 
 LEAST_UNITS = 0.05
-"""Raw depth units per metre; a smaller number is metres per unit."""
+"""Fewest raw depth units per metre; a smaller number is taken for metres per unit."""
 
 ORDER = {"pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
 """Order of OpenCV's distortion coefficients, by model."""
@@ -74,7 +74,7 @@ MODELS = {
 
 
 def model_of(name: Any) -> str | None:
-    """Our name of a distortion model: "pinhole" or "fisheye"; None where it is not known."""
+    """Our name of a distortion model: "pinhole" or "fisheye"; None if unknown."""
     return MODELS.get(name.lower().replace("-", "_")) if isinstance(name, str) else None
 
 
@@ -84,13 +84,13 @@ def plain(name: str) -> str:
 
 
 def first(values: Table, names: tuple[str, ...]) -> Any:
-    """The value of the first of some names that is there; None where none is."""
+    """The value of the first of `names` that has one; None if none has."""
     found = {plain(key): value for key, value in reversed(values.items())}
     return next((found[name] for name in names if found.get(name) is not None), None)
 
 
 def numbers_of(entry: Any) -> list[Any]:
-    """A list, of rows or of numbers, or a matrix with its `data`, as a flat list."""
+    """Flatten a number, a list of numbers or rows, or the `data` of a matrix."""
     if isinstance(entry, dict):
         entry = entry["data"]
     flat: list[Any] = []
@@ -100,29 +100,27 @@ def numbers_of(entry: Any) -> list[Any]:
 
 
 def beside(place: str, values: Table) -> Table:
-    """Our keys for what stands beside a camera's matrix.
+    """Read size, lens, depth unit and `KEPT` keys, everything but the camera matrix, into our keys.
 
     Args:
         place: names the file in messages.
-        values: as a program wrote them.
+        values: the entries of the file.
 
     Raises:
-        GavoError: a name that looks like a lens or a unit is not known.
+        GavoError: an unknown name looks like distortion or a depth unit.
     """
     _refuse_unknown(place, values)
     return {**_size(values), **_lens(values), **_unit(values), **{key: values[key] for key in KEPT if key in values}}
 
 
 def known(key: str) -> bool:
-    """Whether a name is one that `beside` reads."""
+    """Whether `beside` reads a name."""
     words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *ORDER["pinhole"])
     return plain(key) in words or key in KEPT
 
 
 def camera_info_distortion(model: str, coefficients: list[Any]) -> Table:
-    """Our keys for what a ROS camera_info, or another file, says of the lens; an empty list stands for none, but of a
-    fisheye.
-    """
+    """Convert a lens model and coefficients to our keys; without coefficients only a fisheye model is kept."""
     if len(coefficients):
         return {"distortion": coefficients, "model": model or "plumb_bob"}
     return {"model": model} if model_of(model) == "fisheye" else {}
@@ -136,7 +134,7 @@ def _lens(values: Table) -> Table:
 
 
 def _lens_model(values: Table) -> Any:
-    """The name of the lens model; empty where none is told."""
+    """The name of the lens model; empty if the file has none."""
     named = first(values, LENS_MODEL)
     if named is not None:
         return named
@@ -144,7 +142,7 @@ def _lens_model(values: Table) -> Any:
 
 
 def _by_name(values: Table, model: Any) -> list[Any]:
-    """Coefficients k1, k2, … in OpenCV's order and number; those that are missing among them are zero."""
+    """Coefficients k1, k2, … in OpenCV's order and number; missing ones are zero."""
     kind = model_of(model) or "pinhole"
     found = {plain(key): value for key, value in values.items() if value is not None}
     last = max((at for at, name in enumerate(ORDER[kind]) if name in found), default=-1)

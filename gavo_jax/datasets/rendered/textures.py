@@ -1,4 +1,4 @@
-"""Procedural textures of the synthetic room, drawn by seed and filtered for any distance.
+"""Procedural textures of the synthetic room, drawn from a seed and prefiltered for any distance.
 
 A texture is a function (rng, rows, columns, texel in metres) -> albedo [rows, columns], about 0 to 255: fractal noise
 for the fine detail that photometric alignment lives on, and edges.
@@ -37,7 +37,7 @@ def paint(kinds: Sequence[str], sizes: np.ndarray, light: np.ndarray, seed: int)
     Args:
         kinds: names of textures, keys of `TEXTURES`.
         sizes: [F, 2] metres along a texture's rows and along its columns.
-        light: [F] what the albedo is multiplied by.
+        light: [F] factors on the albedo.
         seed: each rectangle's texture depends on it and on the rectangle's place in the list.
     """
     longest = sizes.max(axis=1)
