@@ -161,7 +161,7 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
 def _nerf_cameras(values: Table) -> list[Table]:
     """Cameras of the frames; missing keys come from the top level, as in instant-ngp and NeRFCapture.
 
-    Empty if only the top level has a focal length.
+    Empty if there are no frames, or if only the top level has a focal length.
     """
     frames = values.get("frames")
     told = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
