@@ -205,7 +205,16 @@ def preset_of(name: str) -> Settings:
     method, _, rest = name.partition(":")
     preset, _, bodies = rest.partition(":")
     settings = presets.preset(method, preset or "default")
-    return replace(settings, odometry=replace(settings.odometry, bodies=bodies)) if bodies else settings
+    return with_bodies(settings, bodies) if bodies else settings
+
+
+def with_bodies(settings: Settings, bodies: Any) -> Settings:
+    """Settings that treat bodies in a given way.
+
+    Raises:
+        GavoError: there is no such way.
+    """
+    return replace(settings, odometry=replace(settings.odometry, bodies=bodies))
 
 
 def parse_methods(text: str) -> list[Contender]:

@@ -115,7 +115,7 @@ def with_bodies(settings: Settings, mode: str | None) -> Settings:
     """
     if mode is None:
         return settings
-    return replace(settings, odometry=replace(settings.odometry, bodies="off" if mode == TOLD else mode))
+    return common.with_bodies(settings, "off" if mode == TOLD else mode)
 
 
 @dataclass(eq=False)

@@ -52,10 +52,10 @@ def main(results: Path = Path("runs/table1"), json: Path | None = None) -> dict[
             cells.append((found.label, found.runs, *drifts, number(found.rotation, 3)))
         common.print_table(f"{sequence}, m/s and deg/s", COLUMNS, cells)
         tests = [found for found in comparisons if found.sequence == sequence and found.first == "ga"]
-        likely = [1.0 if found.p is None else found.p for found in tests]
-        cells = [
-            (f"ga / {found.second}", number(found.ratio, 4), f"{p:.1e}") for found, p in zip(tests, likely, strict=True)
-        ]
+        cells = []
+        for found in tests:
+            p = 1.0 if found.p is None else found.p
+            cells.append((f"ga / {found.second}", number(found.ratio, 4), f"{p:.1e}"))
         common.print_table(f"{sequence}, paired by seed (Wilcoxon)", ("", "ratio", "p"), cells)
     figures = {
         "summary": [summary._asdict() for summary in summaries],

@@ -34,10 +34,13 @@ DEPTH_WORD = re.compile(r"(?<![a-z])(?:depth|distance_to_image_plane)(?![a-z])",
 """Marks depth images in the same folder as colour, as a separate word if any name has it so; the longer one is of Isaac
 Sim's Replicator."""
 
-NO_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?r(?:ed)?)(?![a-z])")
+DERIVED = "conf(?:idence)?|masks?|vis|preview|normals?"
+"""Words in names of images that are derived from depth."""
+
+NO_DEPTH = re.compile(rf"(?<![a-z])(?:{DERIVED}|colou?r(?:ed)?)(?![a-z])")
 """Marks folders of images derived from depth, or about it."""
 
-OF_DEPTH = re.compile(r"(?<![a-z])(?:conf(?:idence)?|masks?|vis|preview|normals?|colou?rmap)(?![a-z])", re.IGNORECASE)
+OF_DEPTH = re.compile(rf"(?<![a-z])(?:{DERIVED}|colou?rmap)(?![a-z])", re.IGNORECASE)
 """Marks files derived from depth, as `NO_DEPTH` does folders, where depth itself lies beside them."""
 
 DEPTH_PART = re.compile(r"([-_. ]?)depth([-_. ]?)", re.IGNORECASE)
@@ -57,9 +60,14 @@ def _is_registered(name: str) -> bool:
     return not said & COLOR_NAMES or words[-1] in COLOR_NAMES
 
 
+def _subfolders(path: Path) -> dict[str, Path]:
+    """The folders in a folder by their names in lower case."""
+    return {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
+
+
 def _candidates(path: Path) -> tuple[list[Path], list[Path]]:
     """Colour folders and depth folders in a folder, the preferred one first."""
-    children = {child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()}
+    children = _subfolders(path)
     registered = sorted(filter(_is_registered, children), key=lambda name: (name not in DEPTH_FOLDERS, name))
     names = COLOR_FOLDERS, dict.fromkeys((*registered, *DEPTH_FOLDERS))
     color, depth = ([children[name] for name in some if name in children] for some in names)
@@ -87,7 +95,7 @@ def _pairs(children: dict[str, Path]) -> list[tuple[list[Path], list[Path]]]:
 
 def several_pairs(path: Path) -> str | None:
     """Which folders of colour have depth beside them, where several have and none goes before the others."""
-    pairs = _pairs({child.name.lower(): child for child in sorted(path.glob("*")) if child.is_dir()})
+    pairs = _pairs(_subfolders(path))
     if len(pairs) < 2:
         return None
     names = ", ".join(color.name[:60] for (color, *_), _ in pairs[:3]) + ", …" * (len(pairs) > 3)
