@@ -1,4 +1,4 @@
-"""bodies.csv: a row per body and frame."""
+"""bodies.csv: one row per body and frame."""
 
 import csv
 from pathlib import Path
@@ -11,13 +11,14 @@ from gavo_jax.errors import GavoError, read_text
 from gavo_jax.odometry.driver import Step
 
 BODY_COLUMNS = ("timestamp", "body", "share", "x", "y", "z", "dx", "dy", "dz", "rx", "ry", "rz", "status")
-"""Colour stamp in seconds; number of the body; share of the image that it covers; centroid of what is seen of it in the
-world, m; displacement of that centroid since the last frame, m, and rotation vector, rad: nan where no motion is known;
-status of its motion, `seen` where there is none."""
+"""Columns of bodies.csv: colour timestamp in seconds, number of the body, and share of the image that it covers. Then
+the world coordinates of the visible part's centroid (m), its displacement (m) and the rotation vector (rad) since the
+reference frame, nan if unknown. Last the status of the motion, `seen` if there is none.
+"""
 
 
 def body_rows(step: Step) -> list[list[Any]]:
-    """Values of `BODY_COLUMNS` of every body in a frame, by number."""
+    """Return the values of `BODY_COLUMNS` of each body in a frame, ordered by number."""
     return [
         [f"{step.timestamp:.6f}", body.number, f"{body.share:.6f}"]
         + [f"{value:.6f}" for value in np.concatenate([body.centroid, body.displacement, body.rotation])]
@@ -27,21 +28,20 @@ def body_rows(step: Step) -> list[list[Any]]:
 
 
 class BodyRow(NamedTuple):
-    """A row of bodies.csv, without the status."""
+    """A row of bodies.csv without the status; see `Body` for the fields and units."""
 
     timestamp: float
-    """Colour stamp, seconds."""
+    """Colour timestamp, seconds."""
     body: int
     share: float
     """Share of the image that the body covers."""
     centroid: Float64[np.ndarray, " 3"]
     displacement: Float64[np.ndarray, " 3"]
     rotation: Float64[np.ndarray, " 3"]
-    """Metres, metres and radians in the world, as of `Body`."""
 
 
 def read_bodies(path: Path) -> list[BodyRow]:
-    """Return the rows of bodies.csv; none if there is no such file.
+    """Return the rows of bodies.csv; none if the file does not exist.
 
     Raises:
         GavoError: It cannot be read.

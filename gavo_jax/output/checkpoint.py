@@ -1,6 +1,6 @@
-"""A driver's progress as one file, so that a run that was cut short can go on: arrays and numbers, no code.
+"""Checkpoints: a driver's progress in one file of arrays and numbers, from which an interrupted run resumes.
 
-A digest seals it: an altered checkpoint is refused.
+A digest seals the file: an altered checkpoint is refused.
 """
 
 import hashlib
@@ -30,11 +30,11 @@ NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera"
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
 LAST_GREY, SAME_LEVEL = "last_grey", "same_level"
 MOST_BESIDE = 2**20 + 5 * MAX_SIDE**2 // 4
-"""Bytes at most beside the tracker: a float and a count for every fourth pixel of the largest image, and numbers."""
+"""Maximum bytes without the tracker: numbers, and a float and a count for one pixel in four of the largest image."""
 
 
 class Mark(NamedTuple):
-    """How far a growing file was."""
+    """State of a growing file."""
 
     size: int
     """Length of the file, bytes."""
@@ -43,22 +43,22 @@ class Mark(NamedTuple):
 
 
 class Checkpoint(NamedTuple):
-    """Where a run stood."""
+    """State of a run between two frames."""
 
     progress: Progress
-    """All that the driver knows; without a tracker where no usable frame was seen yet."""
+    """The driver's state; without a tracker before the first usable frame."""
     files: dict[str, Mark]
-    """The files that grow with the run, by name."""
+    """Marks of the files that grow with the run, by name."""
     images: str = ""
-    """Digest of the images that were seen; see `SeenImages`."""
+    """Digest of the images seen so far; see `SeenImages`."""
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write where a run stands, whole or not at all.
+    """Write a checkpoint atomically.
 
     Args:
         path: An .npz file.
-        checkpoint: What it holds.
+        checkpoint: State of the run.
 
     Raises:
         GavoError: The file cannot be written.
@@ -101,10 +101,10 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
 
     Args:
         path: The file.
-        blank: A state of the shapes and types to expect.
+        blank: A tracker's state with the expected shapes and types.
 
     Raises:
-        GavoError: The file cannot be read, is damaged or altered, or is of another camera.
+        GavoError: The file cannot be read, is damaged or altered, or belongs to another camera.
     """
     expected, structure = jax.tree.flatten(blank)
     try:
@@ -127,7 +127,7 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
 
 
 def _sealed_arrays(path: Path, most: int) -> dict[str, np.ndarray]:
-    """Return the sealed arrays of a file of at most `most` bytes, uncompressed; raise if they were altered."""
+    """Return the sealed arrays of a file of at most `most` bytes uncompressed; raise if they were altered."""
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > most:
             raise GavoError(f"{path}: larger than a checkpoint of this camera")
@@ -139,7 +139,7 @@ def _sealed_arrays(path: Path, most: int) -> dict[str, np.ndarray]:
 
 
 def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Progress:
-    """A progress without its tracker's state: the records in `numbers` become what they were written from."""
+    """Rebuild a progress, without its tracker's state, from the stored numbers and arrays."""
     history: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in numbers["history"].items()}
     leap, came, beginning = numbers["leap"], numbers.get("arrival"), numbers.get("beginning")
     numbers |= {

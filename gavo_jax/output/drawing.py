@@ -1,4 +1,4 @@
-"""The figures of a run as files, where matplotlib is installed."""
+"""Writes the figures of a run if matplotlib is installed."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 def draw(
     folder: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None, ours: Collection[str] = ()
 ) -> list[Picture]:
-    """Write the figures of named trajectories, where matplotlib is installed; errors where there is a truth.
+    """Write figures of named trajectories and, with a ground truth, of their errors, if matplotlib is installed.
 
     Args:
-        folder: for the files.
-        estimates: the trajectories.
-        truth: what they are compared with.
-        ours: those that are not other libraries', which are grey; all of them where none is named.
+        folder: Folder for the files.
+        estimates: The trajectories.
+        truth: The true trajectory, or None.
+        ours: Names drawn in colour, the others in grey; if empty, all are in colour.
 
     Raises:
-        GavoError: a figure cannot be written.
+        GavoError: A figure cannot be written.
     """
     if not plots.available():
         return []
@@ -49,10 +49,10 @@ def draw(
 
 
 def draw_search(folder: Path, sequence: Sequence, odometry: Odometry, steps: list[Step]) -> None:
-    """Write the figures of the search, where matplotlib is installed: convergence, landscape, last population.
+    """Write the figures of the search if matplotlib is installed: convergence, last population, landscape.
 
     Raises:
-        GavoError: a figure cannot be written.
+        GavoError: A figure cannot be written.
     """
     good = [step for step in steps if not step.lost]
     if not plots.available() or not good:
@@ -91,7 +91,7 @@ def _reference_of(sequence: Sequence, step: Step) -> int:
 
 
 def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landscape | None:
-    """Return E around the motion of a step at the coarsest and the finest level; None where a frame is unreadable."""
+    """Return E around the motion of a step at the coarsest and the finest level; None if a frame is unreadable."""
     settings = odometry.settings
     levels = dict.fromkeys((settings.solver.levels[0], settings.solver.levels[-1]))
     try:
@@ -102,10 +102,10 @@ def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landsca
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> Picture:
-    """Write a figure as NAME.png and NAME.svg, and return it as a report takes it.
+    """Write a figure as NAME.png and NAME.svg, and return the latter for a report.
 
     Raises:
-        GavoError: a file cannot be written.
+        GavoError: A file cannot be written.
     """
     _, vector = plots.save(figure, folder, name)
     return Picture(" ".join(figure.get_supxlabel().split()), vector)

@@ -1,7 +1,7 @@
-"""What figures are made of: captions, panels, styles of curves, names beside them, a scale.
+"""Parts of figures: captions, panels, styles and labels of curves, scale bars.
 
-Colours are ones that colour-blind people tell apart; line styles, markers and hatches tell the curves and bars apart
-without colour.
+The colours are safe for colour-blind readers; line styles, markers and hatches distinguish curves and bars without
+colour.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#8C7A1F")
-"""Colours of Okabe and Ito; the last two, of Tol's scheme, take the place of their yellow and black."""
+"""Okabe and Ito's colours, with Tol's wine and an olive in place of their yellow and black."""
 GREYS = (0.3, 0.6)
-"""Greys of other libraries' curves, the darkest and the lightest."""
+"""Darkest and lightest grey of other libraries' curves."""
 LINES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 CAPTION_WIDTH, CAPTION_SIZE = 15, 8.5
-"""Letters of a caption per inch of figure width, and their size in points; legible when the figure is scaled down."""
+"""Characters of a caption per inch of figure width, and their size in points: legible in a figure scaled down."""
 SMALL = 0.1
-"""Extent, metres, below which millimetres are drawn."""
+"""Extent, metres, below which figures use millimetres."""
 
 
 def shown_name(name: str) -> str:
@@ -38,7 +38,7 @@ def shown_name(name: str) -> str:
 
 
 def new_figure(width: float, height: float, caption: str) -> Figure:
-    """Return a figure (inches) with a caption and nothing else, that belongs to no window and to no global state."""
+    """Return an empty figure of a size in inches with a caption, tied to no window or global state."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -47,13 +47,13 @@ def new_figure(width: float, height: float, caption: str) -> Figure:
 
 
 def add_legend(figure: Figure) -> None:
-    """Name what the first panel shows, above all panels: within one it would cover curves."""
+    """Add the first panel's legend above all panels, where it covers no curves."""
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize="small")
 
 
 def number_frames(axes: Any, stamps: Float[np.ndarray, " n"]) -> None:
-    """Add an axis on top that counts the frames at these times."""
-    # beyond the last frame the axis goes on, so that no number above it is written at its place
+    """Add a top axis that numbers the frames at these times."""
+    # extended beyond both ends: `interp` clamps, which would put larger numbers at the last frame
     span = max(float(stamps[-1] - stamps[0]), 1e-6)
     stamps = np.array([stamps[0] - span, *stamps, stamps[-1] + span])
     numbers = np.array([2 - len(stamps), *range(len(stamps) - 2), 2 * len(stamps)])
@@ -74,8 +74,8 @@ LABEL_HEIGHT = 0.05
 def label_ends(axes: Any) -> None:
     """Write each curve's name beside the panel at the height of its last point, in its colour.
 
-    Names of curves that end together make room, and a line leads to each one's end. Where some end at one point, a
-    piece of each curve stands before its name instead.
+    Names that would overlap are moved apart, and a line leads from each to its curve's end. If any curves end at the
+    same point, a sample of each curve stands before its name instead.
     """
     low, high = axes.get_ylim()
     ends = {line: (float(line.get_xdata()[-1]), float(line.get_ydata()[-1])) for line in axes.lines if _drawn(line)}
@@ -104,14 +104,14 @@ def label_ends(axes: Any) -> None:
 
 
 def _drawn(line: Any) -> bool:
-    """Whether a line is a curve with a name."""
+    """Whether a line is a named curve."""
     return len(line.get_xdata()) > 0 and not str(line.get_label()).startswith("_")
 
 
 def _draw_leader(axes: Any, end: tuple[float, float], place: float) -> None:
     """Draw a thin line from the end of a curve to its name beside the panel.
 
-    It is dotted where it crosses the panel: it is no curve.
+    It is dotted if the curve ends well inside the panel, so that it is not taken for a curve.
     """
     style = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
     across = {"linestyle": ":", "linewidth": 0.8} if end[0] < axes.get_xlim()[0] + 0.9 * np.ptp(axes.get_xlim()) else {}
@@ -119,16 +119,16 @@ def _draw_leader(axes: Any, end: tuple[float, float], place: float) -> None:
 
 
 def _draw_sample(axes: Any, line: Any, place: float) -> None:
-    """Draw a piece of a curve before its name beside the panel."""
+    """Draw a sample of a curve before its name beside the panel."""
     names = ("color", "linestyle", "linewidth", "marker", "markersize")
     style = {name: getattr(line, f"get_{name}")() for name in names}
     axes.plot([1.03, 1.065, 1.1], [place] * 3, transform=axes.transAxes, clip_on=False, markevery=[1], **style)
 
 
 def apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float, float]) -> Float[np.ndarray, " n"]:
-    """Move descending places as little as needed to keep a distance and, if there is room, the limits."""
+    """Move descending places as little as needed to keep a minimum distance and, if there is room, the limits."""
     steps = -distance * np.arange(len(places))
-    flat = places - steps  # falling by at least the distance where this does not rise
+    flat = places - steps  # does not rise where the distance is kept
     level, blocks = [], []
     for value in flat.tolist():  # pool adjacent violators
         level.append(value)
@@ -143,7 +143,7 @@ def apart(places: Float[np.ndarray, " n"], distance: float, limits: tuple[float,
 
 
 def panels_of(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
-    """Return panels side by side, each with a scale of its own upwards, or all with one."""
+    """Return panels side by side, each with its own vertical scale or all with the same one."""
     panels = list(figure.subplots(1, count, squeeze=False, sharey=one_scale)[0])
     for axes in panels:
         axes.grid(alpha=0.3)
@@ -152,7 +152,7 @@ def panels_of(figure: Figure, count: int, one_scale: bool = False) -> list[Any]:
 
 
 def draw_band(axes: Any, x: Any, samples: Float[np.ndarray, "samples n"], middle: str, range_: str) -> None:
-    """Draw the median of samples with the range of their middle 80 %, where there is any."""
+    """Draw the median of samples and the range of their middle 80 %; nothing if no sample is finite."""
     if not np.isfinite(samples).any():
         return
     low, median, high = np.nanquantile(samples, [0.1, 0.5, 0.9], axis=0)
@@ -161,9 +161,7 @@ def draw_band(axes: Any, x: Any, samples: Float[np.ndarray, "samples n"], middle
 
 
 def draw_scale(axes: Any, unit: str) -> None:
-    """Draw a bar of a round length, a fifth to a half of the panel, into the lower corner that is farther from the
-    start.
-    """
+    """Draw a scale bar in the lower corner farther from the start; its round length is a fifth to half of the panel."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     power = 10.0 ** np.floor(np.log10(right - left))
     length = max(digit * power for digit in (0.1, 0.2, 0.5, 1.0, 2.0) if digit * power <= 0.5 * (right - left))
@@ -176,15 +174,15 @@ def draw_scale(axes: Any, unit: str) -> None:
 
 
 def unit_of(extent: float) -> tuple[float, str]:
-    """Return the factor from metres, and the unit, in which to draw an extent in metres."""
+    """Return the factor from metres to the unit in which to draw an extent in metres, and that unit."""
     return (1e3, "mm") if extent < SMALL else (1.0, "m")
 
 
 def styles(names: Collection[Any], ours: Collection[str] = ()) -> Iterator[dict[str, Any]]:
     """Yield a colour, line style and marker for each curve; neighbours differ in all three.
 
-    Those that are not ours are thin and grey. Of the others the first ones are wider, and show beside those drawn over
-    them where methods coincide.
+    Curves that are not ours are thin and grey. Of the others, earlier ones are wider, so that they show behind later
+    ones that coincide with them.
     """
     muted = [name for name in names if ours and name not in ours]
     greys = iter(np.linspace(*GREYS, max(len(muted), 2)).tolist())

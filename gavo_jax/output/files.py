@@ -1,4 +1,4 @@
-"""A run's files by name, and JSON and folders as they are written and read."""
+"""Names of a run's files, and helpers for JSON and folders."""
 
 import dataclasses
 import enum
@@ -38,7 +38,7 @@ VIEW = "view.rrd"
 
 
 def environment() -> dict[str, str]:
-    """Return the versions that decide a result."""
+    """Return the versions of software that affect a result, and the platform."""
     return {
         "gavo-jax": __version__,
         "jax": jax.__version__,
@@ -50,7 +50,7 @@ def environment() -> dict[str, str]:
 
 
 def circumstances(settings: Settings) -> dict[str, Any]:
-    """Return what config.json says beside the sequence and the options: what decides a result."""
+    """Return what config.json holds besides the sequence and the options: settings, device and versions."""
     return {
         "solver": settings.solver,
         "alignment": settings.alignment,
@@ -61,7 +61,7 @@ def circumstances(settings: Settings) -> dict[str, Any]:
 
 
 def describe(value: Any) -> Any:
-    """Return a value as JSON knows it: settings with the name of their type, arrays as lists, not-a-number as null."""
+    """Convert a value for JSON: settings become objects with their type, arrays lists, non-finite numbers null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         shown = [field.name for field in dataclasses.fields(value) if field.repr]
         entries = {name: describe(getattr(value, name)) for name in shown}
@@ -82,17 +82,17 @@ def describe(value: Any) -> Any:
 
 
 ROW = re.compile(r'\[\n\s*([^][{}"]*?)\n\s*\]')
-"""A list of numbers as `json` writes it, one per line. No string has a line break that is not escaped."""
+"""A list of numbers as `json` writes it, one per line. Strings do not match, as their line breaks are escaped."""
 
 
 def json_text(value: Any, ensure_ascii: bool = True) -> str:
-    """A value (see `describe`) as JSON that people can read: each list of numbers, as a row of a matrix, is a line."""
+    """Format a value (see `describe`) as readable JSON; each list of numbers, such as a matrix row, is one line."""
     text = json.dumps(describe(value), indent=2, allow_nan=False, ensure_ascii=ensure_ascii)
     return ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
 
 
 def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
-    """The places where two JSON values differ: dotted name, one value, the other."""
+    """Yield where two JSON values differ: the dotted name and both values, abridged."""
     if isinstance(before, dict) and isinstance(after, dict):
         for key in dict.fromkeys([*after, *before]):
             yield from differences(before.get(key), after.get(key), f"{name}.{key}".lstrip("."))
@@ -104,7 +104,7 @@ def prepare_folder(folder: str | Path) -> Path:
     """Create a folder if it is missing, check that it is writable, and return it.
 
     Raises:
-        GavoError: it is no folder or cannot be written to.
+        GavoError: It is not a folder or cannot be written to.
     """
     folder = Path(folder)
     try:
@@ -118,25 +118,25 @@ def prepare_folder(folder: str | Path) -> Path:
 
 
 def refuse_foreign(folder: Path, file: str, what: str) -> None:
-    """Refuse a folder that holds results of another kind: figures of both have the same names.
+    """Refuse a folder that holds results of another kind, as their figures have the same names.
 
     Args:
         folder: The folder.
-        file: The file that tells of other results.
-        what: What that file is of, for the message.
+        file: Name of a file that identifies those results.
+        what: Kind of those results, for the message.
 
     Raises:
-        GavoError: The file is there.
+        GavoError: The file exists.
     """
     if (folder / file).exists():
         raise GavoError(f"{folder}: holds {what} ({file}): name another folder")
 
 
 def remove_files(folder: Path, *names: str) -> None:
-    """Remove files of an earlier run, and any that a killed process left half written.
+    """Remove files of an earlier run, and partial ones left by a killed process.
 
     Raises:
-        GavoError: one cannot be removed.
+        GavoError: One cannot be removed.
     """
     for path in (path for name in names for path in (folder / name, *folder.glob(f"{name}.*{PARTIAL}"))):
         try:
@@ -146,18 +146,18 @@ def remove_files(folder: Path, *names: str) -> None:
 
 
 def remove_figures(folder: Path) -> None:
-    """Remove an earlier run's figures, where there are any.
+    """Remove an earlier run's figures, if there are any.
 
     Raises:
-        GavoError: one cannot be removed.
+        GavoError: One cannot be removed.
     """
     remove_files(folder, *(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value (see `describe`) as JSON, whole or not at all.
+    """Write a value (see `describe`) as JSON, atomically.
 
     Raises:
-        GavoError: the file cannot be written.
+        GavoError: The file cannot be written.
     """
     write_lines(path, [json_text(value)])

@@ -1,4 +1,4 @@
-"""frames.csv: a step as a row, and the steps of a run read back."""
+"""frames.csv: steps as rows, and the steps of a run read back."""
 
 import csv
 import io
@@ -22,28 +22,30 @@ FRAME_COLUMNS = (
     + DEVIATIONS
     + ("milliseconds", "segment", "statuses", "origin", "revises")
 )
-"""Columns of frames.csv, one row per pair: stamps in seconds, error in squared grey levels, overlap from 0 to 1, the
-direction that a `low_texture` pair leaves undetermined, what was recorded for a lost pair (`OdometryOptions.on_lost`),
-deviations of the motion's translation (m) and rotation (rad) along the axes of the reference camera, the trajectory's
-segment from 0, every status that holds, with blanks between, and where the pose is from: `tracked`, `relocalised` (the
-reference is then a keyframe of the map) or `guessed` (a lost pair, or a motion gone on with behind a body). The last
-one is how many of the pairs before are wrong, as is seen then: their status says so once the run has come to its
-end."""
+"""Columns of frames.csv, one row per pair.
+
+Timestamps are in seconds, `error` is E in squared grey levels, `overlap` a share from 0 to 1. `undetermined` names the
+directions that a `low_texture` pair leaves open, `on_lost` what was recorded for a lost pair. The deviations are those
+of the translation (m) and rotation (rad) along the axes of the reference camera. Segments count from 0; `statuses` are
+all that hold, separated by spaces. `origin` is `tracked`, `relocalised` (the reference is a keyframe of the map) or
+`guessed` (a lost pair, or a motion extrapolated behind a body). `revises` is the number of preceding pairs that turn
+out to be wrong; their statuses change when the run ends.
+"""
 
 
 def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]:
     """Read the steps of a run from its trajectory.txt and frames.csv.
 
-    Motions are those between the poses as they were found: of odometry.txt, where loops have corrected them since.
-    Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame whose stamp is in
-    doubt has no pose; it gets the one before it.
+    Motions are those between the poses as tracked: from odometry.txt if it exists, as loops have corrected
+    trajectory.txt. Off-diagonal covariances and histories are not in the files: they are zero and empty. A frame whose
+    timestamp is in doubt has no pose and gets the preceding one.
 
     Args:
-        folder: Of the run.
-        trajectory: Of trajectory.txt, where it has been read already.
+        folder: Folder of the run.
+        trajectory: Contents of trajectory.txt, if read already.
 
     Raises:
-        GavoError: a file cannot be read or is damaged, or the poses are of another run.
+        GavoError: A file cannot be read or is damaged, or the poses belong to another run.
     """
     poses = Trajectory.read_tum(folder / TRAJECTORY) if trajectory is None else trajectory
     found = Trajectory.read_tum(folder / ODOMETRY) if (folder / ODOMETRY).exists() else poses
@@ -52,7 +54,7 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     place = now = 0
     rows = _rows_of(folder / FRAMES)
     while len(rows) > 1 and len(rows) >= len(poses) and rows[-1]["timestamp"] not in {**by_stamp, **found_at}:
-        rows.pop()  # its pose was not written yet
+        rows.pop()  # its pose is not written yet
     for number, row in enumerate(rows, start=1):
         try:
             stamp = float(row["timestamp"])
@@ -66,7 +68,7 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
             now = found_at.get(row["timestamp"], now)
             reference = float(row["reference_timestamp"])
             before = found_at.get(row["reference_timestamp"], now)
-            if row["reference_timestamp"] in found_at:  # with all its digits, by which steps are told to follow others
+            if row["reference_timestamp"] in found_at:  # with all digits, by which consecutive steps are recognised
                 reference = float(found.timestamps[before])
             target_T_reference = inverse(found.world_T_camera[now]) @ found.world_T_camera[before]
             steps.append(_read_step(row, reference, stamp, poses.world_T_camera[place], target_T_reference))
@@ -85,7 +87,7 @@ def _rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def _require_pose(folder: Path, stamp: str, poses: Mapping[str, int], found: Mapping[str, int]) -> None:
-    """Raise GavoError where a frame of frames.csv has no pose."""
+    """Raise GavoError if a frame of frames.csv has no pose."""
     for name, stamps in ((TRAJECTORY, poses), (ODOMETRY, found)):
         if stamp not in stamps:
             raise GavoError(f"{folder}: {name} and {FRAMES} are not of the same run: no pose at {stamp}")
@@ -123,11 +125,11 @@ def _read_step(
 
 
 def with_hindsight(lines: Sequence[str], steps: Sequence[Step]) -> list[str]:
-    """The lines of frames.csv, with what is known at the end of pairs that a later one revises.
+    """Return the lines of frames.csv with new statuses and deviations of the pairs that later ones revise.
 
     Args:
-        lines: Of the file.
-        steps: As the driver made them, one per row.
+        lines: Lines of the file, the header included.
+        steps: The driver's steps, one per row.
     """
     lines = list(lines)
     for place, (step, after) in enumerate(zip(steps, revised(steps), strict=True), start=1):
@@ -141,14 +143,14 @@ def with_hindsight(lines: Sequence[str], steps: Sequence[Step]) -> list[str]:
 
 
 def as_line(values: Iterable[Any]) -> str:
-    """Values as a line of CSV."""
+    """Return values as a line of CSV."""
     row = io.StringIO()
     csv.writer(row, lineterminator="").writerow(values)
     return row.getvalue()
 
 
 def frame_row(step: Step) -> list[Any]:
-    """Return the values of `FRAME_COLUMNS` of one step; numbers in the shortest digits that read back exactly."""
+    """Return a step's values of `FRAME_COLUMNS`; error, overlap and deviations read back exactly."""
     alignment = step.alignment
     deviations = np.sqrt(np.maximum(np.diag(np.asarray(alignment.covariance, np.float64)), 0.0))
     return [
@@ -183,7 +185,7 @@ def read_run(folder: str | Path) -> RecordedRun:
     """Read the files of a run, finished or not.
 
     Raises:
-        GavoError: a file is missing or damaged, or trajectory.txt and frames.csv are not of the same run.
+        GavoError: A file is missing or damaged, or trajectory.txt and frames.csv are from different runs.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -192,7 +194,7 @@ def read_run(folder: str | Path) -> RecordedRun:
     if not (folder / CONFIG).exists():
         raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
     config = read_json_object(folder / CONFIG)
-    # a run with loops that was killed has the poses as they were found alone
+    # a killed run with loops has only the poses as tracked
     is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()
     trajectory = Trajectory.read_tum(folder / (ODOMETRY if is_cut_short else TRAJECTORY))
     return RecordedRun(config, trajectory, revised(read_steps(folder, trajectory)))

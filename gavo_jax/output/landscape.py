@@ -1,4 +1,4 @@
-"""The error around a motion that was found: E along the directions that the images hold worst and best."""
+"""The error E around the motion found, along its worst- and best-conditioned directions."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,18 +18,18 @@ from gavo_jax.se3 import exp
 from gavo_jax.settings import AlignmentOptions
 
 REACH, STEPS = 0.1, 81
-"""Metres or radians to either side, and the number of motions scored along a direction."""
+"""Reach to either side, metres or radians, and number of motions scored along a direction."""
 
 
 class Landscape(NamedTuple):
     """E around a motion, along two directions of δ in target_T_reference · exp(δ)."""
 
     steps: Float[np.ndarray, " n"]
-    """Along unit vectors of δ (m, rad)."""
+    """Lengths along unit vectors of δ (m, rad)."""
     directions: Float[np.ndarray, "2 6"]
-    """The worst- and the best-conditioned one."""
+    """Unit vectors of the worst- and the best-conditioned direction."""
     errors: Mapping[int, Float[np.ndarray, "2 n"]]
-    """E by level, squared grey levels; +inf where a motion is worthless."""
+    """E by level, squared grey levels; +inf for an invalid motion."""
 
 
 def error_landscape(
@@ -43,12 +43,12 @@ def error_landscape(
     """Score motions around an alignment, along the eigenvectors of largest and smallest variance of its covariance.
 
     Args:
-        reference: frame t.
-        target: frame t + 1.
-        camera: their camera, without distortion.
-        alignment: the motion between them, on the host.
-        options: what is minimised.
-        levels: pyramid levels to score.
+        reference: The reference frame.
+        target: The target frame.
+        camera: Camera of both, without distortion.
+        alignment: Alignment of the two, on the host.
+        options: Definition of E.
+        levels: Pyramid levels to score.
     """
     _, vectors = np.linalg.eigh(np.asarray(alignment.covariance, np.float64))
     directions = vectors.T[[-1, 0]]

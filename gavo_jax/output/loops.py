@@ -1,4 +1,4 @@
-"""loops.csv: the loops of a run, one row each."""
+"""loops.csv: one row per loop of a run."""
 
 import csv
 import io
@@ -19,13 +19,14 @@ LOOP_COLUMNS = (
     + DEVIATIONS
     + ("disagreement_m", "disagreement_rad")
 )
-"""Indices and stamps of the two frames, whether the loop counts (0: it was found to be wrong), the overlap of the two,
-what is left between the alignment and the map (m, rad, in the later camera), the standard deviations that it was
-weighted with, and how far the alignments there and back were apart."""
+"""Columns of loops.csv: indices and timestamps (s) of both keyframes, whether the loop counts (0: it is false), and
+their overlap. Then the residual between the alignment and the map with its standard deviations, in the later camera (m,
+rad), and the difference between the alignments there and back.
+"""
 
 
 def write_loops(folder: Path, loops: Loops) -> None:
-    """Write loops.csv, whole or not at all.
+    """Write loops.csv atomically.
 
     Raises:
         GavoError: It cannot be written.

@@ -1,6 +1,6 @@
-"""masks/: where bodies are, an image per frame that shows one, named by its colour stamp.
+"""masks/: one image for each frame that shows a body, named by the colour timestamp.
 
-Each pixel has the number of the body that covers it, 0 where nothing moves.
+Each pixel holds the number of the body that covers it, 0 for the background.
 """
 
 from pathlib import Path
@@ -14,15 +14,15 @@ from gavo_jax.odometry.driver import Step
 from gavo_jax.trajectory import stamp_name
 
 MASKS = "masks"
-"""The folder, in that of a run."""
+"""Name of the folder inside that of a run."""
 
 
 def write_masks(folder: Path, step: Step) -> None:
-    """Write where a step's bodies are, if it shows any.
+    """Write the masks of a step's bodies, if there are any.
 
     Args:
-        folder: Of the run.
-        step: Of the frame.
+        folder: Folder of the run.
+        step: Step of the frame.
 
     Raises:
         GavoError: It cannot be written.
@@ -44,7 +44,7 @@ def write_masks(folder: Path, step: Step) -> None:
 
 
 def read_masks(folder: Path, timestamp: float) -> Bool[np.ndarray, "height width"] | None:
-    """Return where any body was in a frame; see `read_labels`."""
+    """Return the pixels that any body covers in a frame; see `read_labels`."""
     labels = read_labels(folder, timestamp)
     return None if labels is None else labels > 0
 
@@ -53,8 +53,8 @@ def read_labels(folder: Path, timestamp: float) -> Integer[np.ndarray, "height w
     """Return the number of the body at each pixel of a frame, 0 for background; None if the run saw no body.
 
     Args:
-        folder: Of the run.
-        timestamp: The frame's colour stamp, seconds.
+        folder: Folder of the run.
+        timestamp: The frame's colour timestamp, seconds.
 
     Raises:
         GavoError: It cannot be read.
@@ -73,7 +73,7 @@ def read_labels(folder: Path, timestamp: float) -> Integer[np.ndarray, "height w
 
 
 def remove_masks(folder: Path, after: float = -np.inf) -> None:
-    """Remove the images of frames after a stamp, and the folder if nothing is left in it.
+    """Remove the images of frames after a timestamp, and the folder if it is empty then.
 
     Raises:
         GavoError: One cannot be removed.
@@ -82,8 +82,8 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
     if inside.is_symlink() or not inside.is_dir():
         return
     try:
-        for path in (*inside.glob("*.png"), *inside.glob(f"*.png.*{PARTIAL}")):  # also what a kill left half written
-            if _stamp(path) > float(stamp_name(after)):  # as names have it
+        for path in (*inside.glob("*.png"), *inside.glob(f"*.png.*{PARTIAL}")):  # also partial files of a killed run
+            if _stamp(path) > float(stamp_name(after)):  # rounded as in the names
                 path.unlink()
         if not any(inside.iterdir()):
             inside.rmdir()
@@ -96,7 +96,7 @@ def _path(folder: Path, timestamp: float) -> Path:
 
 
 def _stamp(path: Path) -> float:
-    """Return the stamp of the frame, seconds; not-a-number where the file is not of a run."""
+    """Return the timestamp in a file's name, seconds; NaN if the file is not from a run."""
     try:
         return float(path.name.partition(".png")[0])
     except ValueError:

@@ -18,12 +18,13 @@ MOTION_COLUMNS = (
     + tuple(f"covariance_{row}{column}" for row, column in zip(*UPPER, strict=True))
     + tuple(f"sway_{axis}" for axis in range(6))
 )
-"""Columns of motions.csv, one row per pair: the frame's index, stamps in seconds, the upper three rows of the pose and
-of the pair's motion, metres, the upper triangle of its covariance, and its sway, of (v, w), metres and radians."""
+"""Columns of motions.csv, one row per pair: the frame's index and timestamps (s), the upper three rows of the pose and
+of the pair's motion (m), and the upper triangle of the motion's covariance and its sway, for (v, w) in m and rad.
+"""
 
 
 def motion_row(step: Step) -> list[Any]:
-    """Values of `MOTION_COLUMNS` of one step, in digits that read back exactly."""
+    """Return the values of `MOTION_COLUMNS` of one step, in digits that read back exactly."""
     matrices = (step.world_T_camera, step.alignment.target_T_reference)
     numbers = [*(np.asarray(matrix, np.float64)[:3].ravel() for matrix in matrices)]
     numbers += [np.asarray(step.alignment.covariance, np.float64)[UPPER], np.asarray(step.alignment.sway, np.float64)]
@@ -35,7 +36,7 @@ def with_motions(steps: list[Step], path: Path) -> list[Step]:
     """Return steps updated with the values of motions.csv.
 
     Raises:
-        GavoError: It cannot be read, or is of other steps.
+        GavoError: It cannot be read, or belongs to other steps.
     """
     lines = read_text(path).splitlines()[1:]
     try:

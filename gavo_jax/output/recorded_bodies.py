@@ -14,10 +14,10 @@ from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
 
 class RecordedBodies:
-    """Gives the steps of a recorded run their bodies back, without the alignments of these.
+    """Restores the bodies of a recorded run's steps, without the bodies' alignments.
 
     Args:
-        folder: The run's.
+        folder: Folder of the run.
 
     Raises:
         GavoError: A file cannot be read.
@@ -29,15 +29,15 @@ class RecordedBodies:
         for row in read_bodies(folder / BODIES):
             self._rows.setdefault(stamp_name(row.timestamp), []).append(row)
         self._odometry: dict[str, np.ndarray] = {}
-        if (folder / ODOMETRY).exists():  # bodies are told in its world, steps in the one that loops corrected
+        if (folder / ODOMETRY).exists():  # bodies are in its world, steps in the one corrected by loops
             odometry = Trajectory.read_tum(folder / ODOMETRY)
             self._odometry = dict(zip(map(stamp_name, odometry.timestamps), odometry.world_T_camera, strict=True))
 
     def restore(self, step: Step) -> Step:
-        """A step with its bodies, in the world of its pose.
+        """Return a step with its bodies, in the world of its pose.
 
         Raises:
-            GavoError: The image of where they are cannot be read.
+            GavoError: Their mask image cannot be read.
         """
         rows = self._rows.get(stamp_name(step.timestamp), [])
         labels = read_labels(self._folder, step.timestamp) if rows else None

@@ -1,4 +1,4 @@
-"""A report that is one file: tables, figures, configuration and versions as HTML, without network or script."""
+"""Reports in one HTML file: tables, figures, configuration and versions, without network access or scripts."""
 
 import base64
 import html
@@ -11,7 +11,7 @@ from gavo_jax.output.files import json_text
 from gavo_jax.trajectory import write_lines
 
 REPORT = "report.html"
-"""Name of the file in a folder of results."""
+"""Name of the report in a folder of results."""
 
 MEDIA_TYPES = {".svg": "image/svg+xml", ".png": "image/png"}
 
@@ -34,10 +34,10 @@ pre { background: #f5f5f5; padding: 1rem; overflow-x: auto; font-size: 0.8rem; l
 
 
 class Table(NamedTuple):
-    """A table; cells are shown as `str` gives them."""
+    """A table; cells are formatted by `str`."""
 
     caption: str
-    """What its numbers are, with their units."""
+    """Meaning of the numbers, with units."""
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
 
@@ -46,7 +46,7 @@ class Picture(NamedTuple):
     """A figure from a file."""
 
     caption: str
-    """What it shows, with the definition of what is measured."""
+    """What the figure shows, with a definition of what is measured."""
     path: Path
     """SVG or PNG."""
 
@@ -60,19 +60,19 @@ def write_report(
     versions: Mapping[str, str],
     introduction: str = "",
 ) -> None:
-    """Write the report, whole or not at all. Nothing in it is fetched: figures are inlined, and scripts are forbidden.
+    """Write the report atomically. It loads nothing: figures are inlined, and scripts are forbidden.
 
     Args:
-        path: the file, HTML.
-        title: its heading.
-        tables: in their order.
-        figures: in their order; their files are read now.
-        configuration: what it takes to repeat the work, as `output.files.describe` takes it.
-        versions: of the software behind it, by name.
-        introduction: a paragraph below the title.
+        path: The HTML file.
+        title: Heading.
+        tables: Tables in order.
+        figures: Figures in order; their files are read.
+        configuration: What is needed to repeat the work; see `output.files.describe`.
+        versions: Software versions by name.
+        introduction: Paragraph below the title.
 
     Raises:
-        GavoError: a figure cannot be read or is neither SVG nor PNG, or the report cannot be written.
+        GavoError: A figure cannot be read or is neither SVG nor PNG, or the report cannot be written.
     """
     settings = json_text(configuration, ensure_ascii=False)
     body = [
@@ -113,7 +113,7 @@ def _table(table: Table) -> str:
 
 
 def _figure(picture: Picture) -> str:
-    """Inline a picture as an image of its own, so that the identifiers inside several SVG files do not clash."""
+    """Inline a picture as a separate image, so that the identifiers inside several SVG files do not clash."""
     path = Path(picture.path)
     media_type = MEDIA_TYPES.get(path.suffix.lower())
     if media_type is None:

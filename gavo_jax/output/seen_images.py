@@ -1,25 +1,25 @@
-"""Whether the images that a run has seen are still the same when it goes on."""
+"""Checks that the images a run has seen are unchanged when it is resumed."""
 
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 TAIL = 64
-"""Bytes at a file's end. In a PNG they hold the checksum of all pixels, so that nothing else has to be read."""
+"""Bytes read at a file's end. In a PNG they hold the checksum of all pixels, so that nothing else is needed."""
 
 
 class SeenImages:
-    """A digest of images, frame after frame.
+    """A digest of image files, updated frame by frame.
 
     Args:
-        files: Of each frame, in their order; none where frames do not come from files.
+        files: Files of each frame, in order; empty if frames do not come from files.
     """
 
     def __init__(self, files: Sequence[Sequence[Path]] = ()) -> None:
         self._files, self._count, self._sha256 = files, 0, hashlib.sha256()
 
     def up_to(self, index: int) -> str:
-        """Take the frames in up to that one, and return the digest of all so far."""
+        """Add the frames up to an index, and return the digest of all so far."""
         for paths in self._files[self._count : index + 1]:
             for path in paths:
                 self._sha256.update(_fingerprint(path))
@@ -28,7 +28,7 @@ class SeenImages:
 
 
 def _fingerprint(path: Path) -> bytes:
-    """Return a file's size and last bytes, or a marker if it is unreadable."""
+    """Return a hash of a file's size and last bytes, or zeros if it is unreadable."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, 2)

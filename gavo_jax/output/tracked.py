@@ -19,14 +19,14 @@ class Tracked(NamedTuple):
     """Result of tracking a sequence, possibly only up to an interruption."""
 
     steps: list[Step]
-    """As they came."""
+    """Steps in the order of the frames."""
     interrupted: bool
     seconds: float
-    """Wall time, decoding included, compilation left out."""
+    """Wall time of the tracking, decoding included, compilation excluded."""
     compile_seconds: float
 
     def outcome(self, sequence: Sequence) -> RunOutcome:
-        """What a run over a sequence comes to, which was tracked from its first frame on."""
+        """Finish a run that was tracked from the sequence's first frame on; see `finish_run`."""
         first, truth = float(sequence.timestamps[0]), sequence.ground_truth
         return finish_run(first, self.steps, truth, None, self.seconds, self.compile_seconds)
 
@@ -39,10 +39,10 @@ def track_visibly(
     viewer: Viewer = NO_VIEWER,
     mapper: BackgroundMapper | None = None,
 ) -> Tracked:
-    """Compile, then track every frame, from where the driver stands, under a progress bar and before a viewer's eyes.
+    """Compile, then track the frames that the driver has not seen yet, with a progress bar and a viewer.
 
     Raises:
-        KeyboardInterrupt: the user stopped it before the first pair was done.
+        KeyboardInterrupt: The user stopped it before a pair was done.
     """
     pairs, done = len(sequence) - 1, max(odometry.progress.last_index, 0)
     steps: list[Step] = []
