@@ -1,7 +1,7 @@
-"""Figures as files: trajectories and their errors, convergence, the error's landscape, basins and drift; PNG and SVG.
+"""Figures of trajectories, their errors, convergence, populations, landscapes of E, basins and drift, as PNG and SVG.
 
-Every function draws one figure from arrays and returns it, with a caption that defines what is measured; `save` writes
-it. Where some methods are called ours, the others are grey.
+Each `plot_` function draws one figure from arrays and returns it, with a caption that defines what is measured; `save`
+writes it.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def available() -> bool:
 
 
 SMALLEST_EXCESS = 1e-3
-"""Per cent; a smaller excess is drawn as this."""
+"""Smallest excess drawn, per cent; smaller ones are drawn as this."""
 PANEL_WIDTH = 2.5
-"""Inches, where each level has a panel."""
+"""Width of a level's panel, inches."""
 
 CAPTIONS = {
     "trajectory": "Camera positions in the frame of the first camera; the square is the start.",
@@ -69,26 +69,26 @@ CAPTIONS = {
     "basin": "Share of frame pairs whose motion is found from a zero guess to within 5 cm and 3 deg, over the median "
     "rotation between the frames of a pair.",
 }
-"""Caption of each figure, by the name of its files."""
+"""Caption of each figure by the name of its files."""
 WITH_TRUTH = (
     " Ground truth: interpolated at the frames' stamps, laid on the first estimate at its first pose that the "
     "ground truth covers."
 )
-"""What the trajectories' caption ends with where there is a ground truth."""
+"""End of the trajectories' caption if there is a ground truth."""
 GAPS = " Gaps: too little of the view is left."
-"""What the landscape's caption ends with where there are gaps."""
+"""End of the landscape's caption if there are gaps."""
 SEVERAL_RUNS = " Bars: median over the runs; whiskers: smallest and largest."
-"""What the drift's caption ends with where there are several runs."""
+"""End of the drift's caption if there are several runs."""
 MORE_THAN_THE_PAIR = " The motion was found with {}, too: the minimum of this pair alone may lie millimetres away."
-"""What the landscape's caption ends with where more than the pair was searched."""
+"""End of the landscape's caption if more than the pair's images determined the motion."""
 
 
 def plot_distance_error(errors: Mapping[str, ErrorSeries], ours: Collection[str] = ()) -> Figure:
-    """Draw the distance error of each named run over time and frames, as the paper's figures 5 and 9.
+    """Draw the distance error of each named run over time and frames, as in the paper's figures 5 and 9.
 
     Args:
-        errors: of each run.
-        ours: runs in colour; the others are grey. All of them where none is named.
+        errors: Errors by the run's name.
+        ours: Names drawn in colour, the others in grey; if empty, all are in colour.
     """
     figure = new_figure(7.0 if len(errors) == 1 else 8.0, 4.4, CAPTIONS["distance_error"])
     axes = figure.add_subplot()
@@ -118,16 +118,16 @@ def plot_distance_error(errors: Mapping[str, ErrorSeries], ours: Collection[str]
 def plot_trajectories(
     estimates: Mapping[str, Trajectory], truth: Trajectory | None, ours: Collection[str] = ()
 ) -> Figure:
-    """Draw each named trajectory from above and upright, all seen from their first camera (x right, z forward).
+    """Draw each named trajectory from above and from the side, in the frame of its first camera (x right, z forward).
 
-    The upright panel looks along z or, where the paths are longer along z than along x, along x. Both panels have one
-    scale. The truth, where there is any, is taken at the stamps of the first estimate that it covers; its first such
-    pose is laid on that estimate's.
+    The side view looks along z or, if the paths extend further along z than along x, along x. Both panels have the
+    same scale. The truth is interpolated at those timestamps of the first estimate that it covers; its first such pose
+    is aligned to that estimate's.
 
     Args:
-        estimates: the trajectories.
-        truth: what they are compared with.
-        ours: estimates in colour; the others are grey. All of them where none is named.
+        estimates: The trajectories.
+        truth: The true trajectory, or None.
+        ours: Names drawn in colour, the others in grey; if empty, all are in colour.
     """
     true_path = None if truth is None else _true_path(next(iter(estimates.values())), truth)
     paths = {name: _path(estimate) for name, estimate in estimates.items()}
@@ -160,23 +160,23 @@ def plot_trajectories(
 
 
 UPWARDS = np.array([1.0, -1.0, 1.0])
-"""Camera axes, y downwards, into what is drawn."""
+"""Factors from camera axes, y downwards, to those drawn, y upwards."""
 AXES = ("x, right", "−y, up", "z, forward")
 SIDES = np.array([-1.0, 1.0])
 HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 MARGIN = 1.3
-"""Sides of a panel over those of what it holds: the start at an edge leaves room for its name."""
+"""Sides of a panel over those of its content; a start at an edge has room for its label."""
 
 
 def _half_widths(extent: Float[np.ndarray, " 3"], views: Sequence[tuple[int, int]]) -> Float[np.ndarray, " 2"]:
-    """Half the sides of panels of one scale that hold each view; not very much wider than high, nor the reverse."""
+    """Half the width and height of panels of one scale that hold each view; width over height is 0.7 to 2."""
     wide, high = (max(float(extent[view[k]]) for view in views) for k in (0, 1))
     wide = max(wide, 0.7 * high, 1e-3)
     return 0.5 * MARGIN * np.array([wide, max(high, 0.5 * wide)])
 
 
 def _path(trajectory: Trajectory) -> Float[np.ndarray, "m 3"]:
-    """Positions seen from the first camera, with a row of not-a-number between two segments: the line breaks there."""
+    """Positions in the first camera's frame, with a row of NaN between two segments, where the line breaks."""
     positions = (inverse(trajectory.world_T_camera[0]) @ trajectory.world_T_camera)[:, :3, 3]
     return np.insert(positions, np.flatnonzero(np.diff(trajectory.segments)) + 1, np.nan, axis=0)
 
@@ -185,14 +185,14 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
     """Draw how the best error falls within each level, over the pairs of a run.
 
     Args:
-        histories: best E so far after every iteration, by level in the order of the search; NaN where a search had
-            ended: its last error is carried on.
+        histories: Best E so far after every iteration, by level in the order of the search. NaN after a search has
+            ended; its last error is used there.
     """
     figure = new_figure(PANEL_WIDTH * len(histories), 3.8, CAPTIONS["convergence"])
     panels = panels_of(figure, len(histories), one_scale=True)
     for axes, (level, history) in zip(panels, histories.items(), strict=True):
         error = _carry_on(history)
-        end = np.where(np.isfinite(error[:, -1:]), error[:, -1:], np.nan)  # infinite where a search sees nothing
+        end = np.where(np.isfinite(error[:, -1:]), error[:, -1:], np.nan)  # infinite if a search found nothing valid
         excess = 100.0 * (error[:, :-1] / np.maximum(end, 1e-12) - 1.0)
         iterations = np.arange(1, excess.shape[1] + 1)
         draw_band(
@@ -207,7 +207,7 @@ def plot_convergence(histories: Mapping[int, Float[np.ndarray, "pairs iterations
 
 
 def _excess(value: float, _: int) -> str:
-    """The label of a tick; the smallest one says that what lies below is drawn there."""
+    """Return a tick's label; the smallest has a ≤, as smaller values are drawn there."""
     return f"≤ {value:g}" if value <= SMALLEST_EXCESS else f"{value:g}"
 
 
@@ -215,8 +215,8 @@ def plot_population(errors: Mapping[int, Float[np.ndarray, "iterations p"]]) -> 
     """Draw how the errors of a population fall within each level of one pair's search.
 
     Args:
-        errors: E of every candidate after every iteration, by level in the order of the search; NaN rows where the
-            search had ended, +inf where a candidate is worthless.
+        errors: E of every candidate after every iteration, by level in the order of the search. Rows are NaN after
+            the search has ended; invalid candidates are +inf.
     """
     figure = new_figure(PANEL_WIDTH * len(errors), 3.8, CAPTIONS["population"])
     for axes, (level, error) in zip(panels_of(figure, len(errors)), errors.items(), strict=True):
@@ -244,9 +244,9 @@ def plot_landscape(landscape: Landscape, pair: str = "", more: Sequence[str] = (
     """Draw the error around the optimum along the worst- and the best-conditioned direction, level by level.
 
     Args:
-        landscape: the errors.
-        pair: which frames it is of, for the title.
-        more: what the motion was found with beside the two frames, for the caption.
+        landscape: The errors.
+        pair: Names of the two frames, for the title.
+        more: What else the motion was found with, for the caption.
     """
     has_gaps = not all(np.isfinite(errors).all() for errors in landscape.errors.values())
     found_with = MORE_THAN_THE_PAIR.format(" and ".join(more)) if more else ""
@@ -273,13 +273,13 @@ def plot_basin(
     title: str,
     ours: Collection[str] = (),
 ) -> Figure:
-    """Draw how often each method still finds a motion, over the motion's size.
+    """Draw how often each method finds a motion over the size of the motion.
 
     Args:
-        motion: median rotation of the pairs, degrees, in any order.
-        success: share of the pairs found, by method; NaN where it was not tried.
-        title: what the pairs are of.
-        ours: methods in colour; the others are grey. All of them where none is named.
+        motion: Median rotation of the pairs, degrees, in any order.
+        success: Share of the pairs found, by method; NaN where a method was not tried.
+        title: Origin of the pairs.
+        ours: Names drawn in colour, the others in grey; if empty, all are in colour.
     """
     figure = new_figure(9.0, 4.6, CAPTIONS["basin"])
     axes = figure.add_subplot()
@@ -298,8 +298,8 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
     """Draw the drift of every method on every clip as bars, other libraries' hatched.
 
     Args:
-        clips: translation (m/s) and rotation (deg/s) of every run, by clip and method.
-        ours: which of the methods are the project's own.
+        clips: Drift in translation (m/s) and rotation (deg/s) of every run, by clip and method.
+        ours: Names of the project's own methods.
     """
     rows = max(len(methods) for methods in clips.values())
     several = any(len(runs) > 1 for methods in clips.values() for runs in methods.values())
@@ -330,16 +330,16 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
 
 
 def _decimals(values: Float[np.ndarray, " n"], least: int) -> int:
-    """How many decimals give the smallest of some values two digits, and at least so many."""
+    """Number of decimals, at least `least`, that gives the smallest positive value two significant digits."""
     smallest = float(np.min(values[values > 0], initial=1.0))
     return max(least, 1 - int(np.floor(np.log10(smallest))))
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
-    """Write a figure as NAME.png and NAME.svg (`FORMATS`), each whole, into a folder and return their paths.
+    """Write a figure as NAME.png and NAME.svg (`FORMATS`), each atomically, into a folder and return their paths.
 
     Raises:
-        GavoError: a file cannot be written.
+        GavoError: A file cannot be written.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -349,10 +349,10 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
         FigureCanvasAgg(figure).print_png(data, pil_kwargs={"optimize": True})
 
     def draw_svg(data: BytesIO) -> None:
-        with rc_context({"svg.hashsalt": name}):  # else its names are random
+        with rc_context({"svg.hashsalt": name}):  # otherwise its ids are random
             FigureCanvasSVG(figure).print_svg(data, metadata={"Date": None})
 
-    # not by `savefig`, which draws twice for each file and lays out anew: that takes the most time
+    # `savefig` would draw twice for each file and repeat the layout, which takes most of the time
     figure.set_dpi(120)
     paths = []
     for suffix, draw in zip(FORMATS, (draw_png, draw_svg), strict=True):
@@ -373,7 +373,7 @@ def _carry_on(history: Float[np.ndarray, "pairs iterations"]) -> Float[np.ndarra
 
 
 def _true_path(estimate: Trajectory, truth: Trajectory) -> Float[np.ndarray, "n 3"] | None:
-    """Return true positions at the estimate's stamps in its first camera's frame; None where nothing is covered."""
+    """Return true positions at the estimate's timestamps, in its first camera's frame; None if there are none."""
     world_T_camera, valid = truth.interpolate(estimate.timestamps)
     if not valid.any():
         return None

@@ -1,6 +1,6 @@
-"""The files of one run: trajectory.txt and frames.csv grow with it, config.json opens and metrics.json closes it.
+"""The files of one run: config.json comes first, trajectory.txt and frames.csv grow, metrics.json comes last.
 
-A checkpoint beside them lets a run that was cut short go on where it was.
+A checkpoint beside them lets an interrupted run resume.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 
 class _GrowingFile:
-    """A text file that grows by whole lines: each is in the file, or the file ends where it did before."""
+    """A text file that grows by whole lines: a line that cannot be written leaves the file as it was."""
 
     def __init__(self, path: Path, mark: Mark | None = None) -> None:
         """Create the file, or open it and truncate it to the mark; raise GavoError on failure.
@@ -110,26 +110,26 @@ class _GrowingFile:
 
 
 FOREIGN = ("trajectory.*", MASKS)
-"""What a run replaces that may be somebody's own, where no run has left its configuration."""
+"""Files that a run replaces, and that may be the user's own if the folder holds no run's configuration."""
 
 
 class RunFolder:
-    """A folder that receives the files of one run; use it in a `with` block, for which no other process has it.
+    """A folder that receives the files of one run; a `with` block locks it against other processes.
 
-    Every frame's row is on disk as soon as it is added, so that a run that is cut short leaves what it had; only a run
-    that came to its end has a metrics.json and no checkpoint.
+    Every frame's row is written as soon as it is added, so that an interrupted run leaves what it had. Only a complete
+    run has a metrics.json and no checkpoint.
     """
 
     def __init__(self, folder: str | Path, images: Sequence[Sequence[Path]] = (), trajectory: str = TRAJECTORY) -> None:
-        """Make the folder where it is missing.
+        """Create the folder if it is missing.
 
         Args:
-            folder: what becomes of its files is up to `start` and `resume`.
-            images: of each frame, where they are files: a run does not go on where those it saw have changed.
-            trajectory: name of the file that receives the poses as they are found.
+            folder: The folder; `start` and `resume` decide what happens to its files.
+            images: Image files of each frame, if any; a run is not resumed if those it saw have changed.
+            trajectory: Name of the file that receives the poses as tracked.
 
         Raises:
-            GavoError: it is no folder or cannot be written to.
+            GavoError: It is not a folder or cannot be written to.
         """
         self.path = prepare_folder(folder)
         self._held = contextlib.ExitStack()
@@ -138,14 +138,14 @@ class RunFolder:
         self._files: dict[str, _GrowingFile] = {}
         self._segment, self._last_pose = 0, 0.0
         self._whole: tuple[dict[str, Mark], str, Progress | None] = ({}, "", None)
-        """The growing files after the last frame that is in both, the images seen and the driver's progress then."""
+        """After the last complete frame: marks of the growing files, digest of the images seen, driver's progress."""
 
     def has_run(self) -> bool:
         """Whether an earlier run left its configuration here."""
         return (self.path / CONFIG).exists()
 
     def _refuse_foreign(self) -> None:
-        """Refuse a folder with files that this run would replace and no other one has left."""
+        """Refuse a folder with a comparison, or with files that this run would replace and no earlier run wrote."""
         refuse_foreign(self.path, COMPARISON, "a comparison")
         try:
             is_of_run = "odometry" in read_json_object(self.path / CONFIG)
@@ -155,14 +155,14 @@ class RunFolder:
             raise GavoError(f"{found[0]}: was left by no run, which would replace it: name another folder")
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
-        """Remove an earlier run's files, write config.json and the first pose, which is the world's frame.
+        """Remove an earlier run's files, and write config.json and the first pose, the identity.
 
         Args:
-            config: the effective configuration.
-            timestamp: of the first frame, seconds.
+            config: The effective configuration.
+            timestamp: Timestamp of the first frame, seconds.
 
         Raises:
-            GavoError: a file cannot be written.
+            GavoError: The folder holds files of another kind, or a file cannot be written.
         """
         self._refuse_foreign()
         growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
@@ -182,17 +182,17 @@ class RunFolder:
         self._whole = (self._marks(), self._seen.up_to(0), None)
 
     def resume(self, config: Mapping[str, Any], blank: Any) -> Progress | None:
-        """Open the files of a run that was cut short, without what came after its last checkpoint.
+        """Open the files of an interrupted run, truncated to its last checkpoint.
 
         Args:
-            config: the effective configuration, which has to be the earlier run's.
-            blank: a tracker's state of the shapes to expect.
+            config: The effective configuration, which must be the earlier run's.
+            blank: A tracker's state with the expected shapes.
 
         Returns:
-            Where the run stood; None where there is nothing to go on from: then `start`.
+            The driver's progress; None if there is no checkpoint: then call `start`.
 
         Raises:
-            GavoError: the earlier run is another one, or its files are damaged.
+            GavoError: The earlier run is a different one, its images have changed, or its files are damaged.
         """
         kept = self.path / CHECKPOINT
         if (self.path / CONFIG).exists():
@@ -220,33 +220,33 @@ class RunFolder:
         return progress
 
     def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:
-        """Files that grow with a run."""
+        """Names of the files that grow with a run."""
         odometry = config.get("odometry")
         bodies = (BODIES,) if getattr(odometry, "bodies", "off") != "off" else ()
         motions = (MOTIONS,) if getattr(odometry, "loops", False) else ()
         return (self._poses, FRAMES, *bodies, *motions)
 
     def finished(self) -> dict[str, Any] | None:
-        """The metrics of an earlier run in this folder that came to its end; None where there is none.
+        """Return the metrics of a complete earlier run in this folder, whose rows are revised; None if there is none.
 
         Raises:
-            GavoError: they cannot be read.
+            GavoError: They cannot be read.
         """
         path = self.path / METRICS
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
-        self._revise()  # it may have been killed before it did
+        self._revise()  # it may have been killed before that
         return read_json_object(path)
 
     def add(self, step: Step, progress: Progress | None = None) -> None:
-        """Append one frame: its pair's row, and its pose unless its stamp is in doubt.
+        """Append one frame: its rows and masks, and its pose unless its timestamp is in doubt.
 
         Args:
-            step: what the driver says of it.
-            progress: where the driver stands now, for a checkpoint.
+            step: The driver's record of the frame.
+            progress: The driver's state after it, for a checkpoint.
 
         Raises:
-            GavoError: the disk is full, or the like; the files then end with the last whole row.
+            GavoError: A file cannot be written, as on a full disk; it then ends with the last whole row.
         """
         write_masks(self.path, step)
         self._files[FRAMES].append(as_line(frame_row(step)))
@@ -266,36 +266,36 @@ class RunFolder:
         self._whole = (self._marks(), images, progress)
 
     def save_checkpoint(self) -> None:
-        """Write where the run stands, so that it can be resumed from here.
+        """Write a checkpoint of the last frame, if its progress is known, from which the run can be resumed.
 
         Raises:
-            GavoError: it cannot be written.
+            GavoError: It cannot be written.
         """
         files, images, progress = self._whole
         if progress is not None:
             save_checkpoint(self.path / CHECKPOINT, Checkpoint(progress, files, images))
 
     def steps(self) -> list[Step]:
-        """The steps of the run so far, as the files tell them: see `read_steps`, and with loops to all digits."""
+        """Read the steps of the run so far from its files; see `read_steps`. With loops they have all digits."""
         steps = self._said()
         return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
 
     def moving(self, step: Step) -> Bool[np.ndarray, "height width"] | None:
-        """Pixels of a step's frame that move on their own, as the files tell; None where the run saw nothing move."""
+        """Read the pixels of a step's frame that move on their own; None if the run saw nothing move."""
         return read_masks(self.path, step.timestamp)
 
     def _said(self) -> list[Step]:
-        """The steps as frames.csv and the poses tell them, without what an interruption left of one."""
+        """Read the steps from frames.csv and the poses, without an incomplete one left by an interruption."""
         self._cut()
         return read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
 
     def finish(self, metrics: Mapping[str, Any], complete: bool = True) -> None:
-        """Write metrics.json, whole or not at all.
+        """Write metrics.json atomically.
 
-        After it a run that is complete needs no checkpoint any more, and its rows say what is known at the end.
+        A complete run then loses its checkpoint, and its rows are revised in hindsight.
 
         Raises:
-            GavoError: it cannot be written.
+            GavoError: It cannot be written.
         """
         write_json(self.path / METRICS, metrics)
         if complete:
@@ -303,7 +303,7 @@ class RunFolder:
             self._revise()
 
     def _revise(self) -> None:
-        """Replace frames.csv where pairs were taken back; then it does not grow any more."""
+        """Rewrite frames.csv if later pairs revise earlier ones; it does not grow after that."""
         steps = self._said()
         rows = read_text(self.path / FRAMES).splitlines()
         known = with_hindsight(rows, steps)
@@ -327,10 +327,10 @@ class RunFolder:
             self._files[name].cut(mark.size)
 
     def __enter__(self) -> Self:
-        """Hold the folder.
+        """Lock the folder.
 
         Raises:
-            GavoError: another process writes to it.
+            GavoError: Another process writes to it.
         """
         self._held.enter_context(hold(self.path))
         return self
@@ -343,7 +343,7 @@ class RunFolder:
 
 
 def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:
-    """Raise GavoError where a config.json is not of the run that `config` describes; it names the first difference."""
+    """Raise GavoError, with the first difference, if a config.json is not of the run that `config` describes."""
     earlier = read_json_object(path)
     now = json.loads(json.dumps(describe(config), allow_nan=False))
     for name, before, after in differences(_identity(earlier), _identity(now)):
@@ -362,7 +362,7 @@ def _identity(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _last_stamp(path: Path) -> float:
-    """Return the stamp of a trajectory's last row, which is not the latest one where a clock was set back."""
+    """Return the stamp of a trajectory's last row, which is not the latest one if a clock was set back."""
     rows = [line for line in read_text(path).splitlines() if line and not line.startswith("#")]
     try:
         return float(rows[-1].split()[0])

@@ -1,6 +1,6 @@
-"""What people see: lines and tables on standard output, progress and warnings on standard error.
+"""Terminal output: lines and tables on standard output, progress on standard error.
 
-All of it passes through `printable`: names of files and sequences are other people's.
+All text passes through `printable`, as names of files and sequences come from outside.
 """
 
 import sys
@@ -27,10 +27,10 @@ from gavo_jax.errors import printable
 
 
 class _Console(Console):
-    """The screen; where who reads has gone, the command is told, as by `print`."""
+    """A console that raises BrokenPipeError if the reader is gone, as `print` does."""
 
     def on_broken_pipe(self) -> None:
-        """Leave it to the command."""
+        """Leave the error to the command."""
         raise BrokenPipeError
 
 
@@ -39,25 +39,25 @@ DASH = "–"
 
 
 def say(line: str) -> None:
-    """Print a line on standard output: on a terminal between words to its width, elsewhere as one line for programs."""
+    """Print a line on standard output: wrapped on a terminal, in one piece elsewhere, for programs."""
     line = printable(line)
     print(_wrapped(line) if sys.stdout.isatty() else line, flush=True)
 
 
 def _wrapped(line: str) -> str:
-    """A line as several that fit the terminal; a path is never broken."""
+    """Wrap a line at spaces to the terminal's width; words, such as paths, are never broken."""
     width = _Console().width
     return textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 class PairProgress:
-    """A bar that counts pairs; it says `compiling …` until the first one is done, and whenever that is so again."""
+    """A progress bar of pairs; it says `compiling …` until the first is done, and after each call of `compiling`."""
 
     def __init__(self, progress: Progress, task: TaskID, label: str) -> None:
         self._progress, self._task, self._label = progress, task, label
 
     def compiling(self) -> None:
-        """Say that a program is compiled, until the next pair is done."""
+        """Say until the next pair is done that a program is being compiled."""
         self._progress.update(self._task, description=_compiling(self._label))
 
     def advance(self, pairs: int = 1) -> None:
@@ -65,14 +65,14 @@ class PairProgress:
         self._progress.update(self._task, advance=pairs, description=self._label)
 
     def say(self, line: str) -> None:
-        """Print a line above the bar; also where there is no bar."""
+        """Print a line on standard error, above the bar if there is one."""
         console, line = self._progress.console, printable(line)
         console.print(Text(_wrapped(line) if console.is_terminal else line), soft_wrap=True)
 
 
 @contextmanager
 def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgress]:
-    """Show a bar on standard error while the block runs; nothing where that is no terminal."""
+    """Show a bar on standard error while the block runs; nothing if that is not a terminal."""
     label = printable(label)
     with progress_bar(MofNCompleteColumn(), TextColumn("pairs")) as progress:
         yield PairProgress(progress, progress.add_task(_compiling(label), total=pairs, completed=done), label)
@@ -80,14 +80,14 @@ def pair_progress(label: str, pairs: int, done: int = 0) -> Iterator[PairProgres
 
 @contextmanager
 def frame_progress(label: str, frames: int) -> Iterator[Callable[[], None]]:
-    """Show a bar that counts frames while the block runs, as `pair_progress` does; what is given counts one."""
+    """Show a bar of frames while the block runs, as `pair_progress` does; the yielded function counts one frame."""
     with progress_bar(MofNCompleteColumn(), TextColumn("frames")) as progress:
         task = progress.add_task(printable(label), total=frames)
         yield lambda: progress.update(task, advance=1)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
-    """A label, a bar, some columns and the time that is left, on standard error while that is a terminal."""
+    """Return a label, a bar, some columns and the time left, shown on standard error if that is a terminal."""
     console = _Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), *columns, TimeRemainingColumn())
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
@@ -99,7 +99,7 @@ def _compiling(label: str) -> str:
 
 @contextmanager
 def waiting(words: str) -> Iterator[None]:
-    """Show a few words on standard error while the block runs; nothing where that is no terminal."""
+    """Show a few words on standard error while the block runs; nothing if that is not a terminal."""
     console = _Console(stderr=True)
     if not console.is_terminal:
         yield
@@ -111,7 +111,7 @@ def waiting(words: str) -> Iterator[None]:
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table whose first column is text and whose others are numbers.
 
-    Nothing of it is cut: columns that the screen has no room for follow below, the first column beside them once more.
+    Nothing is cut off: columns that do not fit the screen follow below, with the first column repeated.
     """
     say(title)
     width = _Console().width
@@ -126,7 +126,7 @@ def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tupl
 
 
 def _parts(columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> Iterator[Table]:
-    """A table as one that fits the width or, the first column in each, as several."""
+    """Split a table into as many as fit the width, each with the first column."""
     start = 1
     while start < len(columns):
         end = len(columns)
@@ -165,10 +165,10 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return a count with what it counts: 1 run, 2 runs; `many` where an s is not enough."""
+    """Return a count with what it counts: 1 run, 2 runs; `many` is the plural if an s is not enough."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number of fixed decimals, or a dash for what is not known."""
+    """Return a number with fixed decimals, or a dash for None."""
     return DASH if value is None else f"{value:.{digits}f}"

@@ -1,4 +1,4 @@
-"""A trajectory in the formats of other programs: TUM, KITTI, EuRoC's CSV, JSON, and a ROS 2 bag of poses."""
+"""Writes trajectories in the formats of other programs: TUM, KITTI, EuRoC's CSV, JSON, and a ROS 2 bag of poses."""
 
 import shutil
 import sqlite3
@@ -20,7 +20,7 @@ FILES = {
     "json": "trajectory.json",
     "bag": "trajectory_bag",
 }
-"""Name, in a run's folder, of the file of each format; the bag is a folder, as ROS 2 has it."""
+"""Name of each format's file in a run's folder; the bag is a folder, as usual in ROS 2."""
 
 EUROC_HEADER = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 
@@ -34,23 +34,23 @@ WORLD = "world"
 """Frame in the messages' headers."""
 
 LATEST_STAMP = 2**31
-"""Seconds: a ROS header holds no later one, and none before 0."""
+"""Bound of the timestamps in a ROS header, seconds: they are below it, and not below 0."""
 
 
 def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> None:
-    """Write a trajectory, camera to world, whole or not at all.
+    """Write a trajectory, camera to world, atomically.
 
-    Stretches between which the motion is unknown (`Trajectory.segments`) are told apart in TUM files and JSON; the
-    other formats have no place for that.
+    Segments, between which the motion is unknown (`Trajectory.segments`), are kept in TUM files and JSON; the other
+    formats cannot hold them.
 
     Args:
-        trajectory: stamps in seconds, poses in metres.
-        path: of the file, or of the folder that a bag is. What lies there is replaced; a folder only if it is a bag.
-        form: one of `FILES`.
+        trajectory: Timestamps in seconds, poses in metres.
+        path: The file, or a bag's folder. An existing file is replaced, a folder only if it is a bag.
+        form: One of `FILES`.
 
     Raises:
-        GavoError: an unknown format, what is no trajectory, a pose that is no rigid transform, a stamp that is no
-            number or that the format cannot hold, a bag without the extra `[bag]`, or the file cannot be written.
+        GavoError: The format is unknown, the input is not a trajectory, a pose is not a rigid transform, or a timestamp
+            is not finite or not allowed in the format. Or a bag lacks the extra `[bag]`, or writing fails.
     """
     check_format(form)
     require_trajectory(trajectory)
@@ -61,10 +61,10 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
 
 
 def check_format(form: str) -> None:
-    """Refuse what `write_trajectory` would, as far as it is known before there is a trajectory.
+    """Check that `write_trajectory` knows a format, before there is a trajectory.
 
     Raises:
-        GavoError: an unknown format, or a bag without the extra `[bag]`.
+        GavoError: The format is unknown, or a bag lacks the extra `[bag]`.
     """
     if form not in WRITERS:
         raise GavoError(f"trajectory format {form[:60]!r}: not one of {', '.join(WRITERS)}")
@@ -73,10 +73,10 @@ def check_format(form: str) -> None:
 
 
 def formats(text: str) -> list[str]:
-    """The formats of a list with commas between, each once.
+    """Return the formats of a comma-separated list, each once.
 
     Raises:
-        GavoError: as `check_format`.
+        GavoError: See `check_format`.
     """
     chosen = list(dict.fromkeys(name.strip() for name in text.split(",")))
     for form in chosen:
@@ -85,10 +85,10 @@ def formats(text: str) -> list[str]:
 
 
 def write_trajectories(trajectory: Trajectory, folder: Path, forms: Iterable[str]) -> None:
-    """Write a run's trajectory in some formats, beside the TUM file that every run writes as it goes.
+    """Write a run's trajectory in some formats, except TUM, which every run writes as it goes.
 
     Raises:
-        GavoError: as `write_trajectory`.
+        GavoError: See `write_trajectory`.
     """
     for form in forms:
         if form != "tum":
@@ -96,10 +96,10 @@ def write_trajectories(trajectory: Trajectory, folder: Path, forms: Iterable[str
 
 
 def remove_trajectories(folder: Path) -> None:
-    """Remove what an earlier run wrote in other formats than TUM's.
+    """Remove an earlier run's trajectories in formats other than TUM.
 
     Raises:
-        GavoError: a file cannot be removed.
+        GavoError: A file cannot be removed.
     """
     remove_files(folder, *(name for form, name in FILES.items() if form not in ("tum", "bag")))
     bag = folder / FILES["bag"]
@@ -189,7 +189,7 @@ def _euroc_rows(trajectory: Trajectory) -> Iterator[str]:
 
 
 def _nanoseconds(trajectory: Trajectory) -> list[int]:
-    """Stamps as whole nanoseconds, to the microsecond, as trajectory.txt has them: seconds since 1970 hold no more."""
+    """Return timestamps in nanoseconds, rounded to the microsecond: seconds since 1970 as floats hold no more."""
     return [round(stamp * 1e6) * 1000 for stamp in trajectory.timestamps.tolist()]
 
 

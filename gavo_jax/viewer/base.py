@@ -1,4 +1,4 @@
-"""A viewer of a run: what it is told, and the one that shows nothing and costs nothing."""
+"""The interface of a run's viewer, and the viewer that shows nothing."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ class Viewer:
     """A viewer that shows nothing."""
 
     wants_populations: bool = False
-    """Whether `watch` makes anything of the candidates."""
+    """Whether `watch` uses the populations."""
 
     def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
         """Begin to show a run.
 
         Args:
-            title: its name.
-            camera: of the frames, without distortion.
-            stamps: of all frames, seconds.
-            truth: the true trajectory, where it is known.
+            title: Name of the run.
+            camera: Camera of the frames, without distortion.
+            stamps: Timestamps of all frames, seconds; of a live source, of the first.
+            truth: The true trajectory, if known.
         """
 
     def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
         """Show one more frame.
 
         Args:
-            frame: the frame, or None where it could not be read.
-            step: what the odometry said of it; None for the first frame.
-            populations: candidates of its search, coarsest level first.
+            frame: The frame; None if it could not be read.
+            step: The driver's record of it; None for the first frame.
+            populations: Candidates of its search, coarsest level first.
         """
 
     def show_corrected(self, trajectory: Trajectory, loops: Loops) -> None:
-        """Show what a map of the whole run says.
+        """Show the loops of a whole run, and the trajectory corrected by them.
 
         Args:
-            trajectory: as the map corrects it.
-            loops: the map, with the places that were seen again.
+            trajectory: The corrected trajectory.
+            loops: The map, with the places that were seen again.
         """
 
     def close(self) -> None:
-        """Show what is still waiting, then end the recording."""
+        """Show what is still queued, then end the recording."""
 
     def stay(self) -> None:
-        """Keep what was shown in reach until the user has seen enough (Ctrl-C), where it would go with the process."""
+        """Wait for Ctrl-C if what was shown would disappear with the process."""
 
     def __enter__(self) -> Self:
         return self

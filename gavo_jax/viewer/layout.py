@@ -16,17 +16,17 @@ IMAGES = {
     "warped": "Target, warped",
     "residual": "Residual: blue is below",
 }
-"""Entities below `images`, and the titles of their views."""
+"""Titles of the views of the entities below `images`."""
 
 
 GATHERED = ("estimate", "truth", "map", "bodies")
-"""Entities below `world` of which each frame adds a piece."""
+"""Entities below `world` to which each frame adds a piece."""
 
 
 def make_blueprint() -> Blueprint:
     """Return the layout: search space, trajectories, state and curves above, the four images below.
 
-    On the time line `frame` the particles of all generations of a frame are shown at once, on `generation` one's.
+    The timeline `frame` shows the particles of all of a frame's generations at once, `generation` those of one.
     """
     import rerun.blueprint as layout
 

@@ -1,4 +1,4 @@
-"""The images that are shown: shrunk, warped, and their residual."""
+"""The images that are shown: downscaled, warped, and residuals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.viewer.colors import RESIDUAL_COLORS, color_of_body
 
 IMAGE_WIDTH = 320
-"""Pixels: images are shown at the pyramid level of at most this width."""
+"""Maximum width of the images shown, pixels."""
 JPEG_QUALITY = 85
 RESIDUAL_RANGE = 40.0
 """Grey levels at which the residual image's colours saturate."""
@@ -43,9 +43,9 @@ def shrink(frame: Frame, camera: Camera, depth_scale: float) -> Shown:
     """Return a frame as it is shown.
 
     Args:
-        frame: as the sequence gives it.
-        camera: of what is shown; see `shown_camera`.
-        depth_scale: of the frame, units per metre.
+        frame: The frame, without distortion.
+        camera: Camera of the images shown; see `shown_camera`.
+        depth_scale: Units of the frame's depth per metre.
     """
     size, step = (camera.width, camera.height), frame.grey.shape[1] // camera.width
 
@@ -62,7 +62,7 @@ def shrink(frame: Frame, camera: Camera, depth_scale: float) -> Shown:
 def tinted(
     picture: UInt8[np.ndarray, "h w *channels"], masks: Iterable[tuple[int, Bool[np.ndarray, "h w"]]]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a picture as BGR, half of what masks cover in the colours of their bodies' numbers."""
+    """Return a picture as BGR, with each body's mask half covered by its colour."""
     shown = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture.copy()
     for number, mask in masks:
         color = np.array(color_of_body(number)[::-1], np.float32)
@@ -73,14 +73,14 @@ def tinted(
 def color_residual(
     warped: UInt8[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return BGR of the residuals warped − reference; black where nothing is seen."""
+    """Return the residuals warped − reference as BGR; black where nothing is seen."""
     factor = 127.5 / RESIDUAL_RANGE
     colored = cv2.applyColorMap(cv2.addWeighted(warped, factor, reference, -factor, 127.5), RESIDUAL_COLORS)
     return cv2.bitwise_and(colored, colored, mask=seen.view(np.uint8))
 
 
 def shown_camera(camera: Camera) -> Camera:
-    """Return the camera of the images that are shown: of the finest level at most `IMAGE_WIDTH` wide."""
+    """Return the camera of the images shown: that of the finest level at most `IMAGE_WIDTH` wide."""
     level = 0
     while camera.width >> level > IMAGE_WIDTH:
         level += 1
@@ -88,7 +88,7 @@ def shown_camera(camera: Camera) -> Camera:
 
 
 def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    """Return the points at depth 1 that pixels see."""
+    """Return the points at depth 1 on the rays of the pixels."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     return np.asarray(camera.back_project(np.stack([u, v], axis=-1), np.ones_like(u)), np.float32)
 
@@ -96,13 +96,13 @@ def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
 def warp_target(
     reference: Shown, target: Shown, target_T_reference: Float[np.ndarray, "4 4"], camera: Camera
 ) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return I_{t+1}(ω(ξ, p)) at every reference pixel, black where it is not defined, and where it is.
+    """Return the warped target I_{t+1}(ω(ξ, p)) at each reference pixel, black where undefined, and where it is defined.
 
     Args:
-        reference: with its depth.
-        target: the image that is sampled.
+        reference: The frame whose depth is used.
+        target: The frame that is sampled.
         target_T_reference: g(ξ).
-        camera: of both, without distortion.
+        camera: Camera of both, without distortion.
     """
     height, width = reference.grey.shape
     matrix = camera.matrix

@@ -1,4 +1,4 @@
-"""The particles at work: where a level's candidates put the camera, and how good they are."""
+"""The search as particles: the camera positions of a level's candidates, and their errors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gavo_jax.alignment.search import Population
 from gavo_jax.viewer.colors import PARTICLE_COLORS
 
 MAX_PARTICLES = 256
-"""Particles shown of a generation; of a larger one every k-th by rank, the best included."""
+"""Maximum number of particles shown per generation; of a larger one every k-th by rank, the best included."""
 MILLIMETRES = 1e3
-"""Millimetres per metre: the search space is drawn in them, as its particles lie millimetres apart."""
+"""Millimetres per metre. The search space is drawn in millimetres, as its particles are that close."""
 KEY = (
     "RMSE of the best particle, in grey levels. Particles: blue is best. White: the last camera. Green star: the true "
     "next one, where the arrow leads. The time line `generation` steps through."
@@ -21,23 +21,23 @@ KEY = (
 
 
 class Level(NamedTuple):
-    """The search of a level as it is shown, g generations of p particles."""
+    """A level's search as it is shown: g generations of p particles."""
 
     positions: Float[np.ndarray, "g p 3"]
-    """Where each particle puts the camera, seen from the last one, millimetres; the best first."""
+    """Camera position of each particle, in the reference camera, millimetres; the best first."""
     colors: UInt32[np.ndarray, "g p"]
-    """RGBA, a byte each. Blue is the level's best error, vermilion that of its worst particles."""
+    """Packed RGBA: from blue for the level's best error to vermilion for the worst twentieth."""
     centre: Float[np.ndarray, " 3"]
     half_sizes: Float[np.ndarray, " 3"]
     number: int
-    """Number of the pyramid's level."""
+    """Number of the pyramid level."""
     particles: int
-    """Particles of a generation, shown or not."""
+    """Number of particles in a generation, shown or not."""
     rmse: Float[np.ndarray, " g"]
     """Root mean square residual of each generation's best particle, grey levels."""
 
     def states(self, errors: Float[np.ndarray, " g"] | None = None) -> list[str]:
-        """Return each generation's state, as Markdown; `errors` are those of the best particles, mm, where known."""
+        """Return each generation's state as Markdown; `errors` are the best particles' distances from the truth, mm."""
         heading, count = "| particles | level | DSR | iteration | RMSE |", len(self.rmse)
         rows = [
             f"| {self.particles} | {self.number} | 1/{2**self.number} | {i} of {count} | {best:.2f} |"
@@ -51,7 +51,7 @@ class Level(NamedTuple):
 
 
 def level_of(population: Population) -> Level | None:
-    """Return what is shown of a level's candidates, None where none of them is worth anything."""
+    """Return a level's candidates as they are shown; None if all of them are invalid."""
     population = population.trimmed()
     xi, error = np.asarray(population.xi), np.asarray(population.error)
     finite = np.sqrt(error[np.isfinite(error)])
@@ -78,7 +78,7 @@ def level_of(population: Population) -> Level | None:
 
 
 def camera_positions(xi: Float[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 3"]:
-    """Return where twists of target_T_reference put the target camera, seen from the reference: −V(−w) v, metres."""
+    """Return the target camera's positions in the reference camera by twists of target_T_reference: −V(−w) v, metres."""
     v, w = np.asarray(xi[..., :3], np.float64), np.asarray(xi[..., 3:], np.float64)
     square = np.sum(w * w, axis=-1, keepdims=True)
     safe = np.sqrt(np.maximum(square, 1e-8))
@@ -93,7 +93,7 @@ class Ticks(NamedTuple):
 
     strips: list[Float[np.ndarray, "2 3"]]
     places: Float[np.ndarray, "t 3"]
-    """Where the labels stand."""
+    """Positions of the labels."""
     labels: list[str]
 
 
@@ -118,7 +118,7 @@ def ticks_of(centre: Float[np.ndarray, " 3"], half_sizes: Float[np.ndarray, " 3"
 
 
 def _round_steps(length: float) -> list[float]:
-    """1, 2 and 5 times powers of ten, ascending, about a length."""
+    """Return 1, 2 and 5 times powers of ten, ascending, up to about a length."""
     power = np.floor(np.log10(max(length, 1e-6)))
     return [float(f"{digit}e{int(power + shift)}") for shift in (-2, -1, 0) for digit in (1, 2, 5)]
 

@@ -1,4 +1,4 @@
-"""The scene as far as it was seen: one point for each small cube of space, which grows with the run."""
+"""The scene as seen so far: one point for each small cube of space."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ CUBE = 0.03
 FARTHEST = 4.0
 """Largest depth shown, metres; beyond it, depth is too uncertain."""
 MOST_POINTS = 300_000
-"""Points that a viewer is sent; some 80 m² of surface at 3 cm."""
+"""Number of points after which no more are sent to a viewer."""
 _BITS, _MIDDLE = 21, 1 << 20
 
 
 class SeenCubes:
-    """The cubes of which a point is shown already."""
+    """The cubes that already have a point."""
 
     def __init__(self) -> None:
         self._known: set[int] = set()
 
     def new(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
-        """Return which points are the first of their cubes, and remember these; none once there are `MOST_POINTS`."""
+        """Return the indices of the first points in new cubes, and remember these; none once there are `MOST_POINTS`."""
         if len(self._known) >= MOST_POINTS:
             return np.zeros(0, np.int64)
         cubes = np.clip(np.floor(points / CUBE).astype(np.int64) + _MIDDLE, 0, 2 * _MIDDLE - 1)
