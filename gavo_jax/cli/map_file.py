@@ -15,11 +15,11 @@ from gavo_jax.trajectory import Trajectory
 
 
 def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> Shape:
-    """Refuse a map that cannot be made or written; return what it is to be.
+    """Check that a map can be made and written; return its shape.
 
     Raises:
-        GavoError: an unknown ending, no folder for it or one that is closed, a folder in its place, an absurd voxel,
-            options of a map without one, or Open3D cannot be imported.
+        GavoError: The suffix is unknown, the folder is missing or not writable, the path is a folder, the voxel is
+            absurd, there are options of a map but no map, or Open3D cannot be imported.
     """
     check_voxel(voxel)
     if path is None:
@@ -41,10 +41,10 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
 def save_map(
     path: Path, sequence: Sequence, folder: RunFolder, trajectory: Trajectory, shape: Shape, voxel: float
 ) -> None:
-    """Fuse the frames of a run, as its later frames have shown them to be, and write the map.
+    """Fuse the frames of a run, as revised in hindsight, and write the map.
 
     Raises:
-        GavoError: it cannot be written.
+        GavoError: It cannot be written.
     """
     steps = folder.steps()
     with frame_progress("the map", len(steps) + 1) as on_frame:
@@ -55,10 +55,10 @@ def save_map(
 
 
 def write_map(scene: SceneMap, path: Path) -> None:
-    """Write a map, and say what is in it.
+    """Write a map, and print what it holds.
 
     Raises:
-        GavoError: it cannot be written.
+        GavoError: It cannot be written.
     """
     scene.write(path)
     warn_of(scene, path)

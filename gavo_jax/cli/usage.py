@@ -19,23 +19,23 @@ COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 HELP = ("-h", "--help")
 HELP_OF_HELP = ("-h, --help", "show this help message and exit")
 VERSION = ("--version", "print the version and exit")
-"""What a page of help says of an option, and `--version` likewise: tyro knows none beside subcommands."""
+"""A help page's row on `--help`, and one like it on `--version`: beside subcommands tyro has no such option."""
 
 USAGE_OF_ALL = "usage: gavo [-h] [--version] SUBCOMMAND ..."
-"""In place of tyro's, which names all subcommands on one line; they follow in a table."""
+"""Replaces tyro's usage, which lists all subcommands on one line; they follow in a table."""
 
 
 class HelpPage(io.StringIO):
-    """Takes what tyro prints in the place of a stream, whose colours and lines are those that the stream can show."""
+    """Captures what tyro prints for a stream, with colours and box lines only if the stream can show them."""
 
     def __init__(self, stream: TextIO) -> None:
-        """Take what is meant for the stream."""
+        """Capture what is meant for `stream`."""
         super().__init__()
         self._stream = stream
 
     @property
     def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The stream's."""
+        """Encoding of the stream."""
         return self._stream.encoding
 
     def isatty(self) -> bool:
@@ -43,9 +43,7 @@ class HelpPage(io.StringIO):
         return self._stream.isatty()
 
     def fitted(self) -> str:
-        """The page, its sentences between words to the width of the screen; beside `--help` of the whole command it has
-        `--version`, too.
-        """
+        """Return the page with its text wrapped to the screen; that of the whole command lists `--version`, too."""
         width = shutil.get_terminal_size().columns
         lines = self.getvalue().splitlines()
         plain = [COLOUR.sub("", line) for line in lines]
@@ -67,15 +65,16 @@ class HelpPage(io.StringIO):
 
 
 def asking_for_help(arguments: Sequence[str]) -> list[str]:
-    """The arguments; where a subcommand's help is among them, that alone: tyro leaves out what was given already."""
+    """Return the arguments; with a subcommand's help among them, that alone, as tyro omits options given already."""
     if arguments and arguments[0] in COMMANDS and any(word in HELP for word in arguments[1:]):
         return [arguments[0], HELP[1]]
     return list(arguments)
 
 
 def empty_argument(arguments: Sequence[str]) -> str | None:
-    """What is wrong where an argument, or an option's value, is empty or blank: as a path it would be the current
-    folder, or one whose name no message shows.
+    """Return a message if an argument, or an option's value, is empty or blank, else None.
+
+    As a path it would be the current folder, or one whose name no message shows.
     """
     for before, argument in itertools.pairwise(("", *arguments)):
         if re.fullmatch(r"(--[\w-]+=)?\s*", argument):
@@ -88,8 +87,8 @@ def fault_of_usage(box: str, arguments: Sequence[str]) -> str:
     """Return one line on what is wrong with the arguments.
 
     Args:
-        box: tyro's message, framed by lines, or by blanks where the screen's encoding has none.
-        arguments: what it was given.
+        box: Message of tyro, framed by lines, or by blanks if the screen's encoding has none.
+        arguments: Arguments of the command.
     """
     lines = [line[2:].rstrip(" │") for line in box.splitlines() if line.startswith(("│ ", "  "))]
     first = list(itertools.takewhile(lambda line: line.strip(" ─-"), lines))
@@ -99,7 +98,7 @@ def fault_of_usage(box: str, arguments: Sequence[str]) -> str:
 
 
 def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: Sequence[str], command: str) -> str:
-    """What the first lines of a box said, in other words; as it was, where it is none of the usual faults."""
+    """Reword what the first lines of a box say; unusual faults are returned as they are."""
     if not command and (not arguments or not arguments[0].startswith("-")):
         return _no_command(arguments)
     if found := re.match(r"Unrecognized (?:or misplaced )?options: (\S+)", said):
@@ -114,7 +113,7 @@ def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: 
         return f"{found[1]}: a value is missing"
     if found := re.fullmatch(CHOICE, said):
         choices = re.findall(r"'([^']*)'", found["choices"])
-        if "None" in choices:  # of an option that may be left out; in no order
+        if "None" in choices:  # of an option that may be omitted; in arbitrary order
             choices = sorted({*choices} - {"None"})
         return f"{found['name']}: {found['value']} is not one of {', '.join(choices)}"
     if found := re.fullmatch(rf"Error parsing (?P<name>\S+): (?:{NUMBER}|{UNION})", said):
@@ -133,7 +132,7 @@ def _no_command(arguments: Sequence[str]) -> str:
 
 
 def _unknown(name: str, lines: Sequence[str], page: str) -> str:
-    """An option that there is none of, or an argument too many; of the options like it, one that the page has."""
+    """Return the message on an unknown option, with a similar one that the page has, or on a surplus argument."""
     if not name.startswith("-"):
         return f"one argument too many: {name[:100]!r}"
     like = ""

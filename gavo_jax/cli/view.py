@@ -27,7 +27,7 @@ from gavo_jax.viewer.live import make_viewer
 
 
 def view(options: View) -> int:
-    """Show the run of a folder; without its frames where the sequence is no longer there."""
+    """Show a folder's run, without images if the sequence is gone."""
     run = read_run(options.folder)
     bodies = RecordedBodies(options.folder)
     viewer = make_viewer(options.viewer, options.folder / VIEW)
@@ -52,10 +52,10 @@ def view(options: View) -> int:
 
 
 def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry | None:
-    """Return the driver of the run, or None, with a line that says why, where config.json does not tell it."""
+    """Return a new driver with the run's settings; None, with a printed reason, if config.json lacks them."""
     try:
         settings = load_settings(folder / CONFIG).settings
-        settings = replace(settings, odometry=replace(settings.odometry, loops=False))  # the run has found its own
+        settings = replace(settings, odometry=replace(settings.odometry, loops=False))  # the run has closed them already
         seed = int(run.config["options"]["seed"])
         return Odometry(sequence.camera, settings, seed=seed, record=True)
     except (GavoError, KeyError, TypeError, ValueError) as error:
@@ -66,7 +66,7 @@ def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry
 def _show_with_search(
     run: RecordedRun, bodies: RecordedBodies, sequence: Sequence, odometry: Odometry, viewer: Viewer
 ) -> None:
-    """Track the frames once more for the particles; what is shown of the poses is what the run found."""
+    """Track the frames again for the particles; the poses shown are those of the run."""
     be_ready()
     recorded = {step.index: step for step in run.steps}
     apart = 0.0
@@ -87,18 +87,19 @@ def _show_with_search(
 
 
 def _is_of_the_search(step: Step) -> bool:
-    """Whether a step's motion in the run's files is the search's: of a lost pair they have what was recorded instead,
-    and a relocalised one is from a keyframe of the map.
+    """Whether a step's motion in the run's files was found by the search.
+
+    For a lost pair they hold what was recorded instead; a relocalised pair starts at a keyframe of the map.
     """
     return not step.lost and step.origin != "relocalised"
 
 
 SAME = 1e-3
-"""Metres within which rounding moves a search on another machine."""
+"""Largest distance, metres, by which rounding on another machine moves the result of a search."""
 
 
 def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
-    """Return the frames of the run, or None, with a line that says why, where they are not to be had."""
+    """Return the run's sequence; None, with a printed reason, if it is not available."""
     settings = run.config.get("options")
     try:
         if not isinstance(settings, dict):
@@ -121,7 +122,7 @@ def _is_of(step: Step, sequence: Sequence) -> bool:
 
 
 ROUNDED = 1e-6
-"""Seconds: stamps of a run's files are rounded to microseconds."""
+"""Tolerance, seconds: timestamps in a run's files are rounded to microseconds."""
 
 
 def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:

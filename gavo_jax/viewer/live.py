@@ -1,7 +1,7 @@
 """The live viewer on Rerun (extra `[viewer]`): window, server or file.
 
-A frame's pictures are prepared and sent by a thread of their own, so that a run hardly waits for them. Two time lines:
-`frame`, and `generation`, which counts on from frame to frame, for the evolution of the populations inside a frame.
+A separate thread prepares and sends a frame's pictures, so that a run hardly waits for them. There are two timelines:
+`frame`, and `generation` for the populations within a frame, which counts on from frame to frame.
 """
 
 from __future__ import annotations
@@ -40,20 +40,22 @@ if TYPE_CHECKING:
 
 
 UNFINISHED = ".part"
-"""After the name of a recording that is being written; not the ending of what a new run clears away."""
+"""Suffix of a recording that is being written; unlike `errors.PARTIAL`, a new run does not remove such files."""
 WAITING_FRAMES = 8
 """Frames that may be queued before the run has to wait."""
 SECONDS_TOGETHER = 0.25
-"""What is shown within this time is sent together; a window lags behind the run by at most this."""
+"""Data of this time, seconds, is sent together; it delays a window by at most this."""
 MEMORY = "512MiB"
-"""What the server of the web viewer keeps for browsers that come later."""
+"""Data that the web viewer's server keeps for browsers that connect later."""
 HOST, WEB_PORT = "127.0.0.1", 9090
-"""Where the web viewer's page is found: on this machine only, and at another port where something else is at this one.
-The data have a port that nobody can foretell: Rerun gives them to whoever asks there, by whatever name of the host."""
+"""Address of all servers, on this machine only, and port of the web viewer's page, or a free one if it is taken.
+
+The data have an unpredictable port, as Rerun serves them to anyone who asks there, under any name of the host.
+"""
 WINDOW_SECONDS = 1.0
-"""After which a window that found no screen would have ended."""
+"""Seconds after which a window that finds no screen has ended."""
 PATIENCE = 60.0
-"""Seconds for the server to start, and for the last frames to arrive."""
+"""Maximum wait, seconds, for a server or window to start or end, and for the last frames to arrive."""
 NOT_STARTED = "Rerun does not start"
 GUARD = """
 import os, signal, subprocess, sys, threading
@@ -62,21 +64,22 @@ threading.Thread(target=lambda: os._exit(server.wait() or 1), daemon=True).start
 sys.stdin.read()
 os.killpg(0, signal.SIGTERM)
 """
-"""Serves until its standard input closes, which it does however the run ends, or until its server ends; Ctrl-C does not
-reach it."""
+"""Program that serves until its standard input closes, which happens however the run ends, or until its server ends.
+Ctrl-C does not reach it.
+"""
 ATTEMPTS = 4
-"""Pairs of ports that are tried: one that is free may be somebody else's before the server has it."""
+"""Number of port pairs that are tried, as another process may take a free port before the server does."""
 
 
 def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
-    """Return a viewer, not open yet.
+    """Return a viewer that is not open yet.
 
     Args:
-        mode: `spawn` a window, serve to a browser on the `web`, `save` to a file, or `none` of these.
-        recording: the file to save to.
+        mode: `spawn` opens a window, `web` serves to a browser, `save` writes a file, `none` shows nothing.
+        recording: The file to save to.
 
     Raises:
-        GavoError: Rerun is not installed, there is no screen for a window, or a folder in place of the file.
+        GavoError: Rerun is not installed, there is no screen for a window, or the file is a folder.
     """
     if mode == "none":
         return NO_VIEWER
@@ -97,19 +100,19 @@ class RerunViewer(Viewer):
     def __init__(self, mode: ViewerMode, recording: Path) -> None:
         self.mode, self.recording = mode, recording
         self.url = ""
-        """Where a browser finds it, in mode `web`."""
+        """URL of the viewer in mode `web`."""
         self._queue: Queue[Callable[[Scene], None] | None] = Queue(WAITING_FRAMES)
-        """What is to be added to the scene; None ends it."""
+        """Additions to the scene; None ends the thread."""
         self._thread: threading.Thread | None = None
         self._fault: Exception | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._partial = recording.with_name(recording.name + UNFINISHED)
 
     def open(self, title: str, camera: Camera, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
-        """Open window, server or file, send the layout, and start the thread.
+        """Open the window, server or file, send the layout, and start the thread.
 
         Raises:
-            GavoError: the file cannot be written, or Rerun cannot be started.
+            GavoError: The file cannot be written, or Rerun cannot be started.
         """
         import rerun
 
@@ -124,7 +127,7 @@ class RerunViewer(Viewer):
         self._thread.start()
 
     def watch(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...] = ()) -> None:
-        """Queue a frame; waits while `WAITING_FRAMES` others are yet to be shown."""
+        """Queue a frame; wait while `WAITING_FRAMES` others are queued."""
         self._raise_fault()
         self._queue.put(lambda scene: scene.add(frame, step, populations))
 
@@ -134,13 +137,13 @@ class RerunViewer(Viewer):
         self._queue.put(lambda scene: scene.add_loops(trajectory, loops))
 
     def close(self, is_cut_short: bool = False) -> None:
-        """Wait for what is queued.
+        """Wait until everything queued is shown, then end the recording.
 
         Args:
-            is_cut_short: an exception ended the run: a recording of it is not kept.
+            is_cut_short: Whether an exception ended the run, whose recording is then not kept.
 
         Raises:
-            GavoError: a frame could not be shown.
+            GavoError: A frame could not be shown.
         """
         if self._thread is None:
             return
@@ -157,7 +160,7 @@ class RerunViewer(Viewer):
         self._raise_fault()
 
     def _keep(self, is_whole: bool) -> None:
-        """Give a recording its name once it is whole: until then an earlier one keeps it."""
+        """Rename a complete recording, replacing an earlier one; delete an incomplete one."""
         try:
             if is_whole:
                 self._partial.replace(self.recording)
@@ -170,7 +173,7 @@ class RerunViewer(Viewer):
         self.close(is_cut_short=exception[0] is not None)
 
     def stay(self) -> None:
-        """Serve the browser until Ctrl-C; a window of its own and a file need nothing."""
+        """Serve the browser until Ctrl-C; a window and a file do not need this process."""
         if not self.url:
             return
         print("the viewer stays until Ctrl-C ends it", flush=True)
@@ -194,7 +197,7 @@ class RerunViewer(Viewer):
             raise GavoError(f"{where}: {error}") from None
 
     def _open_window(self, stream: RecordingStream) -> None:
-        """Start Rerun's own program, which stays when the run ends; unlike Rerun's call, for this machine alone."""
+        """Start Rerun's program, which outlives the run; unlike Rerun's Python call, for this machine only."""
         port, quiet = _free_port(0), subprocess.DEVNULL
         command = [sys.executable, "-m", "rerun", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
         self._process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
@@ -209,7 +212,7 @@ class RerunViewer(Viewer):
         raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
 
     def _serve(self, stream: RecordingStream) -> None:
-        """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
+        """Serve page and data with Rerun's command, which unlike its Python calls can listen on this machine only."""
         self._process, port, page = _serve_alone()
         address = f"rerun+http://{HOST}:{port}/proxy"
         stream.connect_grpc(address)
@@ -219,7 +222,7 @@ class RerunViewer(Viewer):
             webbrowser.open(self.url)
 
     def _work(self, scene: Scene) -> None:
-        """Add what is queued to the scene, and send it every `SECONDS_TOGETHER`, until None comes."""
+        """Add what is queued to the scene, and send it every `SECONDS_TOGETHER`, until None ends the queue."""
         sent, is_open = time.monotonic(), True
         while is_open:
             try:
@@ -246,10 +249,10 @@ def _has_screen() -> bool:
 
 
 def _serve_alone() -> tuple[subprocess.Popen[bytes], int, int]:
-    """Start a server and see that it has its two ports to itself: for data and for the page.
+    """Start a server, check that its ports are its own, and return it with the ports for the data and the page.
 
     Raises:
-        RuntimeError: it does not start.
+        RuntimeError: It does not start.
     """
     for site in (WEB_PORT, *[0] * (ATTEMPTS - 1)):
         port, page = _free_port(0), _free_port(site)
@@ -271,7 +274,7 @@ def _start_server(port: int, page: int) -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a server by its guard."""
+    """End a server through its guard."""
     if process.stdin is not None:
         process.stdin.close()
     with suppress(subprocess.TimeoutExpired):
@@ -279,10 +282,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _await_own(process: subprocess.Popen[bytes], ports: set[int]) -> None:
-    """Wait until it is this process, or one that it started, that listens at ports, and not somebody else's.
+    """Wait until some ports are all listened on by a process or its descendants, not by another program.
 
     Raises:
-        RuntimeError: it has ended, or does not listen for `PATIENCE` seconds.
+        RuntimeError: The process ended, or does not listen within `PATIENCE` seconds.
     """
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
@@ -293,7 +296,7 @@ def _await_own(process: subprocess.Popen[bytes], ports: set[int]) -> None:
 
 
 def _listening(pid: int) -> set[int]:
-    """Ports at which a process and those that it started listen."""
+    """Return the ports on which a process and its descendants listen."""
     import psutil  # Rerun needs it too
 
     ports: set[int] = set()
@@ -306,7 +309,7 @@ def _listening(pid: int) -> set[int]:
 
 
 def _free_port(wanted: int) -> int:
-    """Return the port, or one that is free where that one is taken."""
+    """Return the port, or a free one if it is taken or 0."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:

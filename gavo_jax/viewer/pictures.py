@@ -96,7 +96,7 @@ def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
 def warp_target(
     reference: Shown, target: Shown, target_T_reference: Float[np.ndarray, "4 4"], camera: Camera
 ) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the warped target I_{t+1}(ω(ξ, p)) at each reference pixel, black where undefined, and where it is defined.
+    """Return the target warped to the reference, I_{t+1}(ω(ξ, p)), black where undefined, and where it is defined.
 
     Args:
         reference: The frame whose depth is used.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 CLOUD_STRIDE = 4
-"""Every so many shown pixels along either side make a point of the cloud."""
+"""Spacing of the cloud's points in pixels of the shown image, along rows and columns."""
 
 
 NOTHING = encode_jpeg(np.zeros((3, 4), np.uint8))
@@ -47,7 +47,7 @@ class Rows(NamedTuple):
     """Rows of one entity that belong to one frame."""
 
     generations: list[int]
-    """Where each stands on that time line."""
+    """Position of each row on the timeline `generation`."""
     sizes: list[int]
     """Number of instances (points, boxes, …) of each."""
     values: dict[str, Any]
@@ -56,9 +56,9 @@ class Rows(NamedTuple):
 
 
 class Scene:
-    """Turns frames, steps and populations into what Rerun shows; remembers what a segment or a warp starts from.
+    """Converts frames, steps and populations to Rerun data; remembers where pieces of paths and warps start.
 
-    What is to be shown gathers until `send`: a call to Rerun costs much the same for one row as for hundreds.
+    Data is collected until `send`, as a call to Rerun costs about the same for one row as for hundreds.
     """
 
     def __init__(
@@ -75,14 +75,14 @@ class Scene:
         self._frame, self._generation = 0, 0
         self._segment = 0
         self._world_T_camera: Float64[np.ndarray, "4 4"] | None = None
-        """Pose of the last frame, where the motion from there is known."""
+        """Pose of the last frame; None if the motion since is unknown."""
         self._seen = SeenCubes()
         self._bodies: dict[int, Float64[np.ndarray, " 3"]] = {}
-        """Where the bodies of the last frame are, by number."""
+        """Centroids of the last frame's bodies by number."""
         self._last_truth: Float64[np.ndarray, "4 4"] | None = None
         self._shown: deque[Shown] = deque(maxlen=MAX_DOUBTED + 1)
-        """The last frames that could be read."""
-        # in the order of sending: particles, shown at their own frame alone, are there before the time moves on
+        """The last readable frames, which may be references."""
+        # in the order of sending: particles, shown at their own frame only, arrive before the time advances
         self._archetypes: dict[str, Any] = {
             "search/particles": rr.Points3D,
             "world/camera": rr.Transform3D,
@@ -107,7 +107,7 @@ class Scene:
         self._send_static()
 
     def add(self, frame: Frame | None, step: Step | None, populations: tuple[Population, ...]) -> None:
-        """Add one frame to what is to be sent."""
+        """Collect the data of one frame."""
         self._frame = 0 if step is None else step.index
         world_T_camera = np.eye(4) if step is None else step.world_T_camera
         if step is not None and step.segment != self._segment:
@@ -131,7 +131,7 @@ class Scene:
             self._shown.append(shown)
 
     def add_loops(self, trajectory: Trajectory, loops: Loops) -> None:
-        """Add what the map says in the end: where the camera was, and which places it took for the same."""
+        """Collect the corrected trajectory, and the loops with their residuals."""
         self._add("world/corrected", strips=trajectory.world_T_camera[None, :, :3, 3])
         if not loops.edges:
             return
@@ -143,7 +143,7 @@ class Scene:
         self._add("world/loops", sizes=[len(strips)], strips=strips, colors=colors, labels=labels)
 
     def send(self) -> None:
-        """Send what was added since the last time, each entity's in one call."""
+        """Send the data collected since the last call, each entity's in one call to Rerun."""
         import rerun as rr
 
         for path, rows in self._waiting.items():
@@ -160,7 +160,7 @@ class Scene:
             rows.clear()
 
     def _add(self, path: str, generations: list[int] | None = None, sizes: list[int] | None = None, **values: Any):
-        """Add rows of an entity, one or one for each of some generations, each of one instance or of `sizes`."""
+        """Collect rows of an entity, one for each of `generations`, of `sizes` instances; by default one row of one."""
         generations = [self._generation] if generations is None else generations
         sizes = [1] * len(generations) if sizes is None else sizes
         self._waiting[path].append(Rows(generations, sizes, values, self._frame))
@@ -220,7 +220,7 @@ class Scene:
         shown: Shown,
         masks: list[tuple[int, Bool[np.ndarray, "h w"]]],
     ) -> None:
-        """Add what is seen of the scene for the first time; bodies are no part of it."""
+        """Add the points of the scene that are seen for the first time, without bodies."""
         depth = shown.depth[self._cloud]
         seen = (depth > 0) & (depth < FARTHEST)
         for _, mask in masks:
@@ -243,7 +243,7 @@ class Scene:
     def _add_trajectory(
         self, world_T_camera: Float64[np.ndarray, "4 4"], truth: Float64[np.ndarray, "4 4"] | None
     ) -> None:
-        """Add this frame's piece of either path; the view gathers the pieces."""
+        """Add this frame's piece of both paths, which the view accumulates, and the distance error."""
         for path, start, end in (
             ("world/estimate", self._world_T_camera, world_T_camera),
             ("world/truth", self._last_truth, truth),
@@ -258,7 +258,7 @@ class Scene:
         if np.isfinite(step.alignment.error):
             self._add("curves/rmse", scalars=[float(np.sqrt(step.alignment.error))])
         reference = next((s for s in reversed(self._shown) if s.timestamp == step.reference_timestamp), None)
-        if shown is None or reference is None:  # what was shown is of another frame
+        if shown is None or reference is None:  # otherwise those of another frame would stay
             for name in ("reference", "warped", "residual"):
                 self._add(f"images/{name}", blob=[NOTHING])
             return
@@ -300,7 +300,7 @@ class Scene:
         return count
 
     def _add_ticks(self, search: list[Level], starts: list[int]) -> None:
-        """Add the scale of each level's box."""
+        """Add the ticks of each level's box."""
         ticks = [ticks_of(level.centre, level.half_sizes) for level in search]
         strips = [strip for own in ticks for strip in own.strips]
         self._add("search/ticks", starts, [len(own.strips) for own in ticks], strips=strips)
@@ -313,8 +313,9 @@ def _joined(parts: list[Any]) -> Any:
 
 
 class Truth:
-    """Where the camera was, in the estimate's world: in each segment, as between them the motion is not known, the
-    first pose whose truth is known is laid on it.
+    """The true poses of the camera, in the estimate's world.
+
+    Each segment is aligned by its first pose whose truth is known, as the motion between segments is unknown.
     """
 
     def __init__(self, stamps: Float[np.ndarray, " n"], truth: Trajectory | None) -> None:
@@ -328,7 +329,7 @@ class Truth:
     def at(
         self, index: int, world_T_camera: Float64[np.ndarray, "4 4"], segment: int = 0
     ) -> Float64[np.ndarray, "4 4"] | None:
-        """Return the true world_T_camera of a frame of a segment, None where it is not known."""
+        """Return the true world_T_camera of a frame of a segment, None if unknown."""
         if not self._is_known(index):
             return None
         if segment not in self._world_T_truth:
@@ -336,11 +337,11 @@ class Truth:
         return self._world_T_truth[segment] @ self._truth_T_camera[index]
 
     def _is_known(self, index: int) -> bool:
-        """Whether a later frame is known: of a live source, or a run whose sequence is not there, none is."""
+        """Whether a frame's truth is known; frames beyond the timestamps, as of a live source, have none."""
         return index < len(self._known) and bool(self._known[index])
 
     def motion(self, step: Step) -> Float64[np.ndarray, "4 4"] | None:
-        """Return the true reference_T_target of a step, None where it is not known."""
+        """Return the true reference_T_target of a step, None if unknown."""
         if not self._is_known(step.index):
             return None
         reference = index_at(self._stamps, step.reference_timestamp)

@@ -78,7 +78,7 @@ def level_of(population: Population) -> Level | None:
 
 
 def camera_positions(xi: Float[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 3"]:
-    """Return the target camera's positions in the reference camera by twists of target_T_reference: −V(−w) v, metres."""
+    """Return the target camera's positions in the reference camera for twists of target_T_reference: −V(−w) v, m."""
     v, w = np.asarray(xi[..., :3], np.float64), np.asarray(xi[..., 3:], np.float64)
     square = np.sum(w * w, axis=-1, keepdims=True)
     safe = np.sqrt(np.maximum(square, 1e-8))

@@ -21,7 +21,7 @@ class SeenCubes:
         self._known: set[int] = set()
 
     def new(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
-        """Return the indices of the first points in new cubes, and remember these; none once there are `MOST_POINTS`."""
+        """Return the indices of the first points in new cubes, and remember those; none after `MOST_POINTS` cubes."""
         if len(self._known) >= MOST_POINTS:
             return np.zeros(0, np.int64)
         cubes = np.clip(np.floor(points / CUBE).astype(np.int64) + _MIDDLE, 0, 2 * _MIDDLE - 1)
