@@ -1,4 +1,4 @@
-"""What the command takes: one dataclass per subcommand, from which tyro makes parser and help."""
+"""Arguments of the command: one dataclass per subcommand, from which tyro builds parser and help."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +11,10 @@ from gavo_jax.peers.registry import PEERS
 
 METHODS = (*presets.METHODS, *presets.plugin_names())
 Method = Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")]
-"""A name that presets.methods() knows; the help does without the code of the packages that bring some."""
+"""A name of `presets.methods()`; the help lists those of other packages without loading their code."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
-# tyro breaks a docstring of several lines where its lines end; a text of such a length is given as `help`
+# tyro keeps the line breaks of a docstring, so texts longer than a line are given as `help`
 
 SOURCE = "A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package"
 LIVE = "Also realsense: live frames of the first Intel RealSense camera that is connected"
@@ -22,7 +22,7 @@ LIVE = "Also realsense: live frames of the first Intel RealSense camera that is 
 
 @dataclass(frozen=True)
 class Source:
-    """Which frames."""
+    """The frames to use."""
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}.")] = "synthetic"
     camera: Annotated[
@@ -42,20 +42,20 @@ class Source:
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """Raw depth units per metre: 5000 for TUM, 1000 for millimetres."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: by the stamps, else 30)")] = None
-    """Frames per second, where frames have numbers and no stamps."""
+    """Frames per second, if frames have numbers but no timestamps."""
     colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
-    """Of the colour images of a recording."""
+    """Topic of a recording's colour images."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
-    """Of the depth images of a recording."""
+    """Topic of a recording's depth images."""
     moving: Annotated[int, arg(metavar="N")] = 0
-    """Bodies that move through the synthetic room: a box, a walking figure, more boxes."""
+    """Number of bodies that move through the synthetic room: a box, a walking figure, more boxes."""
     force: bool = False
-    """Go on although the depth looks as if its scale were wrong."""
+    """Go on even if the scale of the depth looks wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
-    """How."""
+    """The search and its settings."""
 
     method: Annotated[
         Method,
@@ -72,9 +72,9 @@ class SearchOptions:
         ),
     ] = "default"
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
-    """Settings from a TOML file, or from config.json of an earlier run; the method and preset that it names count."""
+    """Settings from a TOML file or an earlier run's config.json, with the method and preset that it names."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
-    """A single setting, as alignment.points=2400 or solver.population.4=32."""
+    """A single setting, such as alignment.points=2400 or solver.population.4=32."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Run(SearchOptions, Source):
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}. {LIVE}.")] = "synthetic"
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Of the method's randomness: the same seed gives the same trajectory, bit for bit."""
+    """Seed of the method's random numbers: the same seed gives the same trajectory, bit for bit."""
     reference: Annotated[
         Literal["previous", "keyframe"] | None,
         arg(metavar="{previous,keyframe}", help_behavior_hint="(default: the preset's)"),
@@ -98,34 +98,34 @@ class Run(SearchOptions, Source):
         Literal["off", "mask", "track"] | None,
         arg(metavar="{off,mask,track}", help_behavior_hint="(default: the preset's)"),
     ] = None
-    """What moves on its own: part of the scene; left out of the search; or that, and its own motion found, too."""
+    """Moving bodies: treat as part of the scene, exclude from the search, or also find their own motions."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-METHOD-PRESET)")] = (
         None
     )
     """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
     trajectory_format: Annotated[str, arg(metavar="{tum,kitti,euroc,json,bag}")] = "tum"
-    """In what else the trajectory is written, with commas between: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
+    """Further formats of the trajectory, comma-separated: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
     map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(.ply, .pcd or .obj; default: none)")] = None
-    """Write what was seen, in colour: a cloud, or into .obj a mesh; needs the extra [map]."""
+    """Write a coloured map of the scene: a point cloud, or for .obj a mesh; needs the extra [map]."""
     map_shape: Annotated[
         Literal["cloud", "mesh"] | None, arg(metavar="{cloud,mesh}", help_behavior_hint="(default: the ending's)")
     ] = None
-    """What the map is."""
+    """Kind of the map."""
     voxel: Annotated[float, arg(metavar="M")] = 0.01
     """Side of the map's voxels, metres."""
     loops: bool = False
-    """Keep a map of keyframes and correct the trajectory where the camera comes back to a place (docs/loops.md)."""
+    """Keep a map of keyframes and correct the trajectory when the camera returns to a place (docs/loops.md)."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False
-    """Go on with the run in the folder where it was cut short; the options have to be the same."""
+    """Resume the interrupted run in the folder; the options must be the same."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 
 
 @dataclass(frozen=True)
 class Compare(Source):
-    """Run several methods, other libraries' too, over the same frames: one table, comparison.json, figures."""
+    """Run several methods, also of other libraries, on the same frames: one table, comparison.json, figures."""
 
     methods: Annotated[
         str,
@@ -136,9 +136,9 @@ class Compare(Source):
         ),
     ] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
     preset: PresetName = "default"
-    """Settings of the project's own methods, where none is named with one."""
+    """Preset of those of the project's methods that are named without one."""
     seeds: Annotated[int, arg(metavar="N")] = 1
-    """Run each random method with seeds 0 to N - 1; table and figures show the run of median drift."""
+    """Run each random method with seeds 0 to N - 1; the table and figures show the run of median drift."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-compare-PRESET)")] = (
         None
     )
@@ -147,7 +147,7 @@ class Compare(Source):
 
 @dataclass(frozen=True)
 class View:
-    """Look at a finished run: its trajectory, curves and, where the sequence is still there, images and truth."""
+    """Look at a finished run: its trajectory, curves and, if the sequence is still there, images and truth."""
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """The output folder of `gavo run`."""
@@ -175,7 +175,7 @@ class Align(SearchOptions):
     depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
     """Depth image of the target frame."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """As in `gavo run`; auto: the camera of the source that RGB0 is of, else the file beside it or one folder up."""
+    """As in `gavo run`; auto: the camera of RGB0's source, else the camera file beside it or one folder up."""
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """As in `gavo run`."""
     force: bool = False
@@ -186,7 +186,7 @@ class Align(SearchOptions):
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Errors of a trajectory against the truth, both TUM files (timestamp tx ty tz qx qy qz qw)."""
+    """Compute the errors of a trajectory against the truth, both TUM files (timestamp tx ty tz qx qy qz qw)."""
 
     estimate: Annotated[Positional[Path], arg(metavar="ESTIMATE")]
     """The estimated trajectory, camera to world."""
@@ -211,37 +211,37 @@ class Experiment:
     folder: Annotated[Positional[Path | None], arg(metavar="[DIR]", help_behavior_hint="(with report)")] = None
     """Folder of results to report on."""
     executor: Literal["local", "ray"] = "local"
-    """This process, or the Ray cluster that RAY_ADDRESS names (else one that is started here)."""
+    """Run in this process, or on the Ray cluster named by RAY_ADDRESS (else on one started here)."""
     dry_run: bool = False
     """Print the plan and stop."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
         None
     )
-    """Folder for the table and the report; what it has already is not run again."""
+    """Folder for the table and the report; runs that it holds already are not repeated."""
     markdown: bool = False
     """Print the tables of the report as Markdown."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """Get a sequence of the TUM RGB-D benchmark and unpack it."""
+    """Download a sequence of the TUM RGB-D benchmark and unpack it."""
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """As fr1_xyz, freiburg1_xyz or rgbd_dataset_freiburg1_xyz."""
+    """For example fr1_xyz, freiburg1_xyz or rgbd_dataset_freiburg1_xyz."""
     to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: GAVO_DATA, else data)")] = None
     """Folder that receives the sequence's folder."""
 
 
 @dataclass(frozen=True)
 class Tune:
-    """Search settings for small drift and little time at once, by Optuna; the result is a Pareto front."""
+    """Tune settings for both low drift and short time, by Optuna; the result is a Pareto front."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
-    """What is tuned, over which sequences (docs/experiments.md)."""
+    """The settings to tune and the sequences to tune them on (docs/experiments.md)."""
     trials: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the file's, else 50)")] = None
-    """Trials that the study is to hold in the end; it goes on from those it has."""
+    """Total number of trials in the study, including those it has already."""
     storage: Annotated[str | None, arg(metavar="URL", help_behavior_hint="(default: SQLite in --output)")] = None
-    """Any storage of Optuna; several machines may share one."""
+    """Any Optuna storage; several machines may share one."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
         None
     )
@@ -250,12 +250,12 @@ class Tune:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Versions, machine and settings for an issue report; whether this JAX computes right numbers, and how fast."""
+    """Show versions, machine and settings for an issue report; check that this JAX computes right, and how fast."""
 
 
 @dataclass(frozen=True)
 class Inspect(Source):
-    """Say what a source is: frames, rates, sizes, depth, camera, truth, and which frames cannot be used, and why."""
+    """Describe a source: frames, rates, sizes, depth, camera, truth, and which frames cannot be used, and why."""
 
     json: bool = False
     """Print it as JSON."""
@@ -263,17 +263,17 @@ class Inspect(Source):
 
 @dataclass(frozen=True)
 class Calibrate(Source):
-    """Find from the images alone what a source does not say of its camera, and write a camera file.
+    """Estimate from the images alone what a source does not say about its camera, and write a camera file.
 
-    Shutter readout, delay of depth and depth scale; the source's camera is what the search starts from.
+    It finds shutter readout, depth delay and depth scale, starting from the source's camera.
     """
 
     focal_length: bool = False
-    """Find the focal length, too."""
+    """Also find the focal length."""
     principal_point: bool = False
-    """Find the principal point, too."""
+    """Also find the principal point."""
     output: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="(default: camera.toml)")] = None
-    """The camera file, for --camera. One that is there already is replaced only where it is named."""
+    """The camera file, for --camera. An existing one is replaced only if named here."""
     json: bool = False
     """Print what was found as JSON."""
 
@@ -292,4 +292,4 @@ Command = (
     | Annotated[Calibrate, subcommand("calibrate")]
 )
 COMMANDS = tuple(get_args(command)[0].__name__.lower() for command in get_args(Command))
-"""Their names."""
+"""Names of the commands."""

@@ -52,10 +52,10 @@ def view(options: View) -> int:
 
 
 def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry | None:
-    """Return a new driver with the run's settings; None, with a printed reason, if config.json lacks them."""
+    """Return a new driver with the run's settings; None, with a printed reason, if they cannot be read."""
     try:
         settings = load_settings(folder / CONFIG).settings
-        settings = replace(settings, odometry=replace(settings.odometry, loops=False))  # the run has closed them already
+        settings = replace(settings, odometry=replace(settings.odometry, loops=False))  # the run closed them
         seed = int(run.config["options"]["seed"])
         return Odometry(sequence.camera, settings, seed=seed, record=True)
     except (GavoError, KeyError, TypeError, ValueError) as error:

@@ -1,7 +1,7 @@
 """Procedural textures of the synthetic room, drawn from a seed and prefiltered for any distance.
 
-A texture is a function (rng, rows, columns, texel in metres) -> albedo [rows, columns], about 0 to 255: fractal noise
-for the fine detail that photometric alignment lives on, and edges.
+A texture is a function (rng, rows, columns, texel in metres) -> albedo [rows, columns], about 0 to 255: edges, and
+fractal noise for the fine detail that photometric alignment needs.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ def paint(kinds: Sequence[str], sizes: np.ndarray, light: np.ndarray, seed: int)
     """Draw, light and prefilter the textures of F rectangles and pack their mip levels.
 
     Args:
-        kinds: names of textures, keys of `TEXTURES`.
+        kinds: Names of textures, keys of `TEXTURES`.
         sizes: [F, 2] metres along a texture's rows and along its columns.
         light: [F] factors on the albedo.
-        seed: each rectangle's texture depends on it and on the rectangle's place in the list.
+        seed: Seed; each rectangle's texture depends on it and on the rectangle's index.
     """
     longest = sizes.max(axis=1)
     texel = np.maximum(np.where(longest > 2.2, 0.004, 0.003), longest / _MOST_TEXELS)
@@ -52,9 +52,9 @@ def paint(kinds: Sequence[str], sizes: np.ndarray, light: np.ndarray, seed: int)
 
 
 def _mip_levels(texture: np.ndarray) -> list[np.ndarray]:
-    """Levels of half the size each, every one blurred by a Gaussian of sigma one texel of its own.
+    """Mip levels, each of half the size of the one before and blurred by a Gaussian with a sigma of one of its texels.
 
-    Texel c of a level is centred at (c + 1/2) 2^level - 1/2 of the texture.
+    Texel c of a level is centred at (c + 1/2) 2^level - 1/2 in the texture's texels.
     """
     levels = [cv2.GaussianBlur(texture, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)]
     for _ in range(LEVELS - 1):
@@ -67,7 +67,7 @@ def _mip_levels(texture: np.ndarray) -> list[np.ndarray]:
 
 
 def _pack(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Put images, each with a replicated border, on shelves of one image; also each one's first texel (column, row)."""
+    """Pack images with replicated borders on shelves of one image; also return each one's first texel (column, row)."""
     width = max(2048, max(image.shape[1] for image in images) + 2 * _BORDER)
     corners = np.zeros((len(images), 2), np.int64)
     left = top = shelf = 0
@@ -169,12 +169,12 @@ def _picture(rng: np.random.Generator, rows: int, columns: int, texel: float) ->
 
 
 def _screen(rng: np.random.Generator, rows: int, columns: int, texel: float) -> np.ndarray:
-    """A screen. Its casing is about as light as the wall: contrast at an occluding edge biases plain least squares."""
+    """A screen. Its casing is about as bright as the wall: contrast at an occluding edge biases plain least squares."""
     return _framed(rng, rows, columns, texel, 150.0)
 
 
 def _framed(rng: np.random.Generator, rows: int, columns: int, texel: float, frame_grey: float) -> np.ndarray:
-    """Overlapping shapes on a cloudy ground, framed."""
+    """Overlapping shapes on a cloudy background, framed."""
     image = np.ascontiguousarray(130 + 35 * _fractal(rng, rows, columns, 8, 0.9))
     for _ in range(24):
         centre = (int(rng.uniform(0, columns)), int(rng.uniform(0, rows)))
@@ -204,7 +204,7 @@ def _rug(rng: np.random.Generator, rows: int, columns: int, texel: float) -> np.
 
 
 def _tiles(rng: np.random.Generator, rows: int, columns: int, edge: float) -> np.ndarray:
-    """A checker of squares of `edge` texels, each square with its own brightness."""
+    """A checkerboard of squares of `edge` texels, each with its own brightness."""
     row, column = (np.arange(rows) / edge).astype(int), (np.arange(columns) / edge).astype(int)
     greys = rng.uniform(-25, 25, (row[-1] + 1, column[-1] + 1))
     greys += np.where(np.add.outer(np.arange(row[-1] + 1), np.arange(column[-1] + 1)) % 2 == 0, 85, 150)
