@@ -18,8 +18,8 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
     """Check that a map can be made and written; return its shape.
 
     Raises:
-        GavoError: The suffix is unknown, the folder is missing or not writable, the path is a folder, the voxel is
-            absurd, there are options of a map but no map, or Open3D cannot be imported.
+        GavoError: The suffix is unknown, the folder is missing or not writable, the path is a folder, or the voxel
+            is absurd. Or there are options of a map but no map, or Open3D cannot be imported.
     """
     check_voxel(voxel)
     if path is None:

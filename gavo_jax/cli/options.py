@@ -250,7 +250,7 @@ class Tune:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Show versions, machine and settings for an issue report; check that this JAX computes right, and how fast."""
+    """Show versions, machine and settings for an issue report; check that this JAX computes correctly, and how fast."""
 
 
 @dataclass(frozen=True)

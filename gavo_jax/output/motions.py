@@ -18,8 +18,8 @@ MOTION_COLUMNS = (
     + tuple(f"covariance_{row}{column}" for row, column in zip(*UPPER, strict=True))
     + tuple(f"sway_{axis}" for axis in range(6))
 )
-"""Columns of motions.csv, one row per pair: the frame's index and timestamps (s), the upper three rows of the pose and
-of the pair's motion (m), and the upper triangle of the motion's covariance and its sway, for (v, w) in m and rad.
+"""Columns of motions.csv, one row per pair: the frame's index and timestamps (s), then the upper three rows of the
+pose and of the pair's motion (m). Last the upper triangle of the motion's covariance, and its sway (v, w) in m and rad.
 """
 
 

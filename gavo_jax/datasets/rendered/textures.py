@@ -1,7 +1,7 @@
 """Procedural textures of the synthetic room, drawn from a seed and prefiltered for any distance.
 
-A texture is a function (rng, rows, columns, texel in metres) -> albedo [rows, columns], about 0 to 255: edges, and
-fractal noise for the fine detail that photometric alignment needs.
+A texture is a function (rng, rows, columns, texel in metres) -> albedo [rows, columns], about 0 to 255. It has
+edges, and fractal noise for the fine detail that photometric alignment needs.
 """
 
 from __future__ import annotations
