@@ -178,7 +178,7 @@ class RecordedRun(NamedTuple):
     config: dict[str, Any]
     trajectory: Trajectory
     steps: list[Step]
-    """The step of each frame after the first; see `read_steps`."""
+    """Step of each frame after the first, revised in hindsight; see `read_steps`."""
 
 
 def read_run(folder: str | Path) -> RecordedRun:

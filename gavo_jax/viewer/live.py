@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 UNFINISHED = ".part"
-"""Suffix of a recording that is being written; unlike `errors.PARTIAL`, a new run does not remove such files."""
+"""Suffix of a recording that is being written. A new run removes files that end in `PARTIAL`, but not these."""
 WAITING_FRAMES = 8
 """Frames that may be queued before the run has to wait."""
 SECONDS_TOGETHER = 0.25
