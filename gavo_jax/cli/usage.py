@@ -19,7 +19,7 @@ COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 HELP = ("-h", "--help")
 HELP_OF_HELP = ("-h, --help", "show this help message and exit")
 VERSION = ("--version", "print the version and exit")
-"""A help page's row on `--help`, and one like it on `--version`: beside subcommands tyro has no such option."""
+"""Row of a help page on `--help`, and the one added for `--version`, which tyro lacks beside subcommands."""
 
 USAGE_OF_ALL = "usage: gavo [-h] [--version] SUBCOMMAND ..."
 """Replaces tyro's usage, which lists all subcommands on one line; they follow in a table."""
@@ -65,7 +65,7 @@ class HelpPage(io.StringIO):
 
 
 def asking_for_help(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments; with a subcommand's help among them, that alone, as tyro omits options given already."""
+    """Return the arguments, or only SUBCOMMAND --help if they ask for that: tyro's page omits options given already."""
     if arguments and arguments[0] in COMMANDS and any(word in HELP for word in arguments[1:]):
         return [arguments[0], HELP[1]]
     return list(arguments)

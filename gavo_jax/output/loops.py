@@ -20,8 +20,8 @@ LOOP_COLUMNS = (
     + ("disagreement_m", "disagreement_rad")
 )
 """Columns of loops.csv: indices and timestamps (s) of both keyframes, whether the loop counts (0: it is false), and
-their overlap. Then the residual between the alignment and the map with its standard deviations, in the later camera (m,
-rad), and the difference between the alignments there and back.
+their overlap. Then the residual between the alignment and the map and the alignment's standard deviations, both in the
+later camera, and the difference between the alignments there and back; all in m and rad.
 """
 
 

@@ -87,7 +87,7 @@ def frame_progress(label: str, frames: int) -> Iterator[Callable[[], None]]:
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
-    """Return a label, a bar, some columns and the time left, shown on standard error if that is a terminal."""
+    """Return a bar with a label, some columns and the time left, shown on standard error if that is a terminal."""
     console = _Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), *columns, TimeRemainingColumn())
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)

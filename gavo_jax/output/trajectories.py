@@ -50,7 +50,7 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
 
     Raises:
         GavoError: The format is unknown, the input is not a trajectory, a pose is not a rigid transform, or a timestamp
-            is not finite or not allowed in the format. Or a bag lacks the extra `[bag]`, or writing fails.
+            is not finite or not allowed in the format. Or the extra `[bag]` is missing, or writing fails.
     """
     check_format(form)
     require_trajectory(trajectory)
@@ -64,7 +64,7 @@ def check_format(form: str) -> None:
     """Check that `write_trajectory` knows a format, before there is a trajectory.
 
     Raises:
-        GavoError: The format is unknown, or a bag lacks the extra `[bag]`.
+        GavoError: The format is unknown, or it is a bag and the extra `[bag]` is missing.
     """
     if form not in WRITERS:
         raise GavoError(f"trajectory format {form[:60]!r}: not one of {', '.join(WRITERS)}")

@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8, UInt32
 
 BLUE, WHITE, VERMILION, GREEN = (86, 180, 233), (245, 245, 245), (213, 94, 0), (0, 158, 115)
 GREY, DARK = (120, 120, 120), (24, 26, 32)
-"""RGB of general use; blue, vermilion and green are Okabe and Ito's."""
+"""RGB of scales, paths and backgrounds; blue, vermilion and green are Okabe and Ito's."""
 
 
 BODIES = ((230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))

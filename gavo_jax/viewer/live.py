@@ -44,7 +44,7 @@ UNFINISHED = ".part"
 WAITING_FRAMES = 8
 """Frames that may be queued before the run has to wait."""
 SECONDS_TOGETHER = 0.25
-"""Data of this time, seconds, is sent together; it delays a window by at most this."""
+"""Interval, seconds, at which data is sent; it delays a window by at most this."""
 MEMORY = "512MiB"
 """Data that the web viewer's server keeps for browsers that connect later."""
 HOST, WEB_PORT = "127.0.0.1", 9090

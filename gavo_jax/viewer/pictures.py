@@ -34,7 +34,7 @@ class Shown(NamedTuple):
     depth: Float[np.ndarray, "h w"]
     """Metres; 0 = no reading."""
     picture: UInt8[np.ndarray, "h w *channels"]
-    """BGR where the frame has colours, else grey."""
+    """BGR if the frame has colours, else grey."""
     jpeg: bytes
     """The picture, encoded."""
 
