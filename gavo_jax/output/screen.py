@@ -128,8 +128,8 @@ def known_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tupl
 def _parts(columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> Iterator[Table]:
     """Split a table into as many as fit the width, each with the first column."""
     start = 1
-    while start < len(columns):
-        end = len(columns)
+    while start < len(columns) or start == 1:
+        end = max(len(columns), 2)
         while _width(table := _table(*_columns(columns, rows, start, end))) > width and end > start + 1:
             end -= 1
         yield table

@@ -317,4 +317,4 @@ def _free_port(wanted: int) -> int:
             except OSError:
                 continue
             return int(probe.getsockname()[1])
-    raise GavoError("--viewer web: no free port")
+    raise GavoError("--viewer: no free port")

@@ -47,6 +47,11 @@ def test_nothing_is_cut(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     assert boxes(capsys.readouterr().out) == [[["", "x" * 30], ["a", "1"]]]
 
 
+def test_a_table_of_one_column_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("t", ("method",), [("ga",), ("pso",)])
+    assert boxes(capsys.readouterr().out) == [[["method"], ["ga"], ["pso"]]]
+
+
 def test_a_column_of_dashes_alone_is_left_out() -> None:
     rows = [["ga", number(None), number(1.0)], ["pso", number(None), number(None)]]
     assert known_columns(("method", "m/s", "ms"), rows) == (["method", "ms"], [["ga", "1.0000"], ["pso", "–"]])
