@@ -33,6 +33,8 @@ from gavo_jax.output.screen import number
 from gavo_jax.trajectory import Trajectory
 
 AS_IT_IS = "as it is"
+RESTING = 20
+"""Frames for which a camera rests."""
 
 Image = np.ndarray
 Grey = Callable[[int, Image], Image]
@@ -58,6 +60,24 @@ def depth(make: Callable[[int, Image], Image]) -> Condition:
 def frames(chosen: Callable[[int], bool]) -> Condition:
     """Keep only some of the frames."""
     return lambda clip: Damaged(clip, [index for index in range(len(clip)) if chosen(index)])
+
+
+def rested(clip: FrameSequence) -> Damaged:
+    """Let the camera rest before its first frame: the frame again and again, with other noise of image and depth."""
+    sequence = Damaged(clip, [0] * RESTING + list(range(len(clip))))
+    sequence.timestamps[:RESTING] -= np.arange(RESTING, 0, -1) / 30
+    sequence.alter = {seed: partial(noisy, seed) for seed in range(RESTING)}
+    return sequence
+
+
+def noisy(seed: int, clip: FrameSequence, index: int, frame: Frame) -> Frame:
+    """Add a sensor's noise to both images."""
+    del clip, index
+    generator = random(seed)
+    levels = frame.grey + generator.normal(0.0, 1.2, frame.grey.shape)
+    raw = np.where(frame.depth > 0, frame.depth + generator.integers(-8, 9, frame.depth.shape), 0)
+    grey = np.clip(np.round(levels), 0, 255).astype(np.uint8)
+    return replace(frame, grey=grey, depth=raw.astype(frame.depth.dtype))
 
 
 def gain(of_place: Callable[[int, Image, Image], Image]) -> Condition:
@@ -171,6 +191,7 @@ CONDITIONS: dict[str, Condition] = {
     "middle quarter": with_camera(cropped, middle, middle),
     "every second": frames(lambda index: index % 2 == 0),
     "every third": frames(lambda index: index % 3 == 0),
+    "at rest at first": rested,
     "a tenth missing": frames(lambda index: index == 0 or random(index).random() > 0.1),
 }
 
@@ -181,7 +202,8 @@ def measure(
     """Figures and trajectory of one run; `clean` is the unchanged clip's trajectory, None if this run makes it."""
     sequence = CONDITIONS[condition](clip)
     steps, trajectory = follow(sequence, contender, 0)
-    drift_of = partial(known_drift, stamps=sequence.timestamps, truth=truth)
+    stamps = np.intersect1d(sequence.timestamps, clip.timestamps)
+    drift_of = partial(known_drift, stamps=stamps, truth=truth)
     metres, before = drift_of(trajectory), drift_of(trajectory if clean is None else clean)
     wrong = [step.alignment.status == 0 for step in steps if is_wrong(step, sequence, truth)]
     row = {

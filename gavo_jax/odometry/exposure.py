@@ -15,17 +15,38 @@ explain the ratio, and the search estimates the gain itself.
 """
 
 
+SHARPNESS_LEVEL = 1
+"""Level of the pyramid on which sharpness is measured: on the finest one noise would count too."""
+
+
 class Exposure(NamedTuple):
-    """Brightness and contrast of an image: mean and standard deviation, grey levels."""
+    """Brightness, contrast and sharpness of an image."""
 
     mean: Float[Array, ""]
+    """Grey levels."""
     spread: Float[Array, ""]
+    """Standard deviation, grey levels."""
+    sharpness: Float[Array, ""]
+    """Squared difference of neighbouring pixels, averaged and added over both directions, over the squared contrast."""
 
     @classmethod
     def of(cls, pyramid: Pyramid) -> "Exposure":
-        """Measure the exposure on the coarsest level, where noise adds nothing to the contrast."""
-        grey = pyramid[-1].grey
-        return cls(jnp.mean(grey), jnp.maximum(jnp.std(grey), 0.1))
+        """Measure brightness and contrast on the coarsest level, where noise adds nothing to the contrast."""
+        coarse, fine = pyramid[-1].grey, pyramid[SHARPNESS_LEVEL].grey
+        spread = jnp.maximum(jnp.std(coarse), 0.1)
+        steepness = sum(jnp.mean(jnp.diff(fine, axis=axis) ** 2) for axis in (0, 1))
+        return cls(jnp.mean(coarse), spread, steepness / spread**2)
+
+    def error_per_pixel(self, before: "Exposure") -> Float[Array, ""]:
+        """About the photometric error E after a shift of one pixel of level `SHARPNESS_LEVEL`, squared grey levels.
+
+        E between two images depends on contrast and sharpness: it rises when a camera stops, whose motion had blurred
+        its images. The sharper of the two images counts.
+
+        Args:
+            before: Exposure of the reference.
+        """
+        return self.spread**2 * jnp.maximum(self.sharpness, before.sharpness)
 
 
 SLOW_GAIN, SLOW_SHIFT = 1.35, 40.0

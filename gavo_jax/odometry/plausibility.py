@@ -33,13 +33,13 @@ UNKNOWN_SECONDS = 1.0
 TOLERANCE = (0.015, 0.01)
 """Errors of an estimate by itself, metres and radians."""
 MAX_ERROR_RATIO = 6.0
-"""E over its usual value above which a pair is `HIGH_ERROR`; for a motion larger than usual, the limit is larger in
-proportion.
-"""
+"""Error over its usual value above which a pair is `HIGH_ERROR` (`benchmarks/conditions.py`)."""
+MIN_USUAL_ERROR = 0.2
+"""Smallest usual error, squared pixels, as that of a camera at rest is the sensor's noise alone."""
 SCENE_DISTANCE = 1.5
 """Distance assumed for the scene, metres: it converts a translation to a shift of the image."""
 SMALLEST_SHIFT = 0.005
-"""Smallest usual shift of the image, radians: the error of a camera at rest is the sensor's noise alone."""
+"""Smallest usual shift of the image, radians, as at rest it would be the noise of the estimate."""
 MIN_DEPTH_RATIO = 0.65
 """Explained share of depth, over its usual value, below which a pair is `DEPTH_MISMATCH`."""
 MOST_HIDDEN = 1.5
@@ -66,7 +66,7 @@ class Usual(NamedTuple):
     """Figures of the last good pairs; NaN where there are none yet."""
 
     errors: Float[Array, " n"]
-    """E over the image's squared contrast, as E grows with the camera's gain."""
+    """E in squared pixels (`Exposure.error_per_pixel`), as E grows with the images' contrast and sharpness."""
     shifts: Float[Array, " n"]
     """How far the image moved, radians."""
     explained_depths: Float[Array, " n"]
@@ -79,16 +79,16 @@ class Usual(NamedTuple):
         nothing: Any = np.full(REMEMBERED, np.nan, np.float32)
         return cls(*(nothing for _ in cls._fields))
 
-    def after(self, result: Alignment, contrast: Float[Array, ""]) -> "Usual":
-        """Add one more pair."""
-        figures = (result.error / contrast**2, _shift(result), result.explained.depth, result.depth_scale)
+    def after(self, result: Alignment, error: Float[Array, ""]) -> "Usual":
+        """Add one more pair and its error, squared pixels."""
+        figures = (error, _shift(result), result.explained.depth, result.depth_scale)
         return Usual(*(jnp.append(old[1:], new) for old, new in zip(self, figures, strict=True)))
 
 
 def judge_by_history(
     result: Alignment,
     usual: Usual,
-    contrast: Float[Array, ""],
+    error: Float[Array, ""],
     predicted: Float[Array, " 6"],
     elapsed: Float[Array, ""],
     last_elapsed: Float[Array, ""],
@@ -98,7 +98,7 @@ def judge_by_history(
     Args:
         result: Result of the new frame.
         usual: Figures of the pairs before.
-        contrast: Contrast of the new image, grey levels.
+        error: Error of the result, squared pixels.
         predicted: Twist of the motion if the camera had kept its velocity.
         elapsed: Time since the reference, seconds.
         last_elapsed: Duration of the last motion, seconds; `UNKNOWN_SECONDS` where there was none.
@@ -111,7 +111,6 @@ def judge_by_history(
     implausible = jnp.any(change > possible + tolerance) | jnp.any(_lengths(log(motion)) > reachable + tolerance)
     usual_shift = jnp.maximum(_usual(usual.shifts), SMALLEST_SHIFT)
     larger = jnp.maximum(_shift(result) / usual_shift, 1.0)
-    error = result.error / contrast**2 / larger
     explained_depth = result.explained.depth * jnp.minimum(larger, MOST_HIDDEN)
     least_scale = LEAST_DEPTH_SCALE * jnp.sqrt(jnp.maximum(STEADY_SHIFT / usual_shift, 1.0))
     most_scale = jnp.maximum(MAX_DEPTH_SCALE_RATIO * _usual(usual.depth_scales), least_scale)
@@ -120,7 +119,7 @@ def judge_by_history(
     findings = result.findings | as_findings(
         {
             AlignmentStatus.IMPLAUSIBLE_MOTION: implausible,
-            AlignmentStatus.HIGH_ERROR: error > MAX_ERROR_RATIO * _usual(usual.errors),
+            AlignmentStatus.HIGH_ERROR: error > MAX_ERROR_RATIO * jnp.maximum(_usual(usual.errors), MIN_USUAL_ERROR),
             AlignmentStatus.DEPTH_MISMATCH: mismatch,
         }
     )

@@ -164,9 +164,9 @@ def _velocity_change_after(state: TrackerState, moved: Moved, elapsed: Float[Arr
     )
 
 
-def _usual_after(usual: Usual, result: Alignment, exposure: Exposure, is_first: Bool[Array, ""]) -> Usual:
-    """The usual figures after one more result; a first frame adds none."""
-    after = usual.after(result, exposure.spread)
+def _usual_after(usual: Usual, result: Alignment, error: Float[Array, ""], is_first: Bool[Array, ""]) -> Usual:
+    """The usual figures after one more result, with its error in squared pixels; a first frame adds none."""
+    after = usual.after(result, error)
     return jax.tree.map(lambda new, old: jnp.where(is_first, old, new), after, usual)
 
 
@@ -218,7 +218,8 @@ def track_frame(
         swaying=Swaying(clock.elapsed, state.velocity_change) if options.sway else None,
         part=state.part,
     )
-    result = judge_by_history(result, state.usual, exposure.spread, predicted, clock.elapsed, state.seconds)
+    error = result.error / exposure.error_per_pixel(state.exposure)
+    result = judge_by_history(result, state.usual, error, predicted, clock.elapsed, state.seconds)
     moved = Moved.by(result, is_first=~jnp.any(state.previous.points.q > 0))
     if options.synchronise:
         target = _synchronised(raw, camera, delay * moved.instant_motion, finest)
@@ -241,7 +242,7 @@ def track_frame(
         seconds=clock.elapsed,
         part=Part.whole(),
         exposure=exposure,
-        usual=_usual_after(state.usual, result, exposure, moved.is_first),
+        usual=_usual_after(state.usual, result, error, moved.is_first),
     )
     return after_it, result, populations
 
@@ -285,6 +286,6 @@ def blank_state(camera: Camera, solver: Solver, alignment: AlignmentOptions) -> 
         velocity_change=VelocityChange.unknown(),
         seconds=np.float32(UNKNOWN_SECONDS),  # pyright: ignore[reportArgumentType]
         part=Part(np.float32(1.0), np.array(False)),  # pyright: ignore[reportArgumentType]
-        exposure=Exposure(zero, zero),
+        exposure=Exposure(zero, zero, zero),
         usual=Usual.unknown(),
     )

@@ -34,8 +34,8 @@ SETTINGS = Settings(
 DT = 1 / 30
 
 
-def result_of(x: float = 0.0, error: float = 10.0, depth: float = 0.95, scale: float = 0.005) -> Alignment:
-    """A pair that moved along x, metres, and of which the image does not explain much more than depth may."""
+def result_of(x: float = 0.0, error: float = 0.5, depth: float = 0.95, scale: float = 0.005) -> Alignment:
+    """A pair that moved along x, metres; its error is in squared pixels. Grey explains little more than depth may."""
     motion = jnp.eye(4).at[0, 3].set(x)
     explained = ExplainedShare(jnp.float32(0.7), jnp.float32(depth))
     alignment = no_alignment(Status.OK)._replace(target_T_reference=motion, error=jnp.float32(error))
@@ -43,10 +43,15 @@ def result_of(x: float = 0.0, error: float = 10.0, depth: float = 0.95, scale: f
 
 
 def usual() -> Usual:
-    """After a few pairs of an error of 10 and with most of depth explained."""
+    """After a few pairs of the usual error and with most of depth explained."""
+    return usual_of(result_of())
+
+
+def usual_of(result: Alignment) -> Usual:
+    """After a few pairs like one."""
     known = Usual.unknown()
     for _ in range(MIN_REMEMBERED):
-        known = known.after(result_of(), jnp.float32(50.0))
+        known = known.after(result, result.error)
     return known
 
 
@@ -60,10 +65,9 @@ def usual() -> Usual:
         (result_of(x=-0.06), 1.8, DT, Status.IMPLAUSIBLE_MOTION),
         (result_of(x=0.06), 0.0, 4 * DT, None),
         (result_of(x=0.2), 6.0, DT, Status.IMPLAUSIBLE_MOTION),
-        (result_of(error=50.0), 0.0, DT, None),
-        (result_of(error=70.0), 0.0, DT, Status.HIGH_ERROR),
-        (result_of(error=70.0, x=0.02), 0.0, DT, None),
-        (result_of(error=700.0, x=0.02), 0.0, DT, Status.HIGH_ERROR),
+        (result_of(error=2.5), 0.0, DT, None),
+        (result_of(error=3.5), 0.0, DT, Status.HIGH_ERROR),
+        (result_of(error=3.5, x=0.02), 0.0, DT, Status.HIGH_ERROR),
         (result_of(depth=0.7), 0.0, DT, None),
         (result_of(depth=0.5), 0.0, DT, Status.DEPTH_MISMATCH),
         (result_of(depth=0.5, x=0.05), 1.5, DT, None),
@@ -80,7 +84,7 @@ def test_a_pair_is_judged_by_those_before(
 ) -> None:
     predicted = jnp.zeros(6).at[0].set(velocity * elapsed)
     clock = jnp.float32(elapsed), jnp.float32(DT)
-    judged = judge_by_history(result, usual(), jnp.float32(50.0), predicted, *clock)
+    judged = judge_by_history(result, usual(), result.error, predicted, *clock)
     assert judged.findings == (0 if finding is None else bit(finding))
     assert judged.status == (Status.OK if finding is None else finding)
 
@@ -95,14 +99,22 @@ def test_no_stamp_turns_a_motion_round(rate: int) -> None:
 
 def test_nothing_is_unusual_before_anything_is_known() -> None:
     clock = jnp.float32(DT), jnp.float32(1.0)
-    judged = judge_by_history(result_of(0.1, 1e4, 0.1), Usual.unknown(), jnp.float32(50.0), jnp.zeros(6), *clock)
+    result = result_of(0.1, 1e4, 0.1)
+    judged = judge_by_history(result, Usual.unknown(), result.error, jnp.zeros(6), *clock)
     assert judged.status == Status.OK
 
 
+@pytest.mark.parametrize(("error", "status"), [(1.0, Status.OK), (1.4, Status.HIGH_ERROR)])
+def test_a_camera_may_start_from_rest(error: float, status: Status) -> None:
+    """Its usual error was the sensor's noise alone."""
+    result, clock = result_of(0.02, error), (jnp.float32(DT), jnp.float32(DT))
+    judged = judge_by_history(result, usual_of(result_of(error=0.002)), result.error, jnp.zeros(6), *clock)
+    assert judged.status == status
+
+
 def test_all_that_is_found_is_kept() -> None:
-    judged = judge_by_history(
-        result_of(0.06, 1e4, 0.05), usual(), jnp.float32(50.0), jnp.zeros(6), jnp.float32(DT), jnp.float32(DT)
-    )
+    result = result_of(0.06, 1e4, 0.05)
+    judged = judge_by_history(result, usual(), result.error, jnp.zeros(6), jnp.float32(DT), jnp.float32(DT))
     result = judged._replace(status=Status(int(judged.status)))
     assert result.statuses[0] is Status.HIGH_ERROR
     assert set(result.statuses) == {Status.HIGH_ERROR, Status.DEPTH_MISMATCH, Status.IMPLAUSIBLE_MOTION}
@@ -156,6 +168,25 @@ def with_depth(make: Callable[[list[Frame], int], Any], count: int = 1) -> Calla
 def test_a_clean_run_is_ok(frames: list[Frame]) -> None:
     steps = steps_of(frames, list)
     assert all(step.alignment.statuses == (Status.OK,) and step.segment == 0 for step in steps)
+
+
+def resting(frames: list[Frame]) -> list[Frame]:
+    """The first frame again and again with another noise, then every frame."""
+    rest, random = [], np.random.default_rng(0)
+    for _ in range(8):
+        grey = np.clip(frames[0].grey + random.normal(0.0, 1.2, frames[0].grey.shape), 0, 255).astype(np.uint8)
+        depth = np.where(frames[0].depth > 0, frames[0].depth + random.integers(-8, 9, frames[0].depth.shape), 0)
+        rest.append(replace(frames[0], grey=grey, depth=depth.astype(np.uint16)))
+    return [*rest, *frames]
+
+
+def test_a_camera_that_starts_from_rest_is_ok(data_dir: Path) -> None:
+    """Its errors are many times those at rest, which were noise alone."""
+    clip = TumSequence(data_dir / "fr1_desk")[:5]
+    sequence = Reordered(list(clip), resting)
+    sequence.camera = clip.camera
+    statuses = [step.alignment.statuses for step in track(sequence, preset("ga", "fast"))]
+    assert statuses == [(Status.OK,)] * 12
 
 
 def test_an_older_image_is_told(frames: list[Frame]) -> None:
@@ -322,7 +353,7 @@ def test_depth_is_wrong_that_disagrees_alone(grey: float, depth: float, disagree
     explained = ExplainedShare(jnp.float32(grey), jnp.float32(depth))
     result = result_of()._replace(explained=explained)
     still, elapsed = jnp.zeros(6), jnp.float32(DT)
-    judged = judge_by_history(result, Usual.unknown(), jnp.float32(50.0), still, elapsed, jnp.float32(1.0))
+    judged = judge_by_history(result, Usual.unknown(), result.error, still, elapsed, jnp.float32(1.0))
     assert bool(int(judged.findings) & bit(Status.DEPTH_MISMATCH)) == disagrees
 
 
