@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera import NUMBERS_OF_DISTORTION
+from gavo_jax.camera import DISTORTION_COUNTS
 from gavo_jax.errors import GavoError
 
 Table = dict[str, Any]
@@ -99,7 +99,7 @@ def numbers_of(entry: Any) -> list[Any]:
     return flat
 
 
-def beside(place: str, values: Table) -> Table:
+def rest_of_camera(place: str, values: Table) -> Table:
     """Read size, lens, depth unit and `KEPT` keys, everything but the camera matrix, into our keys.
 
     Args:
@@ -114,7 +114,7 @@ def beside(place: str, values: Table) -> Table:
 
 
 def known(key: str) -> bool:
-    """Whether `beside` reads a name."""
+    """Whether `rest_of_camera` reads a name."""
     words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *ORDER["pinhole"])
     return plain(key) in words or key in KEPT
 
@@ -146,7 +146,7 @@ def _by_name(values: Table, model: Any) -> list[Any]:
     kind = model_of(model) or "pinhole"
     found = {plain(key): value for key, value in values.items() if value is not None}
     last = max((at for at, name in enumerate(ORDER[kind]) if name in found), default=-1)
-    count = next(count for count in (0, *NUMBERS_OF_DISTORTION[kind]) if count > last)
+    count = next(count for count in (0, *DISTORTION_COUNTS[kind]) if count > last)
     return [found.get(name, 0.0) for name in ORDER[kind][:count]]
 
 
