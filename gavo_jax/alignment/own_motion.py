@@ -37,7 +37,7 @@ ROUNDS = 8
 LOOKS = 3
 """Number of first rounds in which depth is looked up anew."""
 
-Images = tuple[UInt8[np.ndarray, "h w"], Depth]
+GreyAndDepth = tuple[UInt8[np.ndarray, "h w"], Depth]
 
 
 class OwnMotion(NamedTuple):
@@ -50,8 +50,8 @@ class OwnMotion(NamedTuple):
 
 
 def refine_moving(
-    reference: Images,
-    target: Images,
+    reference: GreyAndDepth,
+    target: GreyAndDepth,
     camera: Camera,
     target_T_reference: Float[np.ndarray, "4 4"],
     delays: tuple[float, float] = (0.0, 0.0),

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence
+from gavo_jax.bodies.pixel_evidence import PixelEvidence, View, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
@@ -51,7 +51,7 @@ class Belief(NamedTuple):
     """Share of what was known to be static that moves."""
     hidden: Bool[Array, "h w"]
     """Pixels that are occluded in the first of the other views."""
-    carried: Float[Array, "h w"]
+    carried_belief: Float[Array, "h w"]
     """Belief before this frame, carried over to the same surfaces."""
     suspected: Float[Array, "h w"]
     """How recently a body was seen on the pixel's surface, before this frame; from 0 to 1."""
@@ -104,7 +104,7 @@ def form_belief(
         support=jnp.sum(credit * at_rest) / total,
         contradicted=jnp.sum(credit * (moving > 0)) / total,
         hidden=hidden,
-        carried=known,
+        carried_belief=known,
         suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
         in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )

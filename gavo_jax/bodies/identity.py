@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int32, Integer
 
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 
-LEAST = 0.008
+MIN_BODY_SHARE = 0.008
 """Smallest share of the image that a body covers."""
 SHOWS = 0.03
 """Evidence above which a component is a new body: summed belief that its pixels move, as a share of the image."""
@@ -21,7 +21,7 @@ KEEPS = 0.006
 """Evidence that suffices for a body known from the last frame."""
 THICK = 6 / 160
 """Radius, over the image's width, of a disc that has to fit inside a new body."""
-MOST = 8
+MAX_BODIES = 8
 """Maximum number of bodies at a time; the largest ones are kept."""
 UNSEEN = 15
 """Frames after which an unseen body is forgotten."""
@@ -48,10 +48,10 @@ class BodyTracks(NamedTuple):
         """No known bodies, for an image of some height and width."""
         return cls(
             np.zeros(size, np.int32),
-            np.zeros(MOST, np.int32),
-            np.zeros(MOST, np.int32),
-            np.zeros((MOST, 6), np.float32),
-            np.full(MOST, UNKNOWN_SECONDS, np.float32),
+            np.zeros(MAX_BODIES, np.int32),
+            np.zeros(MAX_BODIES, np.int32),
+            np.zeros((MAX_BODIES, 6), np.float32),
+            np.full(MAX_BODIES, UNKNOWN_SECONDS, np.float32),
             np.int32(0),  # pyright: ignore[reportArgumentType]
         )
 
@@ -75,14 +75,14 @@ def body_components(
     """
     mask = moving > 0
     labels = np.zeros(mask.shape, np.int32)
-    if mask.mean() < LEAST:
+    if mask.mean() < MIN_BODY_SHARE:
         return labels
     found = 0
     count, split, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
     thick = THICK * mask.shape[1]
     for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA]) + 1:
-        if stats[k, cv2.CC_STAT_AREA] < LEAST * mask.size or found == MOST:
+        if stats[k, cv2.CC_STAT_AREA] < MIN_BODY_SHARE * mask.size or found == MAX_BODIES:
             break
         part = split == k
         was_known = np.mean(before[part]) > 0.3
@@ -110,7 +110,7 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
     last = np.int32(max(int(tracks.last), *given))
     after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels, last=last)  # pyright: ignore[reportArgumentType]
     entries = [(n, 0) for n in seen] + [(tracks.numbers[i], tracks.ages[i] + 1) for i in lasting]
-    for place, (number, age) in enumerate(entries[:MOST]):
+    for place, (number, age) in enumerate(entries[:MAX_BODIES]):
         after.numbers[place], after.ages[place] = number, age
         for old in np.flatnonzero(tracks.numbers == number):
             after.motions[place], after.seconds[place] = tracks.motions[old], tracks.seconds[old]

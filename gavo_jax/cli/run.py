@@ -135,7 +135,7 @@ def _go_on(
     for step in (None, *steps):
         viewer.watch(None, step)
     if mapper is not None:
-        mapper.replay(sequence, steps, folder.moving, progress.drawn.is_any)
+        mapper.replay(sequence, steps, folder.moving, progress.overlays.is_any)
 
 
 def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:

@@ -33,7 +33,7 @@ LITTLE = 0.01
 """Weight of the whole image's mean, as a share of the surroundings, for where everything around is overlay."""
 
 
-class Drawn(NamedTuple):
+class Overlays(NamedTuple):
     """What is known of overlays, on every `STEP`th pixel."""
 
     last: Num[np.ndarray, "h w"] | None = None
@@ -87,7 +87,7 @@ class AsTracked:
 
     def __init__(self, sequence: Sequence, is_drawn_on: bool = True) -> None:
         self._sequence, self._is_drawn_on = sequence, is_drawn_on
-        self._drawn, self._next = Drawn(), 0
+        self._overlays, self._next = Overlays(), 0
 
     def __getitem__(self, index: int) -> Frame:
         """A frame after those that were asked for before, without distortion and overlays.
@@ -97,13 +97,13 @@ class AsTracked:
         """
         for number in range(self._next, index) if self._is_drawn_on else ():
             with contextlib.suppress(FrameError):
-                self._drawn = self._drawn.after(rectified_at(self._sequence, number).grey)
+                self._overlays = self._overlays.after(rectified_at(self._sequence, number).grey)
         self._next = index + 1
         frame = rectified_at(self._sequence, index)
         if not self._is_drawn_on:
             return frame
-        self._drawn = self._drawn.after(frame.grey)
-        return self._drawn.without(frame)
+        self._overlays = self._overlays.after(frame.grey)
+        return self._overlays.without(frame)
 
 
 def _is_steep(image: np.ndarray) -> np.ndarray:
