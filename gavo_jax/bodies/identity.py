@@ -11,19 +11,19 @@ from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 
 MIN_BODY_SHARE = 0.008
 """Smallest share of the image that a body covers."""
-SHOWS = 0.03
+MIN_NEW_EVIDENCE = 0.03
 """Evidence above which a component is a new body: summed belief that its pixels move, as a share of the image."""
-EXPLAINS = 0.015
+MIN_EXPLAINING_EVIDENCE = 0.015
 """Evidence that suffices for the largest component where depth disagrees with the motion found: a body would explain
 that.
 """
-KEEPS = 0.006
+MIN_KNOWN_EVIDENCE = 0.006
 """Evidence that suffices for a body known from the last frame."""
 THICK = 6 / 160
 """Radius, over the image's width, of a disc that has to fit inside a new body."""
 MAX_BODIES = 8
 """Maximum number of bodies at a time; the largest ones are kept."""
-UNSEEN = 15
+MAX_UNSEEN = 15
 """Frames after which an unseen body is forgotten."""
 
 
@@ -87,8 +87,9 @@ def body_components(
         part = split == k
         was_known = np.mean(before[part]) > 0.3
         evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
-        shows = EXPLAINS if depth_disagrees and found == 0 else SHOWS
-        if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else shows):
+        least = MIN_EXPLAINING_EVIDENCE if depth_disagrees and found == 0 else MIN_NEW_EVIDENCE
+        least = MIN_KNOWN_EVIDENCE if was_known else least
+        if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > least:
             found += 1
             labels[part] = found
     return labels
@@ -104,7 +105,7 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
     given = _numbers(found, tracks)
     seen = given[1:]
     labels = given[found]
-    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < UNSEEN]
+    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < MAX_UNSEEN]
     for i in lasting:  # hidden, or at rest for a moment: expected where it was last seen
         labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
     last = np.int32(max(int(tracks.last), *given))
