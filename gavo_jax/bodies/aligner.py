@@ -35,9 +35,9 @@ MAJORITY = 0.5
 """Support above which a motion is accepted as the camera's although its points fit badly."""
 ROUNDS = 3
 """Maximum number of repeated searches, each without what moves according to the one before."""
-RELUCTANT = 2.0
+MAX_DISSENT_RATIO = 2.0
 """Ratio of a motion's dissent to the least dissent from any motion, above which another one is searched for."""
-BETTER = 1.2
+MIN_REPLACEMENT_RATIO = 1.2
 """Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
 """Dissents above which a motion may be a body's, without bodies in view and with some. With pure noise the median block
@@ -60,15 +60,15 @@ MOST_ASIDE = 0.6
 """Largest share of the image that is set aside on suspicion; where more is suspected, only what moves is set aside."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
-GOES_ON = (0.01, 0.01)
+MIN_VELOCITY_DEVIATIONS = (0.01, 0.01)
 """Least standard deviations, metres and radians, of the prior of constant velocity; larger where the run's velocity
 usually changes more.
 """
-SURPRISE = 22.5
+MAX_FUSION_DISTANCE = 22.5
 """Squared Mahalanobis distance between the motion found and the prediction above which the two are not fused.
 Chi-squared with six degrees of freedom exceeds it once in a thousand times.
 """
-FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
+ACCEPTABLE = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Statuses of a motion that may be considered as the camera's."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """Findings that a body may cause by occluding points."""
@@ -88,7 +88,7 @@ class MotionCandidate(NamedTuple):
     @property
     def rank(self) -> tuple[bool, float]:
         """Sort key: the larger, the better."""
-        return self.attempt.result.status in FOUND, float(self.belief.support)
+        return self.attempt.result.status in ACCEPTABLE, float(self.belief.support)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class BodyAware:
         attempt, seconds_extrapolated = seen, 0.0
         if not self.is_eager and self._asks(first, seen, found, before):
             attempt, seconds_extrapolated = self._asked(state, frame, clock, seen)
-        is_vague = attempt.usable and not seconds_extrapolated and deviation(attempt) > GOES_ON[0]
+        is_vague = attempt.usable and not seconds_extrapolated and deviation(attempt) > MIN_VELOCITY_DEVIATIONS[0]
         if not self.is_eager and is_vague and np.any(before):
             attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
@@ -240,13 +240,13 @@ class BodyAware:
         look = self._look(state, attempt)
         for _ in range(ROUNDS):
             opinion = look.opinion
-            if opinion is None or not float(opinion.dissent) > RELUCTANT * float(opinion.least):
+            if opinion is None or not float(opinion.dissent) > MAX_DISSENT_RATIO * float(opinion.least):
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
             if not again.usable:
                 break
             other = self._look(state, again)
-            if other.opinion is None or BETTER * float(other.opinion.dissent) > float(opinion.dissent):
+            if other.opinion is None or MIN_REPLACEMENT_RATIO * float(other.opinion.dissent) > float(opinion.dissent):
                 break
             attempt, look = again, other
         return attempt, look
@@ -319,10 +319,10 @@ class BodyAware:
         found = np.asarray(attempt.result.target_T_reference)
         onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))
         changed = np.square(float(clock.elapsed)) * np.asarray(state.tracker.velocity_change.changes, np.float64)
-        prior = np.diag(np.repeat(np.maximum(changed, np.square(GOES_ON)), 3))
+        prior = np.diag(np.repeat(np.maximum(changed, np.square(MIN_VELOCITY_DEVIATIONS)), 3))
         covariance = np.float64(attempt.result.covariance)
         certainty = np.linalg.inv(covariance + prior)
-        if onward @ certainty @ onward > SURPRISE:
+        if onward @ certainty @ onward > MAX_FUSION_DISTANCE:
             return attempt
         share = covariance @ certainty
         motion = found @ exp(share @ onward)

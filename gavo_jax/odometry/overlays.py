@@ -23,7 +23,7 @@ CHANGED, MOVED = 2, 0.5
 """Change in grey levels, and the share of pixels with something to see that has to exceed it: then the camera moves."""
 FRAMES = 8
 """Consecutive images of a moving camera in which an overlay keeps its exact level."""
-LEAST = 5e-3
+MIN_OVERLAY_SHARE = 5e-3
 """Share of the pixels that has to be overlay and steep. Clean clips of the TUM benchmark have 0.002 at most."""
 REACH = 5
 """Sampled pixels around an overlay that coding and the search's interpolation mix with it."""
@@ -44,7 +44,7 @@ class Overlays(NamedTuple):
     @property
     def is_any(self) -> bool:
         """Whether enough of the image keeps its level for an overlay to be there."""
-        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= LEAST)
+        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= MIN_OVERLAY_SHARE)
 
     def after(self, grey: np.ndarray) -> Self:
         """Update with one more image."""
@@ -65,7 +65,7 @@ class Overlays(NamedTuple):
         if self.last is None or not self.is_any:
             return frame
         edges = (self.counts >= FRAMES) & _is_steep(self.last)
-        if np.count_nonzero(edges) < LEAST * edges.size:
+        if np.count_nonzero(edges) < MIN_OVERLAY_SHARE * edges.size:
             return frame
         drawn = cv2.dilate(edges.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)) > 0
         grey, depth = np.asarray(frame.grey), np.asarray(frame.depth)
