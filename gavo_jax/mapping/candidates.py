@@ -13,7 +13,7 @@ from gavo_jax.trajectory import inverse
 
 MAX_CANDIDATES = 4
 """Maximum number of candidates per keyframe, which bounds the work."""
-LOOKED_AT = 48
+MAX_COMPARED = 48
 """Maximum number of earlier keyframes compared with a new one, those that see most of the same; it bounds the work."""
 FEW_POINTS = 60
 """About how many of the new keyframe's points are used to choose the earlier ones."""
@@ -85,7 +85,7 @@ def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> 
     ahead = z > NEAREST
     u, v = to_pixels(camera, x, y, 1.0 / np.where(ahead, z, 1.0))
     seen = np.mean(ahead & in_image(camera, u, v), axis=1)
-    return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= NEARLY * MIN_OVERLAP]
+    return [old[k] for k in np.argsort(-seen, kind="stable")[:MAX_COMPARED] if seen[k] >= NEARLY * MIN_OVERLAP]
 
 
 def _was_tried(new: Keyframe, other: Keyframe) -> bool:
