@@ -18,13 +18,7 @@ from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.waits import Stopwatch
-from gavo_jax.datasets.base import (
-    Frame,
-    FrameError,
-    as_seconds,
-    require_begin_in_seconds,
-    require_grey_levels,
-)
+from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
