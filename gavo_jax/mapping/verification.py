@@ -21,21 +21,15 @@ from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.image.motion_compensation import CompensatedImages
 from gavo_jax.mapping.candidates import MAX_CANDIDATES, LoopCandidate
+from gavo_jax.presets import HALF_SIZE_OBJECTIVE
 from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
-from gavo_jax.settings import AlignmentOptions, Settings
+from gavo_jax.settings import Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
-SETTINGS = Settings(
-    GaussNewton(iterations=(12, 12, 15, 20, 0), patience=2),
-    AlignmentOptions(
-        points=(4800, 1200, 1200, 1200, 1200), depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3), views=(1, 1, 1, 1, 1)
-    ),
-)
-"""Gauss-Newton from the guess, both ways. The images have half the frame's size, so a level here is the next coarser
-level of the frame.
-"""
+SETTINGS = Settings(GaussNewton(iterations=(12, 12, 15, 20, 0), patience=2), HALF_SIZE_OBJECTIVE)
+"""Gauss-Newton from the guess, both ways."""
 MIN_OVERLAP = 0.5
 """Smallest overlap of the alignment, in both directions."""
 MAX_DISAGREEMENT = (0.02, 0.02)
