@@ -191,14 +191,14 @@ def estimate_camera(
     if pairs < LEAST_FRAMES // 2:
         raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned: nothing can be found from them")
     interval = min(float(np.median(np.diff(times))) for times in stamps)
-    leasts: dict[str, Minimum] = {}
+    minima: dict[str, Minimum] = {}
     for number in range(rounds):
         for name, find in _STAGES.items():
             if name in wanted:
                 on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {rounds}")
-                leasts |= find(trial, interval, number == 0)
+                minima |= find(trial, interval, number == 0)
                 trial.settle()
-    found |= _judged(leasts, trial, interval, guessed)
+    found |= _judged(minima, trial, interval, guessed)
     delay = found["depth_delay"].value if "depth_delay" in found else None
     return CameraEstimate(found, _with_found(sequence, found), delay or 0.0, pairs)
 
@@ -245,7 +245,7 @@ def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Min
 
 def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
     del interval, is_first
-    leasts, apart = {}, trial.apart(APART)
+    minima, apart = {}, trial.apart(APART)
     for name in ("cx", "cy"):
         said, now = getattr(trial.camera, name), float(getattr(trial.unknowns, name))
 
@@ -254,8 +254,8 @@ def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Mi
 
         least = refine(apart.score("grey", change), now, CENTRE_STEP, said - CENTRE_RANGE, said + CENTRE_RANGE)
         trial.unknowns = apart.unknowns = change(trial.unknowns, least.value)
-        leasts[name] = least
-    return leasts
+        minima[name] = least
+    return minima
 
 
 _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
@@ -276,17 +276,17 @@ _KINDS: dict[str, tuple[str, str, str]] = {
 }
 
 
-def _judged(leasts: dict[str, Minimum], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
+def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
     """Return each parameter with its deviation, or why it is not determined.
 
     Args:
-        leasts: Minima by name.
+        minima: Minima by name.
         trial: Trial that they were found with.
         interval: Time between two frames, seconds: no readout is longer.
         guessed: Origin of the stamps if they are a guess; else empty.
     """
     found = {}
-    for name, least in leasts.items():
+    for name, least in minima.items():
         kind, unit, how = _KINDS[name]
         if name == "readout" and least.value >= interval:
             how += "; at the longest that it can be, the time between two frames"
